@@ -1,0 +1,1 @@
+"""What the edge service and the simulator must agree on, and nothing else."""

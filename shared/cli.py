@@ -1,0 +1,55 @@
+"""The ``aicvds`` command: finds its subcommands by entry point and imports only the one that is asked for."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import entry_points, version
+
+_SUMMARIES = {
+    "serve": "run the edge decision service (LLM included)",
+    "simulate": "fly one mission against an edge, local or remote, and write its report",
+    "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
+    "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
+}
+
+_USAGE = """usage: aicvds COMMAND [OPTIONS]
+
+{commands}
+
+`aicvds COMMAND --help` explains a command, its defaults and its units. First steps:
+
+  aicvds demo --out runs/demo          everything at once, two minutes
+  aicvds serve                         the edge on port 8000
+  aicvds simulate --edge URL --out DIR the UAVs, from this or another machine
+
+aicvds --version prints the version."""
+
+
+def usage() -> str:
+    """The text of ``aicvds --help``."""
+    return _USAGE.format(commands="\n".join(f"  {name:<10} {text}" for name, text in _SUMMARIES.items()))
+
+
+def main() -> int:
+    """Run one subcommand with the rest of the command line; returns the process's exit code."""
+    name, rest = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
+    if name in ("--help", "-h"):
+        print(usage())
+        return 0
+    if name == "--version":
+        print(f"aicvds {version('aic-vds')}")
+        return 0
+    found = [e for e in entry_points(group="aicvds.commands") if e.name == name]
+    if not found:
+        print(f"aicvds: there is no command {name!r}\n\n{usage()}", file=sys.stderr)
+        return 2
+    try:
+        command = found[0].load()
+    except ModuleNotFoundError as missing:
+        extra = "service" if found[0].value.startswith("service") else "simulator"
+        print(
+            f"aicvds {name}: {missing.name} is not installed. Install the extra: pip install 'aic-vds[{extra}]'",
+            file=sys.stderr,
+        )
+        return 2
+    return int(command(rest) or 0)

@@ -1,0 +1,110 @@
+"""Scenarios: every number of the world in one validated model, and the presets by name."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Point = tuple[float, float]
+
+
+class Scenario(BaseModel):
+    """One world's numbers. The defaults are the scenario ``paper``.
+
+    Lengths are in metres, times in seconds unless a field says steps, powers in watts,
+    energies in joules, path losses in dB (the channel gain is minus the path loss).
+
+    Raises:
+        pydantic.ValidationError: a field is out of bounds, or two fields contradict each other.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str = Field("paper", pattern=r"^[a-z][a-z0-9_]{0,31}$")
+    sensors: int = Field(10, ge=1, le=10_000, description="number of ground sensors J")
+    uavs: int = Field(3, ge=1, le=100, description="number of UAVs I")
+    steps: int = Field(30, ge=1, le=10_000, description="waypoints of a mission T")
+
+    area_m: float = Field(1000.0, gt=0, le=1e5, description="side of the square area")
+    layout: Literal["uniform", "pipeline"] = "uniform"
+    pipeline: tuple[Point, ...] = Field(
+        ((50.0, 120.0), (350.0, 300.0), (500.0, 560.0), (720.0, 640.0), (950.0, 900.0)),
+        min_length=2,
+        description="polyline that layout `pipeline` strings the sensors along",
+    )
+    pipeline_spread_m: float = Field(20.0, ge=0, description="largest offset from the polyline, each axis")
+
+    altitude_m: float = Field(100.0, gt=0, le=1e4)
+    radio_radius_m: float = Field(360.0, gt=0, le=1e5, description="horizontal")
+    step_s: float = Field(10.0, gt=0, le=3600)
+    max_velocity: int = Field(14, ge=1, le=14, description="velocity levels are 0..max, in m/s")
+    lap_radius_m: float = Field(300.0, gt=0)
+    lap_offset_m: float = Field(250.0, ge=0, description="lap centres' distance from the area's centre")
+
+    queue_capacity: int = Field(60, ge=1, le=100_000, description="packets, W")
+    initial_queue_min: float = Field(0.3, ge=0, le=1, description="fraction of W")
+    arrival_rate_min: float = Field(2.0, ge=0, le=1000, description="packets a step")
+    arrival_rate_max: float = Field(8.0, ge=0, le=1000, description="packets a step")
+    battery_j: float = Field(50.0, gt=0)
+    transmit_power_w: float = Field(0.1, gt=0)
+
+    los_a: float = Field(20.0, gt=0, description="Al-Hourani a, angles in degrees")
+    los_kappa: float = Field(0.3, gt=0, description="Al-Hourani b, per degree")
+    los_excess_db: float = Field(1.0, ge=0)
+    nlos_excess_db: float = Field(20.0, ge=0)
+    carrier_mhz: float = Field(2000.0, gt=0)
+    path_loss_limit_db: float = Field(110.0, gt=0, description="h_th: the link fails at or past it")
+    bandwidth_hz: float = Field(1e6, gt=0)
+    noise_dbm_hz: float = -174.0
+    noise_figure_db: float = Field(9.0, ge=0)
+    spectral_cap: float = Field(6.0, gt=0, description="bit/s/Hz, 64-QAM")
+    packet_bits: float = Field(1e6, gt=0)
+    link_share: float = Field(1.0, gt=0, le=1, description="share of the rate that a transfer gets")
+
+    overflow_horizon_steps: float = Field(3.0, gt=0, le=1000, description="expected steps to the next visit")
+    uplink_drop: float = Field(0.0, ge=0, lt=1, description="share of requests lost on the way to the edge")
+    uplink_jitter_ms: float = Field(0.0, ge=0, le=10_000, description="uniform extra delay of a request")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.arrival_rate_min > self.arrival_rate_max:
+            raise ValueError("arrival_rate_min exceeds arrival_rate_max")
+        return self
+
+    @property
+    def lap_centres(self) -> tuple[Point, ...]:
+        """Centre of each UAV's circle, metres: evenly spread around the area's centre, the first due north."""
+        half = self.area_m / 2
+        angles = (math.radians(90.0 + 360.0 * i / self.uavs) for i in range(self.uavs))
+        return tuple((half + self.lap_offset_m * math.cos(a), half + self.lap_offset_m * math.sin(a)) for a in angles)
+
+    @property
+    def mean_arrival_rate(self) -> float:
+        """Mean of the arrival rates' range, packets a step: what is assumed of a sensor not yet observed."""
+        return (self.arrival_rate_min + self.arrival_rate_max) / 2
+
+
+SCENARIOS: dict[str, Scenario] = {
+    s.name: s
+    for s in (
+        Scenario(),
+        Scenario(name="pipeline", layout="pipeline"),
+        Scenario(name="stress", link_share=0.35, arrival_rate_min=4.0, arrival_rate_max=12.0),
+        Scenario(name="dense", sensors=100, uavs=10),
+        Scenario(name="lossy_uplink", uplink_drop=0.1, uplink_jitter_ms=200.0),
+    )
+}
+
+
+def scenario_named(name: str) -> Scenario:
+    """The preset of that name.
+
+    Raises:
+        ValueError: no preset has that name; the message lists the names.
+    """
+    try:
+        return SCENARIOS[name]
+    except KeyError:
+        raise ValueError(f"unknown scenario {name!r}: choose one of {', '.join(SCENARIOS)}") from None

@@ -1,0 +1,258 @@
+"""The wire: what the UAVs send to the edge and what it answers. Every bound is stated here.
+
+Columns are parallel arrays, one entry a sensor. A sensor that a UAV has never heard keeps its
+surveyed place (``x``, ``y``) and has ``null`` in the four columns that only a beacon can fill.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from shared.scenario import Scenario
+
+MAX_SENSORS = 10_000
+MAX_STEP = 1_000_000
+
+MissionId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", examples=["default"])]
+DecisionId = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", examples=["0123456789abcdef0123456789abcdef"])]
+UavId = Annotated[int, Field(ge=0, le=99)]
+Step = Annotated[int, Field(ge=0, le=MAX_STEP)]
+SensorId = Annotated[int, Field(ge=0, lt=MAX_SENSORS)]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
+
+Mode = Literal["llm", "value"]
+Source = Literal["llm", "policy"]
+Reason = Literal[
+    "mode_value",
+    "no_candidate",
+    "llm_loading",
+    "llm_unavailable",
+    "llm_timeout",
+    "llm_status",
+    "llm_error",
+    "answer_format",
+    "answer_sensor",
+    "answer_velocity",
+    "answer_reserved",
+]
+
+
+class Wire(BaseModel):
+    """Strict: no coercion between types, no NaN or infinity, no unknown field."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+
+class SensorColumns(Wire):
+    """What one UAV knows of the sensors: parallel arrays of 1 to 10,000 entries, all of one length.
+
+    ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last
+    beacon) are all ``null`` for a sensor never heard, and none of them for one that was.
+    """
+
+    id: Annotated[list[SensorId], Field(min_length=1, max_length=MAX_SENSORS, description="no duplicates")]
+    x: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, description="m, surveyed")]
+    y: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, description="m, surveyed")]
+    queue: Annotated[
+        list[Annotated[float, Field(ge=0, le=100_000)] | None],
+        Field(min_length=1, max_length=MAX_SENSORS, description="packets waiting"),
+    ]
+    battery: Annotated[
+        list[Annotated[float, Field(ge=0, le=1e9)] | None],
+        Field(min_length=1, max_length=MAX_SENSORS, description="J left"),
+    ]
+    channel_gain: Annotated[
+        list[Annotated[float, Field(ge=-400, le=0)] | None],
+        Field(min_length=1, max_length=MAX_SENSORS, description="dB, minus the path loss"),
+    ]
+    last_seen: Annotated[
+        list[Step | None],
+        Field(min_length=1, max_length=MAX_SENSORS, description="step of the last beacon"),
+    ]
+
+    @model_validator(mode="after")
+    def _rectangular(self) -> Self:
+        expected = len(self.id)
+        for name in ("x", "y", "queue", "battery", "channel_gain", "last_seen"):
+            if len(getattr(self, name)) != expected:
+                raise ValueError(f"column {name} has {len(getattr(self, name))} entries, column id has {expected}")
+        if len(set(self.id)) != expected:
+            seen: set[int] = set()
+            twice = next(i for i in self.id if i in seen or seen.add(i))  # type: ignore[func-returns-value]
+            raise ValueError(f"column id names sensor {twice} more than once")
+        for row, heard in enumerate(zip(self.queue, self.battery, self.channel_gain, self.last_seen, strict=True)):
+            if 0 < sum(value is None for value in heard) < 4:
+                raise ValueError(
+                    f"sensor {self.id[row]}: queue, battery, channel_gain and last_seen are all null or none is"
+                )
+        return self
+
+
+class Outcome(Wire):
+    """What came of an earlier decision; applied once, however often it is sent."""
+
+    decision_id: DecisionId
+    cost: float = Field(ge=0, le=10_000, description="c, 0 is best; the value regression's target is -c")
+    failed: bool = Field(False, description="the transmission failed (f = 1)")
+
+
+class UavState(Wire):
+    """One UAV at one waypoint."""
+
+    uav_id: UavId
+    position: list[Metres] = Field(min_length=2, max_length=2, description="x, y in m")
+    sensors: SensorColumns
+    outcome: Outcome | None = Field(None, description="of this UAV's previous decision")
+
+
+class DecideRequest(UavState):
+    """``POST /decide``: which sensor, and how fast?"""
+
+    mission_id: MissionId = "default"
+    step: Step
+    deadline_ms: DeadlineMs | None = None
+
+    @model_validator(mode="after")
+    def _no_beacon_from_the_future(self) -> Self:
+        _check_beacons(self.sensors, self.step)
+        return self
+
+
+class BatchRequest(Wire):
+    """``POST /decide/batch``: a fleet's UAVs at one step, decided in the order given."""
+
+    mission_id: MissionId = "default"
+    step: Step
+    deadline_ms: DeadlineMs | None = Field(None, description="for the whole batch")
+    uavs: list[UavState] = Field(min_length=1, max_length=100)
+
+    @model_validator(mode="after")
+    def _one_state_a_uav(self) -> Self:
+        ids = [uav.uav_id for uav in self.uavs]
+        if len(set(ids)) != len(ids):
+            raise ValueError("uavs: a UAV appears more than once")
+        for uav in self.uavs:
+            _check_beacons(uav.sensors, self.step)
+        return self
+
+
+def _check_beacons(sensors: SensorColumns, step: int) -> None:
+    late = [s for s in sensors.last_seen if s is not None and s > step]
+    if late:
+        raise ValueError(f"sensors.last_seen has step {late[0]}, later than this step {step}")
+
+
+class Candidate(Wire):
+    """A sensor that the attention module kept, with its score."""
+
+    sensor_id: SensorId
+    score: float
+
+
+class Tokens(Wire):
+    """Token accounting of one decision.
+
+    ``static``, ``experiences``, ``state`` and their sum ``prompt`` are counted here with ``tokenizer``;
+    ``state_uncompressed`` is the state block with every reported sensor, ``uncompressed`` the whole prompt
+    with it, and ``saved`` the difference. The ``server_`` fields are what the LLM server's ``usage`` said, in
+    the model's own tokens, chat template included; ``null`` when it said nothing.
+    """
+
+    tokenizer: str
+    static: int
+    experiences: int
+    state: int
+    state_uncompressed: int
+    prompt: int
+    uncompressed: int
+    saved: int
+    completion: int | None = None
+    cached: int | None = None
+    server_prompt: int | None = None
+    cost_usd: float | None = None
+
+
+class DecideResponse(Wire):
+    """The decision: collect from ``sensor_id``, fly the next step at ``velocity`` m/s."""
+
+    decision_id: DecisionId
+    mission_id: MissionId
+    uav_id: UavId
+    step: Step
+    sensor_id: SensorId
+    velocity: int = Field(ge=0, le=14)
+    source: Source
+    reason: Reason | None = Field(None, description="why the decision is not the LLM's")
+    model: str | None = None
+    top_k: list[Candidate]
+    tokens: Tokens
+    latency_ms: dict[str, float]
+
+
+class BatchResponse(Wire):
+    """One decision a UAV, in the order asked."""
+
+    decisions: list[DecideResponse]
+
+
+class FeedbackRequest(Outcome):
+    """``POST /feedback``: an outcome on its own."""
+
+    mission_id: MissionId = "default"
+
+
+class FeedbackResponse(Wire):
+    """``applied`` the first time, ``duplicate`` ever after."""
+
+    decision_id: DecisionId
+    result: Literal["applied", "duplicate"]
+
+
+class MissionSpec(Wire):
+    """``PUT /missions/{id}``: the world that a fleet flies in and how it decides."""
+
+    scenario: str | Scenario = Field("paper", description="a preset's name or a whole scenario")
+    mode: Mode | None = Field(None, description="default: the service's")
+    top_k: int | None = Field(None, ge=1, le=100, description="default: the service's")
+    seed: int = Field(0, ge=0, lt=2**32, description="of the attention and velocity modules' initial weights")
+
+
+class MissionStatus(Wire):
+    """``GET /missions/{id}``."""
+
+    mission_id: MissionId
+    scenario: Scenario
+    mode: Mode
+    top_k: int
+    seed: int
+    decisions: int
+    feedback: int
+    experiences: int
+    learner_updates: int
+    learner_loss: float | None
+    visits: dict[int, int] = Field(description="sensor: step of the last visit")
+
+
+class Readiness(Wire):
+    """``GET /readyz``: decisions can be made, and by whom."""
+
+    ready: bool
+    decides: Source
+    llm: Literal["loading", "ready", "unavailable", "off"]
+    model: str | None = None
+    constraint: str | None = Field(None, description="how the server holds the LLM to the answer's form")
+    detail: str | None = None
+
+
+class Problem(BaseModel):
+    """RFC 9457 ``application/problem+json``; ``errors`` names each field at fault."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    errors: list[dict[str, str]] = []
