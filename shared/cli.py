@@ -53,3 +53,7 @@ def main() -> int:
         )
         return 2
     return int(command(rest) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -27,43 +27,43 @@ class Scenario(BaseModel):
     uavs: int = Field(3, ge=1, le=100, description="number of UAVs I")
     steps: int = Field(30, ge=1, le=10_000, description="waypoints of a mission T")
 
-    area_m: float = Field(1000.0, gt=0, le=1e5, description="side of the square area")
+    area_m: float = Field(1000.0, ge=1, le=1e6, description="side of the square area")
     layout: Literal["uniform", "pipeline"] = "uniform"
     pipeline: tuple[Point, ...] = Field(
         ((50.0, 120.0), (350.0, 300.0), (500.0, 560.0), (720.0, 640.0), (950.0, 900.0)),
         min_length=2,
         description="polyline that layout `pipeline` strings the sensors along",
     )
-    pipeline_spread_m: float = Field(20.0, ge=0, description="largest offset from the polyline, each axis")
+    pipeline_spread_m: float = Field(20.0, ge=0, le=1e6, description="largest offset from the polyline, each axis")
 
-    altitude_m: float = Field(100.0, gt=0, le=1e4)
-    radio_radius_m: float = Field(360.0, gt=0, le=1e5, description="horizontal")
-    step_s: float = Field(10.0, gt=0, le=3600)
+    altitude_m: float = Field(100.0, ge=1, le=1e4)
+    radio_radius_m: float = Field(360.0, ge=1, le=1e6, description="horizontal")
+    step_s: float = Field(10.0, ge=0.01, le=3600)
     max_velocity: int = Field(14, ge=1, le=14, description="velocity levels are 0..max, in m/s")
-    lap_radius_m: float = Field(300.0, gt=0)
-    lap_offset_m: float = Field(250.0, ge=0, description="lap centres' distance from the area's centre")
+    lap_radius_m: float = Field(300.0, ge=1, le=1e6)
+    lap_offset_m: float = Field(250.0, ge=0, le=1e6, description="lap centres' distance from the area's centre")
 
     queue_capacity: int = Field(60, ge=1, le=100_000, description="packets, W")
     initial_queue_min: float = Field(0.3, ge=0, le=1, description="fraction of W")
     arrival_rate_min: float = Field(2.0, ge=0, le=1000, description="packets a step")
     arrival_rate_max: float = Field(8.0, ge=0, le=1000, description="packets a step")
-    battery_j: float = Field(50.0, gt=0)
-    transmit_power_w: float = Field(0.1, gt=0)
+    battery_j: float = Field(50.0, ge=1e-6, le=1e9)
+    transmit_power_w: float = Field(0.1, ge=1e-6, le=1e3)
 
-    los_a: float = Field(20.0, gt=0, description="Al-Hourani a, angles in degrees")
-    los_kappa: float = Field(0.3, gt=0, description="Al-Hourani b, per degree")
-    los_excess_db: float = Field(1.0, ge=0)
-    nlos_excess_db: float = Field(20.0, ge=0)
-    carrier_mhz: float = Field(2000.0, gt=0)
-    path_loss_limit_db: float = Field(110.0, gt=0, description="h_th: the link fails at or past it")
-    bandwidth_hz: float = Field(1e6, gt=0)
-    noise_dbm_hz: float = -174.0
-    noise_figure_db: float = Field(9.0, ge=0)
-    spectral_cap: float = Field(6.0, gt=0, description="bit/s/Hz, 64-QAM")
-    packet_bits: float = Field(1e6, gt=0)
-    link_share: float = Field(1.0, gt=0, le=1, description="share of the rate that a transfer gets")
+    los_a: float = Field(20.0, gt=0, le=100, description="Al-Hourani a, angles in degrees")
+    los_kappa: float = Field(0.3, gt=0, le=5, description="Al-Hourani b, per degree")
+    los_excess_db: float = Field(1.0, ge=0, le=100)
+    nlos_excess_db: float = Field(20.0, ge=0, le=100)
+    carrier_mhz: float = Field(2000.0, ge=1, le=1e6)
+    path_loss_limit_db: float = Field(110.0, gt=0, le=400, description="h_th: the link fails at or past it")
+    bandwidth_hz: float = Field(1e6, ge=1, le=1e12)
+    noise_dbm_hz: float = Field(-174.0, ge=-300, le=0)
+    noise_figure_db: float = Field(9.0, ge=0, le=100)
+    spectral_cap: float = Field(6.0, ge=0.01, le=100, description="bit/s/Hz, 64-QAM")
+    packet_bits: float = Field(1e6, ge=1, le=1e12)
+    link_share: float = Field(1.0, ge=1e-6, le=1, description="share of the rate that a transfer gets")
 
-    overflow_horizon_steps: float = Field(3.0, gt=0, le=1000, description="expected steps to the next visit")
+    overflow_horizon_steps: float = Field(3.0, gt=0, le=100, description="expected steps to the next visit")
     uplink_drop: float = Field(0.0, ge=0, lt=1, description="share of requests lost on the way to the edge")
     uplink_jitter_ms: float = Field(0.0, ge=0, le=10_000, description="uniform extra delay of a request")
 

@@ -46,7 +46,6 @@ class Wire(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-
 class SensorColumns(Wire):
     """What one UAV knows of the sensors: parallel arrays of 1 to 10,000 entries, all of one length.
 

@@ -1,0 +1,45 @@
+# make install | demo | test | check | bench | compose | clean
+#
+# TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
+# selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
+PYTHON ?= python3.11
+TORCH_INDEX ?=
+TORCH := $(shell grep '^torch==' constraints.txt)
+BIN := .venv/bin
+
+.PHONY: install demo test check bench compose clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make install   a virtual environment in .venv with everything, and the embedded model"
+	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
+	@echo "make test      install, run the tests"
+	@echo "make check     install, ruff, mypy --strict, import-linter"
+	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
+
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet $(TORCH) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX) --extra-index-url '$(shell $(PYTHON) -m pip config get global.index-url 2>/dev/null)',)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/aicvds model fetch
+	@touch $@
+
+demo: install
+	$(BIN)/aicvds demo --out runs/demo
+
+test: install
+	$(BIN)/pytest
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+compose:
+	tests/e2e/compose.sh
+
+clean:
+	rm -rf .venv build dist *.egg-info

@@ -1,0 +1,76 @@
+"""The application: wiring, lifespan and middleware. Importing this module has no side effects."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any, TypedDict
+
+import torch
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service import problems
+from service.engine import Engine
+from service.learner import rehearse
+from service.limits import BodyLimit
+from service.llm.upstream import Upstream
+from service.metrics import Metrics
+from service.routes import router
+from service.settings import Settings
+from service.tokens import TokenCounter
+from shared.wire import Problem
+
+
+class State(TypedDict):
+    """What every request finds in ``request.state``."""
+
+    engine: Engine
+    upstream: Upstream
+    metrics: Metrics
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """One edge service; its LLM begins to load when the application starts."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[State]:
+        # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
+        torch.set_num_threads(1)
+        upstream = Upstream(settings)
+        metrics = Metrics()
+        counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
+        await asyncio.to_thread(rehearse)
+        engine = Engine(settings, upstream, counter, metrics)
+        upstream.start()
+        try:
+            yield {"engine": engine, "upstream": upstream, "metrics": metrics}
+        finally:
+            await upstream.close()
+            await asyncio.to_thread(engine.close)
+
+    app = FastAPI(
+        title="AIC-VDS edge",
+        version=version("aic-vds"),
+        summary="Which sensor to collect from, and how fast to fly",
+        lifespan=lifespan,
+    )
+    app.include_router(router)
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    problems.install(app)
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    """The schema, with problem documents in place of FastAPI's own validation errors."""
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = schema["components"]["schemas"]
+        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        app.openapi_schema = schema
+    return app.openapi_schema

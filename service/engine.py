@@ -1,0 +1,226 @@
+"""The decision pipeline: augment, attend, prompt, ask, check, answer; and feedback, from which the modules learn."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Literal
+
+from service.learner import Sample
+from service.llm.answer import NoDecision, check_answer
+from service.llm.client import Completion
+from service.llm.upstream import Upstream
+from service.metrics import Metrics
+from service.mission import Mission
+from service.missions import Missions
+from service.policy import decide_by_urgency
+from service.prompt import Prompt, build_prompt
+from service.settings import Settings
+from service.tokens import TokenCounter, price_usd
+from service.view import View
+from shared.wire import (
+    BatchRequest,
+    DecideRequest,
+    DecideResponse,
+    FeedbackRequest,
+    FeedbackResponse,
+    Outcome,
+    Reason,
+    Tokens,
+    UavState,
+)
+
+log = logging.getLogger(__name__)
+
+# Kept back from the LLM's time for checking, answering and the way through the event loop.
+_RESERVE_S = 0.02
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Milliseconds by stage since the request came in."""
+
+    started: float = field(default_factory=time.perf_counter)
+    stages: dict[str, float] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
+
+    def lap(self, stage: str) -> None:
+        """End a stage."""
+        now = time.perf_counter()
+        self.stages[stage] = round((now - self._last) * 1e3, 3)
+        self._last = now
+
+    def total(self) -> dict[str, float]:
+        """The stages and their total."""
+        return {**self.stages, "total": round((time.perf_counter() - self.started) * 1e3, 3)}
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A sensor and a velocity, with the reason where they are not the LLM's."""
+
+    sensor_id: int
+    velocity: int
+    reason: Reason | None
+    completion: Completion | None
+
+
+class Engine:
+    """Decides for every mission of one service, and learns from what comes back."""
+
+    def __init__(self, settings: Settings, upstream: Upstream, counter: TokenCounter, metrics: Metrics) -> None:
+        self._settings = settings
+        self._upstream = upstream
+        self._counter = counter
+        self._metrics = metrics
+        self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        self.missions = Missions(settings, metrics)
+
+    def close(self) -> None:
+        """Finish the learning that is queued."""
+        self._learning.shutdown(wait=True)
+
+    async def decide(self, request: DecideRequest) -> DecideResponse:
+        """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input."""
+        watch = Stopwatch()
+        mission = self.missions.checked(request.mission_id, [request])
+        deadline_ms = request.deadline_ms or self._settings.deadline_ms
+        return await self._decide(mission, request, request.step, deadline_ms, watch)
+
+    async def decide_batch(self, request: BatchRequest) -> list[DecideResponse]:
+        """A fleet's decisions in the order asked; each gets an equal share of the time that is left."""
+        watch = Stopwatch()
+        total_ms = request.deadline_ms or self._settings.deadline_ms
+        answers: list[DecideResponse] = []
+        mission = self.missions.checked(request.mission_id, request.uavs)
+        for turn, uav in enumerate(request.uavs):
+            left_ms = total_ms - (time.perf_counter() - watch.started) * 1e3
+            share_ms = max(1, int(left_ms / (len(request.uavs) - turn)))
+            answers.append(await self._decide(mission, uav, request.step, share_ms, Stopwatch()))
+        return answers
+
+    def feedback(self, request: FeedbackRequest) -> FeedbackResponse:
+        """Apply an outcome once; raises ``NotFound`` for an unknown mission or decision."""
+        mission = self.missions.get(request.mission_id)
+        return FeedbackResponse(decision_id=request.decision_id, result=self._apply(mission, request))
+
+    async def learned(self) -> None:
+        """Wait until every outcome applied so far has been learned from."""
+        await asyncio.wrap_future(self._learning.submit(lambda: None))
+
+    async def _decide(
+        self, mission: Mission, uav: UavState, step: int, deadline_ms: int, watch: Stopwatch
+    ) -> DecideResponse:
+        if uav.outcome is not None:
+            self._apply(mission, uav.outcome)
+        mission.observe(uav)
+        view = View.of(mission, uav, step)
+        watch.lap("augment")
+        view.attend(mission)
+        watch.lap("attend")
+        prompt = build_prompt(mission.scenario, view.state, view.rows, mission.experiences)
+        tokens = self._count(prompt)
+        watch.lap("prompt")
+        deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
+        choice = await self._choose(mission, view, prompt, deadline, watch)
+        decision_id = uuid.uuid4().hex
+        mission.commit(view.pending(mission, decision_id, choice.sensor_id, choice.velocity))
+        watch.lap("check")
+        answer = DecideResponse(
+            decision_id=decision_id,
+            mission_id=mission.mission_id,
+            uav_id=uav.uav_id,
+            step=step,
+            sensor_id=choice.sensor_id,
+            velocity=choice.velocity,
+            source="policy" if choice.reason else "llm",
+            reason=choice.reason,
+            model=None if choice.reason else self._upstream.model,
+            top_k=view.candidates,
+            tokens=self._with_usage(tokens, choice.completion),
+            latency_ms=watch.total(),
+        )
+        self._metrics.record_decision(answer, deadline_ms=deadline_ms)
+        return answer
+
+    async def _choose(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Choice:
+        """The LLM's choice or the learned values', as the mission's mode says; the policy's where neither has one."""
+        completion: Completion | None = None
+        reason: Reason | None = None
+        try:
+            if not view.rows:
+                raise NoDecision("no_candidate", "no sensor is both heard and free")
+            if mission.mode == "value":
+                (sensor, velocity), reason = view.by_value(mission), "mode_value"
+            else:
+                completion = await self._ask(mission, view, prompt, deadline, watch)
+                sensor, velocity = check_answer(completion.text, view.offered, mission.scenario.max_velocity + 1)
+            # Others may have been answered while this one waited.
+            if sensor in mission.reserved(view.step, view.uav_id):
+                raise NoDecision("answer_reserved", f"sensor {sensor} was given away meanwhile")
+        except NoDecision as error:
+            log.info("mission %s: %s: %s", mission.mission_id, error.reason, error)
+            reserved = mission.reserved(view.step, view.uav_id)
+            (sensor, velocity), reason = decide_by_urgency(view.state, mission.scenario, reserved), error.reason
+        if mission.mode == "llm" and reason != "no_candidate":
+            self._metrics.llm_requests.labels(reason or "ok").inc()
+        return Choice(sensor, velocity, reason, completion)
+
+    async def _ask(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Completion:
+        try:
+            async with asyncio.timeout(deadline - time.perf_counter()):
+                return await self._upstream.ask(
+                    prompt.static, prompt.user, view.offered, mission.scenario.max_velocity + 1
+                )
+        except TimeoutError:
+            raise NoDecision("llm_timeout", "no answer within the deadline") from None
+        finally:
+            watch.lap("llm")
+
+    def _apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
+        result: Literal["applied", "duplicate"] = "duplicate"
+        if mission.find(outcome.decision_id) == "pending":
+            result = "applied"
+            if (sample := mission.apply(outcome)) is not None:
+                self._learning.submit(self._learn, mission, sample, outcome.cost)
+        self._metrics.feedback.labels(result).inc()
+        return result
+
+    def _learn(self, mission: Mission, sample: Sample, cost: float) -> None:
+        try:
+            self._metrics.learner_loss.set(mission.learner.update(sample, cost))
+        except Exception:
+            log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
+
+    def _count(self, prompt: Prompt) -> Tokens:
+        static = self._counter.count_repeated(prompt.static)
+        experiences = sum(self._counter.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
+        state = self._counter.count(prompt.state)
+        state_uncompressed = self._counter.count(prompt.state_uncompressed)
+        return Tokens(
+            tokenizer=self._counter.name,
+            static=static,
+            experiences=experiences,
+            state=state,
+            state_uncompressed=state_uncompressed,
+            prompt=static + experiences + state,
+            uncompressed=static + experiences + state_uncompressed,
+            saved=state_uncompressed - state,
+        )
+
+    def _with_usage(self, tokens: Tokens, completion: Completion | None) -> Tokens:
+        if completion is None or completion.prompt_tokens is None:
+            return tokens
+        cached = completion.cached_tokens or 0
+        cost = price_usd(self._settings, completion.prompt_tokens, cached, completion.completion_tokens or 0)
+        usage = {
+            "server_prompt": completion.prompt_tokens,
+            "cached": completion.cached_tokens,
+            "completion": completion.completion_tokens,
+            "cost_usd": cost,
+        }
+        return tokens.model_copy(update=usage)

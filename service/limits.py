@@ -1,0 +1,118 @@
+"""The door: bodies are bounded before and after decompression, so that no request can fill the memory."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+
+import zstandard
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.problems import problem_response
+
+
+class _TooLarge(Exception):
+    """The body, or what it unpacks to, exceeds the limit."""
+
+
+class _Damaged(Exception):
+    """The body is not in the encoding that it claims."""
+
+
+class BodyLimit:
+    """Pure ASGI middleware: reads the body up to ``limit`` bytes and undoes ``Content-Encoding: gzip | zstd``.
+
+    Answers 413 past the limit, 415 for another encoding, 400 for a damaged one, each as a problem document.
+    """
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self.app = app
+        self.limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] not in ("POST", "PUT", "PATCH"):
+            await self.app(scope, receive, send)
+            return
+        headers = {name.lower(): value for name, value in scope["headers"]}
+        encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
+        if encoding not in _DECODERS:
+            response = problem_response(415, f"Content-Encoding {encoding[:40]!r}: use gzip, zstd or none")
+            response.headers["Accept-Encoding"] = "gzip, zstd"
+            await response(scope, receive, send)
+            return
+        try:
+            body = await self._read(receive, headers.get(b"content-length", b""))
+            body = _DECODERS[encoding](body, self.limit)
+        except _TooLarge:
+            fault = {"field": "body", "problem": f"larger than {self.limit} bytes"}
+            response = problem_response(413, f"body: larger than {self.limit} bytes", [fault])
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+            return
+        except _Damaged as damaged:
+            fault = {"field": "body", "problem": str(damaged)}
+            await problem_response(400, f"body: {damaged}", [fault])(scope, receive, send)
+            return
+        scope["headers"] = [(n, v) for n, v in scope["headers"] if n.lower() not in _REWRITTEN]
+        scope["headers"].append((b"content-length", str(len(body)).encode()))
+        await self.app(scope, _replay(body, receive), send)
+
+    async def _read(self, receive: Receive, content_length: bytes) -> bytes:
+        if content_length.isdigit() and int(content_length) > self.limit:
+            raise _TooLarge
+        body = bytearray()
+        while True:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return bytes(body)
+            body += message.get("body", b"")
+            if len(body) > self.limit:
+                raise _TooLarge
+            if not message.get("more_body", False):
+                return bytes(body)
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replayed() -> Message:
+        return pending.pop() if pending else await receive()
+
+    return replayed
+
+
+def _gunzip(body: bytes, limit: int) -> bytes:
+    decoder = zlib.decompressobj(wbits=31)
+    try:
+        plain = decoder.decompress(body, limit + 1)
+    except zlib.error:
+        raise _Damaged("not valid gzip") from None
+    if len(plain) > limit:
+        raise _TooLarge
+    if not decoder.eof:
+        raise _Damaged("gzip ends too early")
+    return plain
+
+
+def _unzstd(body: bytes, limit: int) -> bytes:
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=2**23).stream_reader(body) as reader:
+            plain = bytes(reader.read(limit + 1))
+    except zstandard.ZstdError:
+        raise _Damaged("not valid zstd") from None
+    if len(plain) > limit:
+        raise _TooLarge
+    return plain
+
+
+def _plain(body: bytes, limit: int) -> bytes:
+    return body
+
+
+_REWRITTEN = (b"content-encoding", b"content-length", b"transfer-encoding")
+_DECODERS: dict[str, Callable[[bytes, int], bytes]] = {
+    "identity": _plain,
+    "": _plain,
+    "gzip": _gunzip,
+    "zstd": _unzstd,
+}

@@ -1,0 +1,102 @@
+"""One HTTP client for every OpenAI-compatible server: OpenAI, vLLM, llama.cpp, Ollama, and the embedded one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+
+from service.llm.answer import Constraint, NoDecision, constrain
+
+# No honest chat completion of two integers comes near this; an endless body must not fill the memory.
+_MAX_RESPONSE_BYTES = 256 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Completion:
+    """An answer's text and the server's ``usage``; ``None`` where it said nothing."""
+
+    text: str
+    prompt_tokens: int | None
+    cached_tokens: int | None
+    completion_tokens: int | None
+
+
+class LLMClient:
+    """Chat completions of one server. Time limits are the caller's: cancelling a call closes its connection.
+
+    Args:
+        base_url: up to and including ``/v1``.
+    """
+
+    def __init__(self, base_url: str, *, api_key: str | None = None) -> None:
+        self.base_url = base_url
+        headers = {"Authorization": f"Bearer {api_key}"} if api_key else {}
+        self._http = httpx.AsyncClient(base_url=base_url + "/", headers=headers, timeout=None)
+
+    async def close(self) -> None:
+        """Close every connection."""
+        await self._http.aclose()
+
+    async def models(self) -> list[str]:
+        """Names of the models that the server lists; raises :class:`NoDecision`."""
+        listed = await self._call("GET", "models", None)
+        try:
+            return [str(model["id"]) for model in listed["data"]]
+        except (KeyError, TypeError):
+            raise NoDecision("llm_error", f"{self.base_url}/models: no list of models") from None
+
+    async def complete(self, body: dict[str, Any]) -> Completion:
+        """One chat completion of a whole request body; raises :class:`NoDecision`."""
+        answer = await self._call("POST", "chat/completions", body)
+        try:
+            text = answer["choices"][0]["message"]["content"]
+            usage = answer.get("usage") or {}
+            details = usage.get("prompt_tokens_details") or {}
+            counts = (usage.get("prompt_tokens"), details.get("cached_tokens"), usage.get("completion_tokens"))
+        except (AttributeError, KeyError, IndexError, TypeError):
+            raise NoDecision("llm_error", f"{self.base_url}: a 200 that is no chat completion") from None
+        if not isinstance(text, str):
+            raise NoDecision("llm_error", f"{self.base_url}: a completion without text")
+        return Completion(text, *(count if type(count) is int and count >= 0 else None for count in counts))
+
+    async def _call(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
+        content = bytearray()
+        try:
+            async with self._http.stream(method, path, json=body) as response:
+                async for chunk in response.aiter_bytes():
+                    content += chunk
+                    if len(content) > _MAX_RESPONSE_BYTES:
+                        raise NoDecision("llm_error", f"{self.base_url}: more than {_MAX_RESPONSE_BYTES} bytes")
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            raise NoDecision("llm_error", f"{self.base_url}: {type(error).__name__} {error}") from error
+        if response.status_code != 200:
+            raise NoDecision("llm_status", f"{self.base_url}: HTTP {response.status_code}")
+        try:
+            return json.loads(content)
+        except (ValueError, RecursionError):
+            raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON") from None
+
+
+def chat_body(
+    model: str | None, system: str, user: str, constraint: Constraint, sensor_ids: list[int], velocities: int
+) -> dict[str, Any]:
+    """The request body of one decision: greedy, short, and held to the answer's form where the server can.
+
+    ``cache_prompt`` is llama.cpp's; it is sent only to a server that understood llama.cpp's ``grammar``, because
+    strict servers refuse fields they do not know.
+    """
+    body: dict[str, Any] = {
+        "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
+        "temperature": 0,
+        "max_tokens": 32 if constraint == "json_schema" else 12,
+        "stream": False,
+        **constrain(constraint, sensor_ids, velocities),
+    }
+    if model:
+        body["model"] = model
+    if constraint == "grammar":
+        body["cache_prompt"] = True
+    return body

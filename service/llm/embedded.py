@@ -1,0 +1,43 @@
+"""The embedded LLM: llama.cpp in this process, serving the same HTTP interface as any other on loopback."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+
+import xllamacpp
+
+# llama.cpp sets aside up to 8 GB of host memory for old prompts unless told otherwise.
+_PROMPT_CACHE_MIB = 64
+_ONLY_ERRORS = 1
+
+
+class EmbeddedServer:
+    """A loaded model behind a loopback address. Loading takes seconds and blocks: call it in a thread.
+
+    The server wants a key made at start, so that other users of the machine cannot spend its time.
+
+    Raises:
+        RuntimeError: llama.cpp could not load the file.
+    """
+
+    def __init__(self, gguf: Path, *, threads: int, context: int) -> None:
+        params = xllamacpp.CommonParams()
+        params.model.path = str(gguf)
+        params.cpuparams.n_threads = threads
+        params.cpuparams_batch.n_threads = threads
+        params.n_ctx = context
+        # One slot: the static prefix and the experiences are one prefix for the whole fleet.
+        params.n_parallel = 1
+        params.cache_ram_mib = _PROMPT_CACHE_MIB
+        params.verbosity = _ONLY_ERRORS
+        params.ui = False
+        self.api_key = secrets.token_urlsafe(24)
+        params.api_keys = [self.api_key]
+        self._server: xllamacpp.Server | None = xllamacpp.Server(params)
+        self.base_url = f"{self._server.listening_address}/v1"
+        self.model = gguf.stem
+
+    def close(self) -> None:
+        """Stop the server and free the model; blocks until its threads have ended."""
+        self._server = None

@@ -1,0 +1,150 @@
+"""The LLM that this edge asks: which one, whether it is ready, and how it can be held to the answer's form."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from service.llm.answer import Constraint, NoDecision
+from service.llm.client import Completion, LLMClient, chat_body
+from service.llm.embedded import EmbeddedServer
+from service.model import ModelMissing, embedded_model
+from service.prompt import static_block
+from service.settings import Settings
+from shared.scenario import SCENARIOS
+from shared.wire import Readiness
+
+log = logging.getLogger(__name__)
+
+_RETRY_S = 5.0
+_PROBE_TIMEOUT_S = 60.0
+# No model says this of its own accord, so a server that answers it has obeyed the constraint.
+_PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
+_PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
+
+
+@dataclass(slots=True)
+class _Status:
+    llm: Literal["loading", "ready", "unavailable", "off"]
+    detail: str | None = None
+
+
+class Upstream:
+    """Brings the LLM up in the background and keeps trying while a remote one is down.
+
+    ``/healthz`` and decisions by the policy go on meanwhile. States: ``loading``, ``ready``, ``unavailable``
+    (with the reason in ``detail``), and ``off`` where the service was told to do without.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._status = _Status("off" if settings.mode == "value" else "loading")
+        self._client: LLMClient | None = None
+        self._embedded: EmbeddedServer | None = None
+        self._task: asyncio.Task[None] | None = None
+        self.model = settings.llm_model
+        self.constraint: Constraint = "none"
+
+    @property
+    def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
+        """Where the LLM stands."""
+        return self._status.llm
+
+    def readiness(self) -> Readiness:
+        """What ``/readyz`` says."""
+        ready = self.status == "ready"
+        return Readiness(
+            ready=True,
+            decides="llm" if ready else "policy",
+            llm=self.status,
+            model=self.model,
+            constraint=self.constraint if ready else None,
+            detail=self._status.detail,
+        )
+
+    def start(self) -> None:
+        """Begin loading or probing, unless the LLM is off."""
+        if self.status != "off":
+            self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up")
+
+    async def close(self) -> None:
+        """Stop trying, close connections, free the embedded model."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        if self._client is not None:
+            await self._client.close()
+        if self._embedded is not None:
+            await asyncio.to_thread(self._embedded.close)
+
+    async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
+        """One decision's completion; the caller sets the time limit.
+
+        Raises:
+            NoDecision: no answer, with the reason.
+        """
+        if self._client is None or self.status != "ready":
+            raise NoDecision("llm_loading" if self.status == "loading" else "llm_unavailable", self.status)
+        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
+        return await self._client.complete(body)
+
+    async def _bring_up(self) -> None:
+        while True:
+            try:
+                client = await self._connect()
+                self._status = _Status("ready")
+                log.info("LLM ready: %s at %s, constraint %s", self.model, client.base_url, self.constraint)
+                return
+            except (ModelMissing, RuntimeError) as error:
+                self._status = _Status("unavailable", str(error))
+                log.error("no embedded LLM: %s", error)
+                return
+            except (NoDecision, TimeoutError) as error:
+                self._status = _Status("unavailable", str(error) or f"no answer in {_PROBE_TIMEOUT_S:g} s")
+                log.warning("LLM not ready, next try in %g s: %s", _RETRY_S, self._status.detail)
+                await asyncio.sleep(_RETRY_S)
+
+    async def _connect(self) -> LLMClient:
+        """Reach the server, learn what it obeys, and have it read the static block before a decision pays for it."""
+        settings = self._settings
+        if self._client is None and settings.llm_url is not None:
+            key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
+            self._client = LLMClient(settings.llm_url, api_key=key)
+        elif self._client is None:
+            gguf = embedded_model(settings)
+            self._embedded = await asyncio.to_thread(
+                EmbeddedServer, gguf, threads=settings.embedded_threads, context=settings.llm_context
+            )
+            self._client = LLMClient(self._embedded.base_url, api_key=self._embedded.api_key)
+            self.model = self.model or self._embedded.model
+        async with asyncio.timeout(_PROBE_TIMEOUT_S):
+            if self.model is None:
+                self.model = next(iter(await self._client.models()), None)
+            self.constraint = await self._probe(self._client)
+            paper = SCENARIOS["paper"]
+            first = chat_body(self.model, static_block(paper), "0,50,100,-90,1,100\n", self.constraint, [0], 15)
+            await self._client.complete(first)
+        return self._client
+
+    async def _probe(self, client: LLMClient) -> Constraint:
+        """The first way of constraining that the server really obeys: it may ignore an unknown field silently."""
+        refusal: NoDecision | None = None
+        for constraint in _PROBES:
+            try:
+                body = self._probe_body(constraint)
+                text = (await client.complete(body)).text
+            except NoDecision as failed:
+                if failed.reason != "llm_status":
+                    raise
+                refusal = failed
+                continue
+            if str(_PROBE_SENSOR) in text:
+                return constraint
+        if refusal is not None:
+            await client.complete(self._probe_body("none"))
+        return "none"
+
+    def _probe_body(self, constraint: Constraint) -> dict[str, Any]:
+        return chat_body(self.model, "Answer in words.", "Say hello.", constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)

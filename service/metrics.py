@@ -1,0 +1,53 @@
+"""Every Prometheus name of the edge, in one place. No label carries a mission, UAV or sensor: cardinality."""
+
+from __future__ import annotations
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from prometheus_client.platform_collector import PlatformCollector
+from prometheus_client.process_collector import ProcessCollector
+
+from shared.wire import DecideResponse
+
+_DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
+_OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)
+
+
+class Metrics:
+    """The metrics of one service, in a registry of their own."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        PlatformCollector(registry=self.registry)
+        r = self.registry
+        self.decisions = Counter("aicvds_decisions", "Decisions answered", ["source", "reason"], registry=r)
+        self.decision_seconds = Histogram(
+            "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], registry=r, buckets=_DECISION_BUCKETS
+        )
+        self.overhead_seconds = Histogram(
+            "aicvds_overhead_seconds", "The edge's own share: all but the LLM", registry=r, buckets=_OVERHEAD_BUCKETS
+        )
+        self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
+        self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
+        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens that attention pruned away", registry=r)
+        self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
+        self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
+        self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
+        self.missions = Gauge("aicvds_missions", "Missions held in memory", registry=r)
+
+    def record_decision(self, decision: DecideResponse, *, deadline_ms: int) -> None:
+        """Count one answered decision: source, stages, overhead, tokens, lateness."""
+        self.decisions.labels(decision.source, decision.reason or "none").inc()
+        for stage, milliseconds in decision.latency_ms.items():
+            self.decision_seconds.labels(stage).observe(milliseconds / 1e3)
+        total = decision.latency_ms["total"]
+        self.overhead_seconds.observe((total - decision.latency_ms.get("llm", 0.0)) / 1e3)
+        if total > deadline_ms:
+            self.deadline_missed.inc()
+        tokens = decision.tokens
+        if tokens.server_prompt is None:
+            return
+        self.tokens_saved.inc(tokens.saved)
+        self.llm_tokens.labels("prompt").inc(tokens.server_prompt)
+        self.llm_tokens.labels("cached").inc(tokens.cached or 0)
+        self.llm_tokens.labels("completion").inc(tokens.completion or 0)

@@ -1,0 +1,176 @@
+"""One fleet's state: visiting records, arrival rates, reservations, experiences, pending decisions, learner."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from service.features import FEATURES, filled
+from service.learner import Learner, Sample
+from service.problems import NotFound, Refused
+from service.prompt import experience_text
+from service.settings import Settings
+from shared.channel import FloatArray
+from shared.scenario import Scenario, scenario_named
+from shared.wire import MissionSpec, MissionStatus, Mode, Outcome, UavState
+
+# An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
+_PENDING_PER_UAV = 8
+_APPLIED_PER_UAV = 64
+_RESERVED_STEPS = 4
+# Weight, in steps, of the scenario's mean arrival rate against what is observed.
+_PRIOR_STEPS = 2.0
+_NEVER = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A decision whose outcome is still to come. ``sample`` is None where the modules had no part in it."""
+
+    decision_id: str
+    uav_id: int
+    step: int
+    sensor_id: int
+    velocity: int
+    row: str
+    sample: Sample | None
+
+
+class Mission:
+    """One fleet's state. Only the event loop touches it, apart from the learner's own thread.
+
+    Raises:
+        Refused: the spec names an unknown scenario.
+    """
+
+    def __init__(self, mission_id: str, spec: MissionSpec, settings: Settings) -> None:
+        try:
+            named = isinstance(spec.scenario, str)
+            self.scenario: Scenario = scenario_named(spec.scenario) if named else spec.scenario  # type: ignore[arg-type, assignment]
+        except ValueError as error:
+            raise Refused("scenario", str(error)) from None
+        self.mission_id = mission_id
+        self.spec = spec
+        self.mode: Mode = spec.mode or settings.mode
+        self.top_k = spec.top_k or settings.top_k
+        self.experiences: list[str] = []
+        self.decisions = 0
+        self.feedback = 0
+        levels = self.scenario.max_velocity + 1
+        self.learner = Learner(FEATURES, levels, learning_rate=settings.learning_rate, seed=spec.seed)
+        sensors = self.scenario.sensors
+        self.visits = np.full(sensors, _NEVER, dtype=np.int64)
+        self._before_visit: dict[int, int] = {}
+        self._seen = np.full(sensors, _NEVER, dtype=np.int64)
+        self._queue = np.zeros(sensors)
+        self._arrivals = np.full(sensors, self.scenario.mean_arrival_rate * _PRIOR_STEPS)
+        self._exposure = np.full(sensors, _PRIOR_STEPS)
+        self._reserved: OrderedDict[int, dict[int, int]] = OrderedDict()
+        self._pending: OrderedDict[str, Pending] = OrderedDict()
+        self._applied: OrderedDict[str, None] = OrderedDict()
+        self._experience_limit = settings.experiences
+
+    @property
+    def rates(self) -> FloatArray:
+        """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
+        rates: FloatArray = self._arrivals / self._exposure
+        return rates
+
+    def check(self, uav: UavState) -> None:
+        """Refuse, before anything is recorded, what this mission's world does not have.
+
+        Raises:
+            Refused: an unknown UAV or sensor, or a queue past its capacity.
+            NotFound: an outcome of a decision that this mission does not know.
+        """
+        if uav.uav_id >= self.scenario.uavs:
+            raise Refused("uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
+        if (highest := max(uav.sensors.id)) >= self.scenario.sensors:
+            raise Refused("sensors.id", f"sensor {highest} is unknown: there are {self.scenario.sensors}, from 0")
+        fullest = max((q for q in uav.sensors.queue if q is not None), default=0.0)
+        if fullest > self.scenario.queue_capacity:
+            raise Refused("sensors.queue", f"{fullest:g} packets exceed the capacity of {self.scenario.queue_capacity}")
+        if uav.outcome is not None:
+            self.find(uav.outcome.decision_id, "outcome.decision_id")
+
+    def find(self, decision_id: str, field: str = "decision_id") -> Literal["pending", "applied"]:
+        """Where a decision stands; raises :class:`NotFound` for one that this mission does not know."""
+        if decision_id in self._pending:
+            return "pending"
+        if decision_id in self._applied:
+            return "applied"
+        raise NotFound(field, f"mission {self.mission_id} knows no decision {decision_id} (or no longer)")
+
+    def observe(self, uav: UavState) -> None:
+        """Learn arrival rates from the beacons that are news.
+
+        Between two beacons of one sensor, with no visit and no overflow between them, its queue grew by the arrivals.
+        """
+        ids = np.asarray(uav.sensors.id)
+        seen = filled(uav.sensors.last_seen, _NEVER).astype(np.int64)
+        queue = filled(uav.sensors.queue)
+        news = seen > self._seen[ids]
+        undisturbed = (self._seen[ids] >= 0) & (self.visits[ids] < self._seen[ids])
+        usable = news & undisturbed & (queue < self.scenario.queue_capacity) & (queue >= self._queue[ids])
+        self._arrivals[ids[usable]] += (queue - self._queue[ids])[usable]
+        self._exposure[ids[usable]] += (seen - self._seen[ids])[usable]
+        self._seen[ids[news]] = seen[news]
+        self._queue[ids[news]] = queue[news]
+
+    def reserved(self, step: int, uav_id: int) -> frozenset[int]:
+        """Sensors that other UAVs were given this step."""
+        return frozenset(s for uav, s in self._reserved.get(step, {}).items() if uav != uav_id)
+
+    def commit(self, decision: Pending) -> None:
+        """Reserve the sensor, note the visit, and wait for the outcome."""
+        self._reserved.setdefault(decision.step, {})[decision.uav_id] = decision.sensor_id
+        while len(self._reserved) > _RESERVED_STEPS:
+            self._reserved.popitem(last=False)
+        self._before_visit[decision.sensor_id] = int(self.visits[decision.sensor_id])
+        self.visits[decision.sensor_id] = max(decision.step, self.visits[decision.sensor_id])
+        self._pending[decision.decision_id] = decision
+        while len(self._pending) > _PENDING_PER_UAV * self.scenario.uavs:
+            self._pending.popitem(last=False)
+        self.decisions += 1
+
+    def apply(self, outcome: Outcome) -> Sample | None:
+        """Record the outcome of a pending decision; returns what the modules saw, to learn from.
+
+        A failed transmission was no visit: the visiting record goes back to what it was.
+        """
+        decision = self._pending.pop(outcome.decision_id)
+        self._applied[decision.decision_id] = None
+        while len(self._applied) > _APPLIED_PER_UAV * self.scenario.uavs:
+            self._applied.popitem(last=False)
+        self.feedback += 1
+        if outcome.failed and self.visits[decision.sensor_id] == decision.step:
+            self.visits[decision.sensor_id] = self._before_visit.get(decision.sensor_id, _NEVER)
+        self._remember(experience_text(decision.row, decision.sensor_id, decision.velocity, outcome.cost))
+        return decision.sample
+
+    def _remember(self, line: str) -> None:
+        """Append only, so that the LLM's prefix cache lives; at the limit the older half goes at once."""
+        if self._experience_limit == 0:
+            return
+        self.experiences.append(line)
+        if len(self.experiences) > self._experience_limit:
+            del self.experiences[: len(self.experiences) - max(1, self._experience_limit // 2)]
+
+    def status(self) -> MissionStatus:
+        """What ``GET /missions/{id}`` says."""
+        return MissionStatus(
+            mission_id=self.mission_id,
+            scenario=self.scenario,
+            mode=self.mode,
+            top_k=self.top_k,
+            seed=self.spec.seed,
+            decisions=self.decisions,
+            feedback=self.feedback,
+            experiences=len(self.experiences),
+            learner_updates=self.learner.updates,
+            learner_loss=self.learner.last_loss,
+            visits={int(s): int(self.visits[s]) for s in np.flatnonzero(self.visits >= 0)},
+        )

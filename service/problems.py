@@ -1,0 +1,92 @@
+"""Errors as RFC 9457 problem documents that name the field at fault."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from starlette.exceptions import HTTPException
+
+from shared.wire import Problem
+
+log = logging.getLogger(__name__)
+
+CONTENT_TYPE = "application/problem+json"
+
+
+class Refused(Exception):
+    """A request that cannot be served as it is; nothing was recorded for it."""
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY
+
+    def __init__(self, field: str, detail: str) -> None:
+        super().__init__(f"{field}: {detail}")
+        self.field = field
+        self.detail = detail
+
+
+class NotFound(Refused):
+    """The request names something that the edge does not know."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+class Conflict(Refused):
+    """The request contradicts what is there."""
+
+    status = HTTPStatus.CONFLICT
+
+
+class TooMany(Refused):
+    """A bound on what the edge holds is reached."""
+
+    status = HTTPStatus.TOO_MANY_REQUESTS
+
+
+def problem_response(status: int, detail: str, errors: Sequence[dict[str, str]] = ()) -> Response:
+    """An ``application/problem+json`` response; never echoes what was sent."""
+    body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
+    return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
+
+
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries for the problems that a route can answer."""
+    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
+    return {s: {"description": HTTPStatus(s).phrase, "content": {CONTENT_TYPE: schema}} for s in statuses}
+
+
+def install(app: FastAPI) -> None:
+    """Turn every error of the app into a problem document."""
+
+    @app.exception_handler(Refused)
+    async def refused(_: Request, error: Refused) -> Response:
+        return problem_response(error.status, str(error), [{"field": error.field, "problem": error.detail}])
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(_: Request, error: RequestValidationError) -> Response:
+        errors = [{"field": _path(e["loc"]), "problem": e["msg"]} for e in error.errors()[:20]]
+        return problem_response(422, f"{errors[0]['field']}: {errors[0]['problem']}", errors)
+
+    @app.exception_handler(HTTPException)
+    async def http(_: Request, error: HTTPException) -> Response:
+        response = problem_response(error.status_code, str(error.detail))
+        response.headers.update(error.headers or {})
+        return response
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> Response:
+        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+        return problem_response(500, "the edge failed; its log says more")
+
+
+def _path(location: Sequence[int | str]) -> str:
+    parts = list(location[1:]) if location and location[0] in ("body", "path", "query", "header") else list(location)
+    # A JSON syntax error has the byte offset for a location.
+    if not parts or (len(parts) == 1 and isinstance(parts[0], int)):
+        return "body"
+    return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in parts).removeprefix(".")

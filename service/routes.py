@@ -1,0 +1,118 @@
+"""The HTTP interface: thin routes over the engine."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Body, Depends, Request, Response
+from prometheus_client import generate_latest
+
+from service.engine import Engine
+from service.llm.upstream import Upstream
+from service.metrics import Metrics
+from service.problems import documented
+from shared.wire import (
+    BatchRequest,
+    BatchResponse,
+    DecideRequest,
+    DecideResponse,
+    FeedbackRequest,
+    FeedbackResponse,
+    MissionId,
+    MissionSpec,
+    MissionStatus,
+    Readiness,
+)
+
+router = APIRouter()
+
+EXAMPLE = {
+    "step": 0,
+    "uav_id": 0,
+    "position": [500.0, 450.0],
+    "sensors": {
+        "id": [0, 1, 2, 3],
+        "x": [420.0, 650.0, 300.0, 900.0],
+        "y": [380.0, 520.0, 700.0, 100.0],
+        "queue": [52.0, 17.0, 33.0, None],
+        "battery": [49.0, 50.0, 47.5, None],
+        "channel_gain": [-83.1, -96.0, -109.2, None],
+        "last_seen": [0, 0, 0, None],
+    },
+}
+
+
+def _engine(request: Request) -> Engine:
+    engine: Engine = request.state.engine
+    return engine
+
+
+TheEngine = Annotated[Engine, Depends(_engine)]
+
+
+@router.post("/decide", responses=documented(400, 404, 413, 415, 422, 429), tags=["decisions"])
+async def decide(
+    body: Annotated[DecideRequest, Body(openapi_examples={"paper": {"value": EXAMPLE}})],
+    engine: TheEngine,
+    response: Response,
+) -> DecideResponse:
+    """Which sensor to collect from, and how fast to fly the next step."""
+    answer = await engine.decide(body)
+    response.headers["Server-Timing"] = ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())
+    return answer
+
+
+@router.post("/decide/batch", responses=documented(400, 404, 413, 415, 422, 429), tags=["decisions"])
+async def decide_batch(body: BatchRequest, engine: TheEngine) -> BatchResponse:
+    """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
+    return BatchResponse(decisions=await engine.decide_batch(body))
+
+
+@router.post("/feedback", responses=documented(400, 404, 413, 415, 422), tags=["decisions"])
+async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
+    """What came of a decision. Sent twice, it is applied once."""
+    return engine.feedback(body)
+
+
+@router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422, 429), tags=["missions"])
+async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
+    """Make a mission with its scenario, mode and k; the same again changes nothing."""
+    return engine.missions.put(mission_id, body).status()
+
+
+@router.get("/missions/{mission_id}", responses=documented(404, 422), tags=["missions"])
+async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
+    """Where a mission stands."""
+    return engine.missions.get(mission_id).status()
+
+
+@router.delete("/missions/{mission_id}", status_code=204, responses=documented(404, 422), tags=["missions"])
+async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
+    """Forget a mission and what it learned."""
+    engine.missions.delete(mission_id)
+
+
+@router.get("/healthz", tags=["operation"])
+async def healthz() -> dict[str, str]:
+    """The process is alive; touches nothing else."""
+    return {"status": "ok"}
+
+
+@router.get("/readyz", tags=["operation"])
+async def readyz(request: Request) -> Readiness:
+    """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``."""
+    upstream: Upstream = request.state.upstream
+    return upstream.readiness()
+
+
+@router.get("/metrics", tags=["operation"], response_class=Response)
+async def metrics(request: Request) -> Response:
+    """Prometheus metrics."""
+    owned: Metrics = request.state.metrics
+    return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+@router.get("/", tags=["operation"])
+async def index(request: Request) -> dict[str, str]:
+    """Where things are."""
+    return {"service": request.app.title, "version": request.app.version, "docs": "/docs", "metrics": "/metrics"}

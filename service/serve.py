@@ -1,0 +1,69 @@
+"""``aicvds serve``: the edge as a process."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+from pydantic import ValidationError
+
+# In-flight decisions end within their deadline; past this, shutting down does not wait for them.
+_SHUTDOWN_S = 10
+_CONCURRENCY = 256
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Run the edge decision service.
+
+    Decides at once by its LLM-free policy, and by the LLM as soon as that is loaded (watch /readyz). With no
+    AICVDS_LLM_URL it embeds SmolLM2-135M; `aicvds model fetch` brings the file. Everything else is set by
+    environment variables AICVDS_*: see the README's table of settings.
+
+    Try it:  curl localhost:8000/readyz
+    """
+
+    host: str = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 for every interface (put it behind something that authenticates)."""
+    port: Annotated[int, tyro.conf.arg(metavar="0-65535")] = 8000
+    """Port to listen on; 0 picks a free one."""
+
+
+def main(argv: list[str]) -> int:
+    """Serve until SIGTERM or Ctrl-C; returns the exit code."""
+    args = tyro.cli(Serve, prog="aicvds serve", args=argv)
+    if not 0 <= args.port <= 65535:
+        print(f"aicvds serve: --port {args.port} is not between 0 and 65535", file=sys.stderr)
+        return 2
+
+    from service.settings import Settings
+
+    try:
+        settings = Settings()
+    except ValidationError as error:
+        for fault in error.errors():
+            name = "AICVDS_" + "_".join(str(part) for part in fault["loc"]).upper()
+            print(f"aicvds serve: {name}: {fault['msg']}", file=sys.stderr)
+        return 2
+
+    import logging
+
+    import uvicorn
+
+    from service.app import create_app
+
+    logging.basicConfig(level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # httpx logs every request at level info, address included.
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+    uvicorn.run(
+        create_app(settings),
+        host=args.host,
+        port=args.port,
+        log_level=settings.log_level,
+        timeout_graceful_shutdown=_SHUTDOWN_S,
+        limit_concurrency=_CONCURRENCY,
+        access_log=settings.log_level == "debug",
+    )
+    return 0

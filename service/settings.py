@@ -1,0 +1,84 @@
+"""Every setting of the edge service, in one place. Environment variables carry the prefix ``AICVDS_``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, SecretStr, field_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from shared.wire import Mode
+
+
+def _default_cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on, which in a container is fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Settings(BaseSettings):
+    """Settings of one edge service.
+
+    Raises:
+        pydantic.ValidationError: a variable is out of bounds; the message names the field.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", validate_default=True)
+
+    # An OpenAI-compatible server, up to and including /v1. Unset: the embedded llama.cpp.
+    llm_url: str | None = None
+    # The model to ask for. Unset: the first that the server lists.
+    llm_model: str | None = None
+    llm_api_key: SecretStr | None = None
+    # Another model file for the embedded llama.cpp. Unset: the one that `aicvds model fetch` brought.
+    llm_gguf: Path | None = None
+    # Threads of the embedded llama.cpp. 0: cores - 1, because with as many threads as cores and
+    # anything else running, llama.cpp's spinning workers slow each token a hundredfold.
+    llm_threads: int = Field(0, ge=0, le=256)
+    # Tokens of the embedded model's context: static prefix, experiences and 100 rows fit in a third of it.
+    llm_context: int = Field(4096, ge=512, le=131_072)
+
+    # Who decides by default: `llm` (the paper's method) or `value` (what the modules learned; no LLM is started).
+    mode: Mode = "llm"
+    # Milliseconds from request to answer unless the request says otherwise. A third of the paper's 10 s
+    # step, so that three UAVs deciding one after another still fit into it.
+    deadline_ms: int = Field(3000, ge=10, le=60_000)
+    # Sensors that the attention module keeps for the prompt (k in the paper).
+    top_k: int = Field(5, ge=1, le=100)
+    # Experiences in the prompt before the oldest half is dropped. Appending keeps the LLM's prefix
+    # cache; dropping costs one prefill of what stays, so it happens rarely.
+    experiences: int = Field(12, ge=0, le=200)
+    # Adam's step size for the attention and velocity modules (the paper's table).
+    learning_rate: float = Field(5e-4, gt=0, le=1)
+
+    # US dollars a million tokens, for the price in the token accounting. 0: the embedded model costs nothing.
+    price_input: float = Field(0.0, ge=0)
+    price_cached: float = Field(0.0, ge=0)
+    price_output: float = Field(0.0, ge=0)
+
+    # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take about 0.6 MB.
+    max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
+    # Missions held in memory at once; one more is refused until another is deleted.
+    max_missions: int = Field(1000, ge=1, le=1_000_000)
+    # Where the model file and the token vocabulary live.
+    cache_dir: Path = Field(default_factory=_default_cache)
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @field_validator("llm_url")
+    @classmethod
+    def _http_url(cls, url: str | None) -> str | None:
+        if url is None or url == "":
+            return None
+        if not url.startswith(("http://", "https://")):
+            raise ValueError("must start with http:// or https://, for example http://localhost:8080/v1")
+        return url.rstrip("/")
+
+    @property
+    def embedded_threads(self) -> int:
+        """Threads for the embedded llama.cpp: the setting, or cores - 1, at least 1."""
+        return self.llm_threads or max(1, usable_cores() - 1)

@@ -1,0 +1,92 @@
+"""One decision in the making: a UAV's augmented state, and what the attention module made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from service.attention import top_k
+from service.features import FEATURES, State, augment
+from service.learner import Sample
+from service.mission import Mission, Pending
+from service.prompt import row_text
+from shared.wire import Candidate, UavState
+
+
+@dataclass(slots=True)
+class View:
+    """A UAV's view at one step. ``rows`` index the state's arrays: the k sensors kept, best first."""
+
+    uav_id: int
+    step: int
+    state: State
+    rows: list[int] = field(default_factory=list)
+    candidates: list[Candidate] = field(default_factory=list)
+    _admissible: list[int] = field(default_factory=list)
+    _features: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, FEATURES), np.float32))
+    _contexts: Tensor = field(default_factory=lambda: torch.empty(0))
+
+    @classmethod
+    def of(cls, mission: Mission, uav: UavState, step: int) -> Self:
+        """Augment what the UAV reported with what its mission knows."""
+        state = augment(
+            uav,
+            step,
+            mission.scenario,
+            visits=mission.visits,
+            rates=mission.rates,
+            reserved=mission.reserved(step, uav.uav_id),
+        )
+        return cls(uav_id=uav.uav_id, step=step, state=state)
+
+    @property
+    def offered(self) -> list[int]:
+        """IDs of the sensors kept, best first."""
+        return [candidate.sensor_id for candidate in self.candidates]
+
+    def attend(self, mission: Mission) -> None:
+        """Score the admissible sensors and keep the mission's top k."""
+        self._admissible = np.flatnonzero(self.state.admissible).tolist()
+        self._features = self.state.features(mission.scenario)
+        if not self._admissible:
+            return
+        scores, self._contexts = mission.learner.current.score(self._features)
+        kept = top_k(scores, mission.top_k)
+        self.rows = [self._admissible[i] for i in kept]
+        self.candidates = [
+            Candidate(sensor_id=int(self.state.ids[self._admissible[i]]), score=round(float(scores[i]), 6))
+            for i in kept
+        ]
+
+    def by_value(self, mission: Mission) -> tuple[int, int]:
+        """The best-scored sensor and the best velocity for it, by the learned values."""
+        row = self.rows[0]
+        distance = self.state.normalised_distance(row, mission.scenario)
+        values = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], distance)
+        return int(self.state.ids[row]), int(values.argmax())
+
+    def pending(self, mission: Mission, decision_id: str, sensor_id: int, velocity: int) -> Pending:
+        """The decision, as its outcome will need it."""
+        row = int(np.flatnonzero(self.state.ids == sensor_id)[0])
+        sample = None
+        if row in self._admissible:
+            sample = Sample(
+                features=self._features,
+                chosen=self._admissible.index(row),
+                distance=self.state.normalised_distance(row, mission.scenario),
+                velocity=velocity,
+            )
+        return Pending(
+            decision_id=decision_id,
+            uav_id=self.uav_id,
+            step=self.step,
+            sensor_id=sensor_id,
+            velocity=velocity,
+            row=row_text(self.state, row, mission.scenario),
+            sample=sample,
+        )
