@@ -85,7 +85,7 @@ class Learner:
 
 
 def rehearse() -> None:
-    """Do one update on nothing: torch imports a second's worth of modules at its first, which no decision should pay."""
+    """Update once on nothing: at its first update torch imports a second's worth of modules."""
     learner = Learner(1, 1, learning_rate=1e-3, seed=0)
     learner.update(Sample(np.zeros((2, 1), np.float32), 0, 0.0, 0), 0.0)
     learner.current.score(np.zeros((2, 1), np.float32))

@@ -95,13 +95,18 @@ def _gunzip(body: bytes, limit: int) -> bytes:
 
 
 def _unzstd(body: bytes, limit: int) -> bytes:
+    """The stream reader bounds what is unpacked but hides a missing end, the object sees the end but has no bound."""
+    decompressor = zstandard.ZstdDecompressor(max_window_size=2**23)
     try:
-        with zstandard.ZstdDecompressor(max_window_size=2**23).stream_reader(body) as reader:
-            plain = bytes(reader.read(limit + 1))
+        with decompressor.stream_reader(body) as reader:
+            if len(reader.read(limit + 1)) > limit:
+                raise _TooLarge
+        decoder = decompressor.decompressobj()
+        plain = decoder.decompress(body)
     except zstandard.ZstdError:
         raise _Damaged("not valid zstd") from None
-    if len(plain) > limit:
-        raise _TooLarge
+    if not decoder.eof:
+        raise _Damaged("zstd ends too early")
     return plain
 
 

@@ -1,0 +1,54 @@
+"""Fixtures shared by every test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+
+from service.app import create_app
+from service.settings import Settings
+from tests.running import serving
+
+Edge = Callable[..., httpx.Client]
+
+
+@pytest.fixture
+def edge() -> Iterator[Edge]:
+    """Starts a real edge with the settings given (no LLM unless told) and returns a client of it."""
+    with ExitStack() as stack:
+
+        def start(**settings: Any) -> httpx.Client:
+            url = stack.enter_context(serving(create_app(Settings(**{"mode": "value", **settings}))))
+            return stack.enter_context(httpx.Client(base_url=url, timeout=30))
+
+        yield start
+
+
+@pytest.fixture
+def report() -> Callable[..., dict[str, Any]]:
+    """Makes the body of a valid ``/decide``: four sensors heard at ``step`` and one never heard."""
+
+    def make(**changes: Any) -> dict[str, Any]:
+        step = changes.get("step", 0)
+        body: dict[str, Any] = {
+            "mission_id": "test",
+            "uav_id": 0,
+            "step": step,
+            "position": [500.0, 450.0],
+            "sensors": {
+                "id": [0, 1, 2, 3, 4],
+                "x": [420.0, 650.0, 300.0, 520.0, 900.0],
+                "y": [380.0, 520.0, 700.0, 500.0, 100.0],
+                "queue": [52, 17, 33, 8, None],
+                "battery": [49.0, 50.0, 47.5, 50.0, None],
+                "channel_gain": [-83.1, -96.0, -109.2, -81.0, None],
+                "last_seen": [step, step, step, step, None],
+            },
+        }
+        return {**body, **changes}
+
+    return make

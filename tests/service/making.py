@@ -1,0 +1,48 @@
+"""Missions and views for tests of the service's parts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from service.mission import Mission
+from service.settings import Settings
+from service.view import View
+from shared.scenario import SCENARIOS
+from shared.wire import MissionSpec, SensorColumns, UavState
+
+PAPER = SCENARIOS["paper"]
+
+
+def mission(**settings: Any) -> Mission:
+    return Mission("test", MissionSpec(), Settings(**{"mode": "value", **settings}))
+
+
+def uav(
+    *,
+    step: int = 0,
+    uav_id: int = 0,
+    position: tuple[float, float] = (500.0, 500.0),
+    x: list[float] | None = None,
+    queue: list[float | None] | None = None,
+    last_seen: list[int | None] | None = None,
+) -> UavState:
+    """A UAV over the area's centre that hears sensors on a line to the east, 100 m apart, unless told otherwise."""
+    queue = queue if queue is not None else [10.0 * (i + 1) for i in range(6)]
+    n = len(queue)
+    seen = last_seen if last_seen is not None else [None if q is None else step for q in queue]
+    sensors = SensorColumns(
+        id=list(range(n)),
+        x=x if x is not None else [500.0 + 100.0 * i for i in range(n)],
+        y=[500.0] * n,
+        queue=queue,
+        battery=[None if q is None else 50.0 for q in queue],
+        channel_gain=[None if q is None else -90.0 for q in queue],
+        last_seen=seen,
+    )
+    return UavState(uav_id=uav_id, position=list(position), sensors=sensors)
+
+
+def attended(mission: Mission, state: UavState, step: int = 0) -> View:
+    view = View.of(mission, state, step)
+    view.attend(mission)
+    return view

@@ -1,0 +1,246 @@
+"""The HTTP interface against a real server: what it answers, what it refuses, and that refusals leave no trace."""
+
+import gzip
+import json
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+import zstandard
+
+Body = dict[str, Any]
+Report = Callable[..., Body]
+Edge = Callable[..., httpx.Client]
+
+
+def columns(n: int) -> Body:
+    """n sensors, all heard."""
+    return {
+        "id": list(range(n)),
+        "x": [1.0] * n,
+        "y": [1.0] * n,
+        "queue": [1] * n,
+        "battery": [1.0] * n,
+        "channel_gain": [-90.0] * n,
+        "last_seen": [0] * n,
+    }
+
+
+def fields(response: httpx.Response) -> list[str]:
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert problem["status"] == response.status_code
+    return [error["field"] for error in problem["errors"]]
+
+
+def test_decides_and_says_how(edge: Edge, report: Report) -> None:
+    response = edge().post("/decide", json=report())
+    assert response.status_code == 200, response.text
+    answer = response.json()
+    assert (answer["source"], answer["reason"]) == ("policy", "mode_value")
+    assert answer["sensor_id"] in [0, 1, 2, 3]
+    assert 0 <= answer["velocity"] <= 14
+    assert answer["sensor_id"] == answer["top_k"][0]["sensor_id"]
+    scores = [c["score"] for c in answer["top_k"]]
+    assert scores == sorted(scores, reverse=True)
+    assert len(scores) == 4
+    assert answer["tokens"]["saved"] == answer["tokens"]["state_uncompressed"] - answer["tokens"]["state"] > 0
+    stages = response.headers["server-timing"]
+    assert all(f"{stage};dur=" in stages for stage in ("augment", "attend", "prompt", "check", "total"))
+
+
+def test_same_seed_same_decision_on_two_edges(edge: Edge, report: Report) -> None:
+    answers = [client.post("/decide", json=report()).json() for client in (edge(), edge())]
+    assert answers[0]["top_k"] == answers[1]["top_k"]
+    assert answers[0]["velocity"] == answers[1]["velocity"]
+
+
+def test_uavs_of_one_step_get_different_sensors(edge: Edge, report: Report) -> None:
+    client = edge()
+    given = [client.post("/decide", json=report(uav_id=uav)).json()["sensor_id"] for uav in range(3)]
+    assert len(set(given)) == 3
+    # A UAV that asks again gives its own reservation back.
+    assert client.post("/decide", json=report(uav_id=0)).json()["sensor_id"] == given[0]
+
+
+def test_batch_reserves_in_order(edge: Edge, report: Report) -> None:
+    uavs = [{k: report()[k] for k in ("position", "sensors")} | {"uav_id": uav} for uav in range(3)]
+    response = edge().post("/decide/batch", json={"mission_id": "test", "step": 0, "uavs": uavs})
+    assert response.status_code == 200, response.text
+    given = [d["sensor_id"] for d in response.json()["decisions"]]
+    assert len(set(given)) == 3
+
+
+def test_a_uav_that_has_heard_nothing_still_gets_an_answer(edge: Edge, report: Report) -> None:
+    body = report()
+    for column in ("queue", "battery", "channel_gain", "last_seen"):
+        body["sensors"][column] = [None] * 5
+    answer = edge().post("/decide", json=body).json()
+    assert (answer["source"], answer["reason"], answer["top_k"]) == ("policy", "no_candidate", [])
+
+
+def test_feedback_is_applied_once(edge: Edge, report: Report) -> None:
+    client = edge()
+    decision = client.post("/decide", json=report()).json()["decision_id"]
+    outcome = {"decision_id": decision, "cost": 0.5}
+    results = [client.post("/feedback", json={"mission_id": "test", **outcome}).json()["result"] for _ in range(3)]
+    assert results == ["applied", "duplicate", "duplicate"]
+    # The same outcome with the next request is a duplicate too, and no error.
+    assert client.post("/decide", json=report(step=1, outcome=outcome)).status_code == 200
+    assert client.get("/missions/test").json()["feedback"] == 1
+
+
+def test_feedback_for_an_unknown_decision_is_a_404(edge: Edge, report: Report) -> None:
+    client = edge()
+    client.post("/decide", json=report())
+    unknown = {"decision_id": "0" * 32, "cost": 0.5}
+    response = client.post("/feedback", json={"mission_id": "test", **unknown})
+    assert (response.status_code, fields(response)) == (404, ["decision_id"])
+    response = client.post("/feedback", json={"mission_id": "nobody", **unknown})
+    assert (response.status_code, fields(response)) == (404, ["mission_id"])
+    response = client.post("/decide", json=report(step=1, outcome=unknown))
+    assert (response.status_code, fields(response)) == (404, ["outcome.decision_id"])
+    assert client.get("/missions/test").json()["decisions"] == 1
+
+
+def test_a_failed_transmission_was_no_visit(edge: Edge, report: Report) -> None:
+    client = edge()
+    answer = client.post("/decide", json=report(step=4)).json()
+    assert client.get("/missions/test").json()["visits"] == {str(answer["sensor_id"]): 4}
+    client.post(
+        "/feedback", json={"mission_id": "test", "decision_id": answer["decision_id"], "cost": 1, "failed": True}
+    )
+    assert client.get("/missions/test").json()["visits"] == {}
+
+
+BAD: list[tuple[str, Callable[[Body], Any], str]] = [
+    ("no sensors", lambda b: b["sensors"].update({k: [] for k in b["sensors"]}), "sensors.id"),
+    ("no sensors column", lambda b: b.pop("sensors"), "sensors"),
+    ("ragged", lambda b: b["sensors"]["queue"].pop(), "sensors"),
+    ("duplicate IDs", lambda b: b["sensors"]["id"].__setitem__(1, 0), "sensors"),
+    ("unknown sensor", lambda b: b["sensors"]["id"].__setitem__(1, 77), "sensors.id"),
+    ("unknown UAV", lambda b: b.update(uav_id=3), "uav_id"),
+    ("negative queue", lambda b: b["sensors"]["queue"].__setitem__(0, -1), "sensors.queue[0]"),
+    ("queue past its capacity", lambda b: b["sensors"]["queue"].__setitem__(0, 61), "sensors.queue"),
+    ("string for a number", lambda b: b["sensors"]["queue"].__setitem__(0, "5"), "sensors.queue[0]"),
+    ("half a beacon", lambda b: b["sensors"]["queue"].__setitem__(0, None), "sensors"),
+    ("beacon from the future", lambda b: b["sensors"]["last_seen"].__setitem__(0, 1), "body"),
+    ("true for a step", lambda b: b.update(step=True), "step"),
+    ("three coordinates", lambda b: b.update(position=[1.0, 2.0, 3.0]), "position"),
+    ("unknown field", lambda b: b.update(velocity=3), "velocity"),
+    ("mission ID with a slash", lambda b: b.update(mission_id="a/b"), "mission_id"),
+    ("lone surrogate", lambda b: b.update(mission_id="\ud800"), "mission_id"),
+    ("cost below zero", lambda b: b.update(outcome={"decision_id": "0" * 32, "cost": -1}), "outcome.cost"),
+    ("no time at all", lambda b: b.update(deadline_ms=0), "deadline_ms"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "field"), [case[1:] for case in BAD], ids=[case[0] for case in BAD])
+def test_bad_input_is_refused_by_field_and_recorded_nowhere(
+    edge: Edge, report: Report, spoil: Callable[[Body], Any], field: str
+) -> None:
+    client, body = edge(), report()
+    spoil(body)
+    response = client.post("/decide", content=json.dumps(body), headers={"content-type": "application/json"})
+    assert response.status_code == 422, response.text
+    assert any(name.startswith(field) for name in fields(response)), response.text
+    assert client.get("/missions/test").status_code == 404
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "9" * 5000])
+def test_numbers_that_are_none(edge: Edge, report: Report, number: str) -> None:
+    text = json.dumps(report()).replace("-83.1", number)
+    assert number in text
+    client = edge()
+    response = client.post("/decide", content=text, headers={"content-type": "application/json"})
+    assert response.status_code in (400, 422)
+    assert response.headers["content-type"] == "application/problem+json"
+    assert client.get("/missions/test").status_code == 404
+
+
+@pytest.mark.parametrize(("body", "status"), [(b"", 422), (b"{", 422), (b"\xff", 400), (b"[" * 100_000, 400)])
+def test_bodies_that_are_no_json(edge: Edge, body: bytes, status: int) -> None:
+    response = edge().post("/decide", content=body, headers={"content-type": "application/json"})
+    assert response.status_code in (400, 422), response.text
+    assert response.headers["content-type"] == "application/problem+json"
+
+
+def test_too_many_sensors(edge: Edge, report: Report) -> None:
+    client = edge(max_body_bytes=200_000_000)
+    response = client.post("/decide", json=report(sensors=columns(1_000_000)))
+    assert response.status_code == 422
+    assert "sensors.id" in fields(response)
+    response = edge().post("/decide", json=report(sensors=columns(1_000_000)))
+    assert (response.status_code, fields(response)) == (413, ["body"])
+
+
+def test_a_hundred_megabytes_are_refused_unread(edge: Edge) -> None:
+    client = edge()
+
+    def endless() -> Any:
+        for _ in range(100):
+            yield b" " * 1_000_000
+
+    for content in (b" " * 100_000_000, endless()):
+        try:
+            response = client.post("/decide", content=content, headers={"content-type": "application/json"})
+        except httpx.WriteError:
+            # The edge hung up while this side was still sending, which is its right.
+            continue
+        assert (response.status_code, fields(response)) == (413, ["body"])
+    assert client.get("/healthz").status_code == 200
+
+
+@pytest.mark.parametrize(("encoding", "squeeze"), [("gzip", gzip.compress), ("zstd", zstandard.compress)])
+def test_compressed_bodies(edge: Edge, report: Report, encoding: str, squeeze: Callable[[bytes], bytes]) -> None:
+    client, headers = edge(), {"content-type": "application/json", "content-encoding": encoding}
+    packed = squeeze(json.dumps(report()).encode())
+    assert client.post("/decide", content=packed, headers=headers).status_code == 200
+    bomb = client.post("/decide", content=squeeze(b" " * 50_000_000), headers=headers)
+    assert (bomb.status_code, fields(bomb)) == (413, ["body"])
+    damaged = client.post("/decide", content=packed[:20], headers=headers)
+    assert (damaged.status_code, fields(damaged)) == (400, ["body"])
+    assert client.post("/decide", content=b"x", headers={**headers, "content-encoding": "br"}).status_code == 415
+
+
+def test_missions(edge: Edge, report: Report) -> None:
+    client = edge(max_missions=2)
+    made = client.put("/missions/a", json={"scenario": "stress", "top_k": 3})
+    assert made.status_code == 200, made.text
+    assert (made.json()["scenario"]["link_share"], made.json()["top_k"]) == (0.35, 3)
+    assert client.put("/missions/a", json={"scenario": "stress", "top_k": 3}).status_code == 200
+    assert client.put("/missions/a", json={"scenario": "paper"}).status_code == 409
+    assert len(client.post("/decide", json=report(mission_id="a")).json()["top_k"]) == 3
+    unknown = client.put("/missions/b", json={"scenario": "moon"})
+    assert (unknown.status_code, fields(unknown)) == (422, ["scenario"])
+    custom = client.put("/missions/b", json={"scenario": {**made.json()["scenario"], "name": "own", "uavs": 1}})
+    assert custom.status_code == 200, custom.text
+    assert client.post("/decide", json=report(mission_id="b", uav_id=1)).status_code == 422
+    full = client.post("/decide", json=report(mission_id="c"))
+    assert (full.status_code, fields(full)) == (429, ["mission_id"])
+    assert client.delete("/missions/a").status_code == 204
+    assert client.delete("/missions/a").status_code == 404
+    assert client.post("/decide", json=report(mission_id="c")).status_code == 200
+
+
+def test_metrics_tell_what_happened_and_name_no_one(edge: Edge, report: Report) -> None:
+    client = edge()
+    decision = client.post("/decide", json=report(mission_id="secret")).json()["decision_id"]
+    client.post("/feedback", json={"mission_id": "secret", "decision_id": decision, "cost": 0.5})
+    text = client.get("/metrics").text
+    assert 'aicvds_decisions_total{reason="mode_value",source="policy"} 1.0' in text
+    assert 'aicvds_feedback_total{result="applied"} 1.0' in text
+    assert 'aicvds_decision_seconds_count{stage="total"} 1.0' in text
+    assert "aicvds_overhead_seconds_count 1.0" in text
+    assert "secret" not in text
+
+
+def test_operation(edge: Edge) -> None:
+    client = edge()
+    assert client.get("/healthz").json() == {"status": "ok"}
+    ready = client.get("/readyz").json()
+    assert (ready["ready"], ready["decides"], ready["llm"]) == (True, "policy", "off")
+    assert client.get("/").json()["docs"] == "/docs"
+    assert client.get("/nowhere").headers["content-type"] == "application/problem+json"
+    assert client.get("/decide").status_code == 405

@@ -1,0 +1,68 @@
+"""The real embedded model: SmolLM2-135M out of the installed package, in this process, over its own HTTP server."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+
+from service.app import create_app
+from service.settings import Settings, usable_cores
+from tests.running import serving
+from tests.service.test_upstream import wait_for
+
+Report = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def loaded() -> Iterator[httpx.Client]:
+    with ExitStack() as stack:
+        url = stack.enter_context(serving(create_app(Settings(deadline_ms=30_000))))
+        client = stack.enter_context(httpx.Client(base_url=url, timeout=60))
+        ready = wait_for(client, "ready")
+        assert ready["constraint"] == "grammar"
+        assert "SmolLM2-135M" in ready["model"]
+        yield client
+
+
+def test_the_llm_decides_within_the_grammar(loaded: httpx.Client, report: Report) -> None:
+    for step in range(4):
+        answer = loaded.post("/decide", json=report(mission_id="grammar", step=step)).json()
+        assert (answer["source"], answer["reason"]) == ("llm", None)
+        assert answer["sensor_id"] in [c["sensor_id"] for c in answer["top_k"]]
+        assert 0 <= answer["velocity"] <= 14
+
+
+def test_the_static_block_is_read_once(loaded: httpx.Client, report: Report) -> None:
+    """From the second decision on, the server has the static block and the earlier experiences in its cache."""
+    first = loaded.post("/decide", json=report(mission_id="cache")).json()
+    outcome = {"decision_id": first["decision_id"], "cost": 0.0}
+    second = loaded.post("/decide", json=report(mission_id="cache", step=1, outcome=outcome)).json()
+    third = loaded.post("/decide", json=report(mission_id="cache", step=1, uav_id=1)).json()
+    for answer in (second, third):
+        assert answer["tokens"]["cached"] >= answer["tokens"]["static"]
+    assert third["tokens"]["cached"] > second["tokens"]["cached"]
+
+
+def test_decisions_and_health_go_on_while_the_model_loads(report: Report) -> None:
+    with serving(create_app(Settings())) as url, httpx.Client(base_url=url, timeout=10) as client:
+        seen = set()
+        for _ in range(2000):
+            assert client.get("/healthz").status_code == 200
+            llm = client.get("/readyz").json()["llm"]
+            if llm == "loading":
+                seen.add(client.post("/decide", json=report(mission_id="early")).json()["reason"])
+            if llm == "ready":
+                break
+            time.sleep(0.01)
+    assert llm == "ready"
+    # The model may turn ready between the two requests.
+    assert "llm_loading" in seen
+    assert seen <= {"llm_loading", None}
+
+
+def test_threads_default_to_one_core_less_than_there_are() -> None:
+    assert Settings().embedded_threads == max(1, usable_cores() - 1)
+    assert Settings(llm_threads=3).embedded_threads == 3

@@ -1,0 +1,237 @@
+"""A real HTTP upstream that obeys, or misbehaves in every way that one can: the UAV is always answered."""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse, Response
+
+from tests.running import Handler, listening, serving
+
+Report = Callable[..., dict[str, Any]]
+Edge = Callable[..., httpx.Client]
+
+PROBE = "7301"
+
+
+class Model:
+    """An OpenAI-compatible server that obeys some of the ways to constrain an answer, and counts its calls."""
+
+    def __init__(self, obeys: str, answer: str = "0 7", refuses: bool = False) -> None:
+        self.obeys, self.answer, self.refuses = obeys, answer, refuses
+        self.bodies: list[dict[str, Any]] = []
+        self.app = FastAPI()
+        self.app.get("/v1/models")(self.models)
+        self.app.post("/v1/chat/completions")(self.complete)
+
+    async def models(self) -> dict[str, Any]:
+        return {"data": [{"id": "stub-1"}]}
+
+    async def complete(self, request: Request) -> Response:
+        body = await request.json()
+        self.bodies.append(body)
+        ways = {"grammar", "structured_outputs", "response_format"} & body.keys()
+        if self.refuses and ways - {self.obeys}:
+            return JSONResponse({"error": "unknown field"}, status_code=400)
+        text = self.answer
+        if body["messages"][-1]["content"] == "Say hello.":
+            text = PROBE + " 0" if self.obeys in ways else "hello"
+        usage = {"prompt_tokens": 300, "completion_tokens": 4, "prompt_tokens_details": {"cached_tokens": 250}}
+        return JSONResponse({"choices": [{"message": {"content": text}}], "usage": usage})
+
+
+def wait_for(client: httpx.Client, llm: str) -> dict[str, Any]:
+    for _ in range(200):
+        ready: dict[str, Any] = client.get("/readyz").json()
+        if ready["llm"] == llm:
+            return ready
+        time.sleep(0.05)
+    raise AssertionError(f"the LLM never became {llm}: {ready}")
+
+
+@pytest.mark.parametrize(
+    ("obeys", "refuses", "constraint"),
+    [
+        ("grammar", False, "grammar"),
+        ("structured_outputs", False, "structured_outputs"),
+        ("response_format", True, "json_schema"),
+        ("nothing", False, "none"),
+        ("nothing", True, "none"),
+    ],
+)
+def test_learns_what_a_server_really_obeys(
+    edge: Edge, report: Report, obeys: str, refuses: bool, constraint: str
+) -> None:
+    model = Model(obeys, refuses=refuses)
+    with serving(model.app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1", price_input=1.0, price_cached=0.5, price_output=2.0)
+        ready = wait_for(client, "ready")
+        assert (ready["constraint"], ready["model"]) == (constraint, "stub-1")
+        answer = client.post("/decide", json=report()).json()
+    assert (answer["source"], answer["reason"], answer["model"]) == ("llm", None, "stub-1")
+    assert (answer["sensor_id"], answer["velocity"]) == (0, 7)
+    tokens = answer["tokens"]
+    assert (tokens["server_prompt"], tokens["cached"], tokens["completion"]) == (300, 250, 4)
+    assert tokens["cost_usd"] == pytest.approx((50 * 1.0 + 250 * 0.5 + 4 * 2.0) / 1e6)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("4 7", "answer_sensor"), ("0 15", "answer_velocity"), ("I would fly to sensor 0.", "answer_format")],
+)
+def test_an_answer_is_checked_whatever_the_server_promised(edge: Edge, report: Report, text: str, reason: str) -> None:
+    with serving(Model("grammar", answer=text).app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        answer = client.post("/decide", json=report()).json()
+        metrics = client.get("/metrics").text
+    assert (answer["source"], answer["reason"]) == ("policy", reason)
+    assert answer["sensor_id"] in [0, 1, 2, 3]
+    assert f'aicvds_llm_requests_total{{outcome="{reason}"}} 1.0' in metrics
+
+
+async def _head(reader: asyncio.StreamReader) -> dict[str, Any]:
+    head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+    length = next((int(line.split(":")[1]) for line in head.split("\r\n") if line.startswith("content-length:")), 0)
+    body: dict[str, Any] = json.loads(await reader.readexactly(length) or b"{}")
+    return body
+
+
+def misbehaving(fault: Handler) -> Handler:
+    """A server that passes the probe, so that the edge trusts it, and then does what ``fault`` does."""
+
+    async def handler(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while True:
+            body = await _head(reader)
+            asked = body.get("messages", [{}])[-1].get("content", "")
+            if body and asked != "Say hello." and asked != "0,50,100,-90,1,100\n":
+                await fault(reader, writer)
+                return
+            text = f"{PROBE} 0" if asked == "Say hello." else "0 0"
+            answer = json.dumps({"choices": [{"message": {"content": text}}], "data": [{"id": "stub-1"}]}).encode()
+            writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%s" % (len(answer), answer))
+            await writer.drain()
+
+    return handler
+
+
+async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    await reader.read()
+
+
+async def dripping(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: 1000\r\n\r\n")
+    while True:
+        writer.write(b" ")
+        await writer.drain()
+        await asyncio.sleep(0.05)
+
+
+async def resetting(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    writer.transport.abort()
+
+
+async def endless(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    writer.write(b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n")
+    while True:
+        writer.write(b"10000\r\n" + b"x" * 0x10000 + b"\r\n")
+        await writer.drain()
+
+
+def saying(status: bytes, body: bytes) -> Handler:
+    async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"HTTP/1.1 %s\r\ncontent-length: %d\r\nconnection: close\r\n\r\n%s" % (status, len(body), body))
+        await writer.drain()
+
+    return fault
+
+
+FAULTS: dict[str, tuple[Handler, str]] = {
+    "silent": (silent, "llm_timeout"),
+    "dripping": (dripping, "llm_timeout"),
+    "resetting": (resetting, "llm_error"),
+    "endless": (endless, "llm_error"),
+    "429": (saying(b"429 Too Many Requests", b"{}"), "llm_status"),
+    "500": (saying(b"500 Oops", b"oops"), "llm_status"),
+    "redirect": (saying(b"302 Found", b""), "llm_status"),
+    "html": (saying(b"200 OK", b"<html>hello</html>"), "llm_error"),
+    "truncated": (saying(b"200 OK", b'{"choices": [{"mess'), "llm_error"),
+    "empty object": (saying(b"200 OK", b"{}"), "llm_error"),
+    "a list": (saying(b"200 OK", b"[1]"), "llm_error"),
+    "no text": (saying(b"200 OK", b'{"choices": [{"message": {"content": null}}]}'), "llm_error"),
+    "not http": (saying(b"", b"\x00\x01"), "llm_error"),
+}
+
+
+@pytest.fixture(params=FAULTS)
+def faulty(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
+    fault, reason = FAULTS[request.param]
+    with ExitStack() as stack:
+        yield stack.enter_context(listening(misbehaving(fault))), reason
+
+
+def test_a_misbehaving_upstream_never_keeps_a_uav_waiting(edge: Edge, report: Report, faulty: tuple[str, str]) -> None:
+    url, reason = faulty
+    client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=400)
+    wait_for(client, "ready")
+    answers = [client.post("/decide", json=report(uav_id=uav)) for uav in range(3)]
+    assert [a.status_code for a in answers] == [200] * 3
+    assert {a.json()["reason"] for a in answers} == {reason}
+    assert len({a.json()["sensor_id"] for a in answers}) == 3
+
+
+def test_a_usage_that_makes_no_sense_is_no_usage(edge: Edge, report: Report) -> None:
+    usage = b'{"prompt_tokens": -3, "completion_tokens": "x", "prompt_tokens_details": {"cached_tokens": 1.5}}'
+    answer = b'{"choices": [{"message": {"content": "0 7"}}], "usage": %s}' % usage
+    with listening(misbehaving(saying(b"200 OK", answer))) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1")
+        wait_for(client, "ready")
+        decision = client.post("/decide", json=report()).json()
+    assert decision["source"] == "llm"
+    assert [decision["tokens"][key] for key in ("server_prompt", "cached", "completion")] == [None] * 3
+
+
+def test_a_timed_out_call_is_hung_up(edge: Edge, report: Report) -> None:
+    """The server learns at once that nobody waits any longer, and can free its slot."""
+    hung_up = []
+
+    async def watching(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        hung_up.append(await reader.read())
+
+    with listening(misbehaving(watching)) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=200)
+        wait_for(client, "ready")
+        assert client.post("/decide", json=report()).json()["reason"] == "llm_timeout"
+        for _ in range(100):
+            if hung_up:
+                break
+            time.sleep(0.02)
+    assert hung_up == [b""]
+
+
+def test_an_upstream_that_is_down_is_tried_again(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.llm.upstream._RETRY_S", 0.1)
+    with serving(Model("grammar").app) as url:
+        port = int(url.rsplit(":", 1)[1])
+    client = edge(mode="llm", llm_url=f"{url}/v1")
+    ready = wait_for(client, "unavailable")
+    assert str(port) in ready["detail"]
+    assert client.post("/decide", json=report()).json()["reason"] == "llm_unavailable"
+
+
+def test_without_its_model_file_the_edge_flies_on_and_says_what_to_run(
+    edge: Edge, report: Report, tmp_path: Any
+) -> None:
+    client = edge(mode="llm", llm_gguf=tmp_path / "none.gguf")
+    assert "AICVDS_LLM_GGUF" in wait_for(client, "unavailable")["detail"]
+    assert client.post("/decide", json=report()).json()["reason"] == "llm_unavailable"
+    (tmp_path / "junk.gguf").write_bytes(b"GGUF" + b"\0" * 1000)
+    client = edge(mode="llm", llm_gguf=tmp_path / "junk.gguf")
+    wait_for(client, "unavailable")
+    assert client.post("/decide", json=report()).status_code == 200
