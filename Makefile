@@ -2,7 +2,7 @@
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
-PYTHON ?= python3.11
+PYTHON ?= $(shell command -v python3.11 || echo python3)
 TORCH_INDEX ?=
 TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin

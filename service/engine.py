@@ -17,7 +17,7 @@ from service.llm.upstream import Upstream
 from service.metrics import Metrics
 from service.mission import Mission
 from service.missions import Missions
-from service.policy import decide_by_urgency
+from service.policy import decide_without_llm
 from service.prompt import Prompt, build_prompt
 from service.settings import Settings
 from service.tokens import TokenCounter, price_usd
@@ -165,7 +165,8 @@ class Engine:
         except NoDecision as error:
             log.info("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reserved = mission.reserved(view.step, view.uav_id)
-            (sensor, velocity), reason = decide_by_urgency(view.state, mission.scenario, reserved), error.reason
+            sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
+            reason = error.reason
         if mission.mode == "llm" and reason != "no_candidate":
             self._metrics.llm_requests.labels(reason or "ok").inc()
         return Choice(sensor, velocity, reason, completion)

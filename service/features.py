@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray, channel_gain_db
-from shared.scenario import Scenario
+from shared.scenario import Point, Scenario
 from shared.urgency import urgency
 from shared.wire import UavState
 
@@ -18,12 +18,14 @@ FEATURES = 5
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One UAV's view at one step; every array has shape ``(J,)``, in the order of the request's columns.
+    """One UAV's view at one step; arrays have shape ``(J,)``, ``places`` ``(J, 2)``, in the request's order.
 
     ``queue`` packets, ``battery`` J, ``gain`` dB, ``since_visit`` steps, ``urgency`` 0..1, ``distance`` m from
     the UAV now. Sensors never heard (``heard`` false) hold zeros in what only a beacon tells.
     """
 
+    position: Point
+    places: FloatArray
     ids: NDArray[np.int64]
     heard: NDArray[np.bool_]
     admissible: NDArray[np.bool_]
@@ -76,9 +78,13 @@ def augment(
     ids = np.asarray(sensors.id, dtype=np.int64)
     heard = np.array([s is not None for s in sensors.last_seen])
     fresh = np.array([s == step for s in sensors.last_seen])
-    distance = np.hypot(np.asarray(sensors.x) - uav.position[0], np.asarray(sensors.y) - uav.position[1])
+    position = (uav.position[0], uav.position[1])
+    places = np.stack((sensors.x, sensors.y), axis=1)
+    distance = np.linalg.norm(places - position, axis=1)
     queue = filled(sensors.queue)
     return State(
+        position=position,
+        places=places,
         ids=ids,
         heard=heard,
         admissible=heard & ~np.isin(ids, list(reserved)),

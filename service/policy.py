@@ -7,27 +7,38 @@ from collections.abc import Collection
 import numpy as np
 
 from service.features import State
-from shared.channel import link_holds
+from shared.channel import packets_per_step
+from shared.lap import on_lap, positions_after
 from shared.scenario import Scenario
 
+# What a metre a second is worth in urgent packets: a UAV that dwells on little lets the rest of its lap overflow.
+# On 30 worlds of scenario `paper`, 0.5 to 4 lost 54 to 61 packets, differences within their noise.
+_VELOCITY_BONUS = 0.5
 
-def decide_by_urgency(state: State, scenario: Scenario, reserved: Collection[int]) -> tuple[int, int]:
-    """The most urgent sensor that will surely be in reach, at the fastest velocity that keeps it there.
 
-    Flying d metres brings the UAV at most d metres farther from any sensor, so a sensor ``m`` metres inside
-    the radio radius stays in reach at ``floor(m / step)`` m/s whatever the trajectory. Where no sensor
-    qualifies, the UAV makes for the nearest unreserved one at full speed.
+def decide_without_llm(state: State, uav: int, scenario: Scenario, reserved: Collection[int]) -> tuple[int, int]:
+    """One step of look-ahead over every velocity and every sensor heard, free and with a battery.
+
+    Maximises ``U_j min(q_j, packets movable from the new position) + 0.5 v``; a sensor out of reach from there is
+    worth nothing, so that the UAV flies on where there is little to collect. A UAV that is not on its scenario's
+    lap flies an unknown trajectory: then the most urgent sensor in radio range now, at full speed. Among equals,
+    the nearest.
 
     Returns:
         sensor ID and velocity in m/s. A reserved sensor only where every sensor is.
     """
-    free = np.array([i not in reserved for i in state.ids.tolist()])
+    free = ~np.isin(state.ids, list(reserved))
     if not free.any():
         free[:] = True
-    sure = free & state.heard & (state.battery > 0) & link_holds(state.distance, scenario)
-    if not sure.any():
-        nearest = np.where(free, state.distance, np.inf).argmin()
-        return int(state.ids[nearest]), scenario.max_velocity
-    row = int(np.where(sure, state.urgency, -np.inf).argmax())
-    margin = scenario.radio_radius_m - float(state.distance[row])
-    return int(state.ids[row]), min(scenario.max_velocity, int(margin / scenario.step_s))
+    velocities = np.arange(scenario.max_velocity + 1)
+    if on_lap(scenario, uav, state.position):
+        ahead = positions_after(scenario, uav, state.position, velocities * scenario.step_s)
+        distance = np.linalg.norm(state.places[None] - ahead[:, None], axis=2)
+    else:
+        velocities, distance = velocities[-1:], state.distance[None]
+    able = free & state.heard & (state.battery > 0)
+    packets = np.where(able, np.minimum(state.queue, packets_per_step(distance, scenario)), 0.0)
+    worth = state.urgency * packets + _VELOCITY_BONUS * velocities[:, None]
+    worth = np.where(free, worth - 1e-9 * distance, -np.inf)
+    level, row = np.unravel_index(int(worth.argmax()), worth.shape)
+    return int(state.ids[row]), int(velocities[level])

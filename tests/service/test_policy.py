@@ -3,34 +3,62 @@ import math
 import numpy as np
 import pytest
 
-from service.policy import decide_by_urgency
+from service.features import State
+from service.policy import decide_without_llm
 from shared.channel import link_holds
+from shared.lap import on_lap, positions_after
 from tests.service.making import PAPER, attended, mission, uav
 
+X, Y = PAPER.lap_centres[0]
+ON_LAP = (X + PAPER.lap_radius_m, Y)
 
-@pytest.mark.parametrize("x", [500.0, 650.0, 750.0, 820.0, 855.0])
-def test_the_sensor_stays_in_reach_wherever_the_uav_flies(x: float) -> None:
-    state = attended(mission(), uav(x=[x], queue=[50.0])).state
-    sensor, velocity = decide_by_urgency(state, PAPER, frozenset())
+
+def state(**kwargs: object) -> State:
+    return attended(mission(), uav(**kwargs)).state  # type: ignore[arg-type]
+
+
+def test_a_lap_is_flown_counter_clockwise() -> None:
+    quarter = PAPER.lap_radius_m * math.pi / 2
+    points = positions_after(PAPER, 0, ON_LAP, [0.0, quarter])
+    np.testing.assert_allclose(points, [ON_LAP, (X, Y + PAPER.lap_radius_m)], atol=1e-9)
+    assert on_lap(PAPER, 0, ON_LAP)
+    assert not on_lap(PAPER, 1, ON_LAP)
+
+
+def test_the_sensor_is_in_reach_after_the_move() -> None:
+    """Far ahead on the lap: out of reach at full speed's opposite, in reach where the policy flies."""
+    ahead = positions_after(PAPER, 0, ON_LAP, [480.0])[0]
+    view = attended(mission(), uav(position=ON_LAP, x=[float(ahead[0])], queue=[60.0]))
+    view.state.places[0] = ahead
+    sensor, velocity = decide_without_llm(view.state, 0, PAPER, frozenset())
+    arrived = positions_after(PAPER, 0, ON_LAP, [velocity * PAPER.step_s])[0]
     assert sensor == 0
-    away = [
-        math.hypot(x - 500 - velocity * PAPER.step_s * math.cos(a), velocity * PAPER.step_s * math.sin(a))
-        for a in np.linspace(0, 2 * math.pi, 73)
-    ]
-    assert link_holds(away, PAPER).all()
+    assert velocity > 0
+    assert link_holds(math.dist(arrived, ahead), PAPER)
+    assert not link_holds(math.dist(ON_LAP, ahead), PAPER)
 
 
-def test_the_most_urgent_in_reach_and_free() -> None:
-    m = mission()
-    state = attended(m, uav(queue=[10.0, 40.0, 50.0, 20.0, 60.0, None])).state
-    assert decide_by_urgency(state, PAPER, frozenset()) == (2, 14)
-    assert decide_by_urgency(state, PAPER, frozenset({2}))[0] == 1
-    # Sensors 4 and 5 are 400 and 500 m away: the nearest free one, at full speed.
-    assert decide_by_urgency(state, PAPER, frozenset({0, 1, 2, 3})) == (4, 14)
-    assert decide_by_urgency(state, PAPER, frozenset(range(6)))[0] == 2
+def test_it_slows_down_for_a_full_queue_that_it_would_leave_behind() -> None:
+    behind = positions_after(PAPER, 0, ON_LAP, [-300.0])[0]
+    s = state(position=ON_LAP, x=[float(behind[0])], queue=[60.0])
+    s.places[0] = behind
+    _, velocity = decide_without_llm(s, 0, PAPER, frozenset())
+    arrived = positions_after(PAPER, 0, ON_LAP, [velocity * PAPER.step_s])[0]
+    assert velocity < PAPER.max_velocity
+    assert link_holds(math.dist(arrived, behind), PAPER)
 
 
-def test_an_empty_battery_sends_nothing() -> None:
-    state = attended(mission(), uav(queue=[10.0, 60.0])).state
-    state.battery[1] = 0.0
-    assert decide_by_urgency(state, PAPER, frozenset())[0] == 0
+def test_on_an_unknown_trajectory_the_most_urgent_in_range_at_full_speed() -> None:
+    s = state(queue=[10.0, 40.0, 50.0, 20.0, 60.0, None])
+    assert decide_without_llm(s, 0, PAPER, frozenset()) == (2, 14)
+    assert decide_without_llm(s, 0, PAPER, frozenset({2})) == (1, 14)
+    # Sensors 4 and 5 are 400 and 500 m away: the nearest free one.
+    assert decide_without_llm(s, 0, PAPER, frozenset({0, 1, 2, 3})) == (4, 14)
+    assert decide_without_llm(s, 0, PAPER, frozenset(range(6)))[0] == 2
+
+
+@pytest.mark.parametrize("position", [ON_LAP, (500.0, 500.0)])
+def test_an_empty_battery_sends_nothing(position: tuple[float, float]) -> None:
+    s = state(queue=[10.0, 60.0], position=position, x=[position[0] - 50, position[0] - 60])
+    s.battery[1] = 0.0
+    assert decide_without_llm(s, 0, PAPER, frozenset())[0] == 0
