@@ -67,7 +67,8 @@ def augment(
     """Complete a UAV's report with visiting records, urgency, and the channel from where it is now.
 
     A stale channel gain is replaced by the channel model's at the present distance: the place of a sensor does
-    not change, so the model knows better than an old beacon. Admissible is a sensor heard and not reserved.
+    not change, so the model knows better than an old beacon. Admissible is a sensor heard, with a battery, and not
+    reserved.
 
     Args:
         visits: step of each sensor's last visit (TVR_j), by sensor ID; one never visited counts from step 0.
@@ -81,15 +82,15 @@ def augment(
     position = (uav.position[0], uav.position[1])
     places = np.stack((sensors.x, sensors.y), axis=1)
     distance = np.linalg.norm(places - position, axis=1)
-    queue = filled(sensors.queue)
+    queue, battery = filled(sensors.queue), filled(sensors.battery)
     return State(
         position=position,
         places=places,
         ids=ids,
         heard=heard,
-        admissible=heard & ~np.isin(ids, list(reserved)),
+        admissible=heard & (battery > 0) & ~np.isin(ids, list(reserved)),
         queue=queue,
-        battery=filled(sensors.battery),
+        battery=battery,
         gain=np.where(fresh, filled(sensors.channel_gain), channel_gain_db(distance, scenario)),
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
         urgency=urgency(queue, rates[ids], scenario),

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from service.features import State
 from shared.scenario import Scenario
 
@@ -19,12 +17,11 @@ _STATIC = """You direct a fleet of UAVs that collect data packets from ground se
 At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.
 
 Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost. \
-A transmission fails beyond {radius:g} m, at a channel gain of {limit:g} dB or below, or on an empty battery.
+A transmission fails beyond {radius:g} m, or at a channel gain of {limit:g} dB or below.
 
-Each row is one sensor, the most promising first, with six numbers:
-sensor_id,queue,battery,gain,age,distance
-queue: percent full. battery: percent left. gain: channel gain in dB. \
-age: steps since its last visit. distance: metres from this UAV.
+Each row is one sensor, the most promising first, with five numbers:
+sensor_id,queue,gain,age,distance
+queue: packets waiting. gain: channel gain in dB. age: steps since its last visit. distance: metres from this UAV.
 
 Rules:
 1. Prefer a full queue, then a long age.
@@ -32,14 +29,14 @@ Rules:
 3. Velocity is a whole number from 0 to {max_velocity} m/s. Fly slowly to stay near a far sensor with a full queue, \
 fast when the sensor is near or there is little to collect.
 
-Past decisions are rows followed by > sensor_id velocity and the cost that came of it; 0 is best.
+Past decisions are rows without their first number, then > sensor_id velocity: cost, where 0 is best.
 
 Answer with two whole numbers and nothing else: sensor_id velocity"""
 
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """One prompt. ``state_uncompressed`` is the last block as it would be with every reported sensor."""
+    """One prompt. ``state_uncompressed`` is the last block as it would be without attention and masks."""
 
     static: str
     experiences: str
@@ -63,20 +60,33 @@ def static_block(scenario: Scenario) -> str:
     )
 
 
-def row_text(state: State, row: int, scenario: Scenario) -> str:
-    """One sensor as ``sensor_id,queue,battery,gain,age,distance``; question marks for what was never heard."""
-    distance = round(float(state.distance[row]))
-    age = round(float(state.since_visit[row]))
+def row_text(state: State, row: int) -> str:
+    """One sensor of those kept: ``sensor_id,queue,gain,age,distance``.
+
+    No battery: a sensor that cannot send is masked before, so that the LLM need not judge it.
+    """
+    return f"{state.ids[row]},{_judged(state, row)}"
+
+
+def full_row_text(state: State, row: int) -> str:
+    """One sensor as an LLM would have to see it if nothing were pruned or masked for it.
+
+    ``sensor_id,queue,battery,gain,age,distance``, with question marks for what was never heard.
+    """
     if not state.heard[row]:
-        return f"{state.ids[row]},?,?,?,{age},{distance}"
-    queue = round(100 * float(state.queue[row]) / scenario.queue_capacity)
-    battery = round(100 * float(state.battery[row]) / scenario.battery_j)
-    return f"{state.ids[row]},{queue},{battery},{round(float(state.gain[row]))},{age},{distance}"
+        return f"{state.ids[row]},?,?,?,{state.since_visit[row]:.0f},{state.distance[row]:.0f}"
+    queue, rest = _judged(state, row).split(",", 1)
+    return f"{state.ids[row]},{queue},{state.battery[row]:.0f},{rest}"
+
+
+def _judged(state: State, row: int) -> str:
+    numbers = (state.queue[row], state.gain[row], state.since_visit[row], state.distance[row])
+    return ",".join(f"{number:.0f}" for number in numbers)
 
 
 def experience_text(row: str, sensor_id: int, velocity: int, cost: float) -> str:
     """One line of the experiences: the chosen sensor's row, the decision, and its cost."""
-    return f"{row} > {sensor_id} {velocity} cost {cost:.2f}\n"
+    return f"{row.split(',', 1)[1]} > {sensor_id} {velocity}: {cost:.1f}\n"
 
 
 def build_prompt(scenario: Scenario, state: State, kept_rows: Sequence[int], experiences: Sequence[str]) -> Prompt:
@@ -84,10 +94,6 @@ def build_prompt(scenario: Scenario, state: State, kept_rows: Sequence[int], exp
     return Prompt(
         static=static_block(scenario),
         experiences="".join(experiences),
-        state=_rows(state, kept_rows, scenario),
-        state_uncompressed=_rows(state, np.arange(len(state.ids)).tolist(), scenario),
+        state="".join(f"{row_text(state, row)}\n" for row in kept_rows),
+        state_uncompressed="".join(f"{full_row_text(state, row)}\n" for row in range(len(state.ids))),
     )
-
-
-def _rows(state: State, rows: Sequence[int], scenario: Scenario) -> str:
-    return "".join(f"{row_text(state, row, scenario)}\n" for row in rows)

@@ -28,7 +28,7 @@ class Settings(BaseSettings):
         pydantic.ValidationError: a variable is out of bounds; the message names the field.
     """
 
-    model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", validate_default=True)
+    model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", env_ignore_empty=True)
 
     # An OpenAI-compatible server, up to and including /v1. Unset: the embedded llama.cpp.
     llm_url: str | None = None
@@ -52,7 +52,7 @@ class Settings(BaseSettings):
     top_k: int = Field(5, ge=1, le=100)
     # Experiences in the prompt before the oldest half is dropped. Appending keeps the LLM's prefix
     # cache; dropping costs one prefill of what stays, so it happens rarely.
-    experiences: int = Field(12, ge=0, le=200)
+    experiences: int = Field(8, ge=0, le=200)
     # Adam's step size for the attention and velocity modules (the paper's table).
     learning_rate: float = Field(5e-4, gt=0, le=1)
 

@@ -87,6 +87,6 @@ class View:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            row=row_text(self.state, row, mission.scenario),
+            row=row_text(self.state, row),
             sample=sample,
         )

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Point = tuple[float, float]
 
+_MAX_ARRIVALS = 10_000_000
+
 
 class Scenario(BaseModel):
     """One world's numbers. The defaults are the scenario ``paper``.
@@ -71,6 +73,8 @@ class Scenario(BaseModel):
     def _consistent(self) -> Self:
         if self.arrival_rate_min > self.arrival_rate_max:
             raise ValueError("arrival_rate_min exceeds arrival_rate_max")
+        if self.sensors * self.steps > _MAX_ARRIVALS:
+            raise ValueError(f"sensors x steps exceeds {_MAX_ARRIVALS:,}: a world draws that many arrivals at once")
         return self
 
     @property

@@ -124,7 +124,7 @@ class Upstream:
                 self.model = next(iter(await self._client.models()), None)
             self.constraint = await self._probe(self._client)
             paper = SCENARIOS["paper"]
-            first = chat_body(self.model, static_block(paper), "0,50,100,-90,1,100\n", self.constraint, [0], 15)
+            first = chat_body(self.model, static_block(paper), "0,50,-90,1,100\n", self.constraint, [0], 15)
             await self._client.complete(first)
         return self._client
 

@@ -48,11 +48,11 @@ def test_experiences_grow_by_appending_and_are_compacted_at_once() -> None:
     m = mission(experiences=4)
     texts = []
     for number in range(1, 7):
-        m.apply(outcome(decide(m, number, step=number), cost=number / 100))
+        m.apply(outcome(decide(m, number, step=number), cost=number / 10))
         texts.append("".join(m.experiences))
     assert all(later.startswith(earlier) for earlier, later in zip(texts[:4], texts[1:4], strict=False))
     assert len(m.experiences) == 3
-    assert [line.split()[-1] for line in m.experiences] == ["0.04", "0.05", "0.06"]
+    assert [line.split()[-1] for line in m.experiences] == ["0.4", "0.5", "0.6"]
 
 
 def test_no_experiences_when_told_so() -> None:

@@ -110,7 +110,7 @@ def misbehaving(fault: Handler) -> Handler:
         while True:
             body = await _head(reader)
             asked = body.get("messages", [{}])[-1].get("content", "")
-            if body and asked != "Say hello." and asked != "0,50,100,-90,1,100\n":
+            if body and asked != "Say hello." and asked != "0,50,-90,1,100\n":
                 await fault(reader, writer)
                 return
             text = f"{PROBE} 0" if asked == "Say hello." else "0 0"

@@ -35,6 +35,12 @@ def test_unheard_and_reserved_sensors_never_reach_the_softmax() -> None:
     assert 3 in attended(m, uav(uav_id=1)).offered
 
 
+def test_a_sensor_with_a_flat_battery_never_reaches_the_softmax() -> None:
+    state = uav(queue=[10.0, 20.0, 30.0])
+    sensors = state.sensors.model_copy(update={"battery": [50.0, 0.0, 50.0]})
+    assert sorted(attended(mission(), state.model_copy(update={"sensors": sensors})).offered) == [0, 2]
+
+
 def test_top_k_is_the_missions() -> None:
     view = attended(mission(top_k=2), uav())
     assert len(view.rows) == 2

@@ -1,0 +1,46 @@
+"""What the hand-written policies share: which sensors are in reach, and what to do when none is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.scenario import Scenario
+from simulator.world import Observation
+
+
+def cruise_velocity(scenario: Scenario) -> int:
+    """The constant velocity of a policy that does not control it: 7 m/s, half of the paper's range."""
+    return min(7, scenario.max_velocity)
+
+
+def free_sensors(count: int, taken: frozenset[int]) -> NDArray[np.bool_]:
+    """Which of ``count`` sensors no earlier UAV chose in this step, shape ``(J,)``; all if none is free."""
+    free = np.ones(count, dtype=np.bool_)
+    free[list(taken)] = False
+    return free if free.any() else ~free
+
+
+def in_reach(observation: Observation, taken: frozenset[int]) -> NDArray[np.bool_]:
+    """Which sensors are in radio range now and free, shape ``(J,)``."""
+    heard_now = observation["last_heard"] == observation["step"]
+    return np.asarray(heard_now & free_sensors(len(observation["queue"]), taken))
+
+
+def longest_silent(observation: Observation, taken: frozenset[int]) -> int:
+    """The free sensor heard longest ago, one never heard before any other; of several, the nearest."""
+    free = np.flatnonzero(free_sensors(len(observation["queue"]), taken))
+    distance = np.hypot(*(observation["sensor_position"][free] - observation["position"]).T)
+    return int(free[np.lexsort((distance, observation["last_heard"][free]))[0]])
+
+
+def best_in_reach(score: NDArray[np.float64], observation: Observation, taken: frozenset[int]) -> int:
+    """The sensor of the highest score among those in reach, or the longest silent one if none is.
+
+    Args:
+        score: shape ``(J,)``; of equals the lowest index wins.
+    """
+    reachable = in_reach(observation, taken)
+    if not reachable.any():
+        return longest_silent(observation, taken)
+    return int(np.argmax(np.where(reachable, score, -np.inf)))

@@ -1,0 +1,28 @@
+"""Round robin."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shared.scenario import Scenario
+from simulator.policies.reach import cruise_velocity, free_sensors
+from simulator.world import Observation
+
+
+class RoundRobin:
+    """Every UAV takes the sensors in turn, in range or not; UAV i starts at sensor ``i J / I``.
+
+    A sensor that is taken is passed over. Flies at 7 m/s throughout.
+    """
+
+    def reset(self, scenario: Scenario, seed: int) -> None:
+        """Start a mission; the seed is not used."""
+        self._uavs = scenario.uavs
+        self._velocity = cruise_velocity(scenario)
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+        """Sensor and velocity."""
+        count = len(observation["queue"])
+        turn = uav * count // self._uavs + int(observation["step"][0])
+        free = np.roll(free_sensors(count, taken), -(turn % count))
+        return (turn + int(np.argmax(free))) % count, self._velocity

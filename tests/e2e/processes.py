@@ -1,0 +1,57 @@
+"""The commands as a user starts them: processes, ports, signals."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+AICVDS = Path(sys.executable).with_name("aicvds")
+
+
+def run(*args: str, timeout: float = 120, **env: str) -> subprocess.CompletedProcess[str]:
+    """One command to its end."""
+    return subprocess.run(
+        [AICVDS, *args], capture_output=True, text=True, timeout=timeout, env={**os.environ, **env}, check=False
+    )
+
+
+@contextmanager
+def started(*args: str, **env: str) -> Iterator[subprocess.Popen[str]]:
+    """A command in the background, killed at the end if it still runs."""
+    process = subprocess.Popen(
+        [AICVDS, *args], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env={**os.environ, **env}
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate(timeout=30)
+
+
+def output_until(process: subprocess.Popen[str], pattern: str, timeout: float = 60) -> re.Match[str]:
+    """Read the command's output until a line matches."""
+    assert process.stdout is not None
+    seen, ends = "", time.monotonic() + timeout
+    while time.monotonic() < ends:
+        if select.select([process.stdout], [], [], 0.2)[0]:
+            chunk = os.read(process.stdout.fileno(), 65536).decode(errors="replace")
+            if not chunk:
+                break
+            seen += chunk
+            if match := re.search(pattern, seen):
+                return match
+    raise AssertionError(f"never saw {pattern!r} in:\n{seen}")
+
+
+@contextmanager
+def serving_edge(**env: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``aicvds serve`` on a free port; yields its URL and process."""
+    with started("serve", "--port", "0", **env) as process:
+        yield output_until(process, r"running on (http://[\d.:]+)")[1], process
