@@ -15,10 +15,10 @@ from pathlib import Path
 AICVDS = Path(sys.executable).with_name("aicvds")
 
 
-def run(*args: str, timeout: float = 120, **env: str) -> subprocess.CompletedProcess[str]:
+def run(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     """One command to its end."""
     return subprocess.run(
-        [AICVDS, *args], capture_output=True, text=True, timeout=timeout, env={**os.environ, **env}, check=False
+        [AICVDS, *args], capture_output=True, text=True, timeout=120, env={**os.environ, **env}, check=False
     )
 
 
