@@ -142,9 +142,10 @@ class Engine:
             model=None if choice.reason else self._upstream.model,
             top_k=view.candidates,
             tokens=self._with_usage(tokens, choice.completion),
+            deadline_ms=deadline_ms,
             latency_ms=watch.total(),
         )
-        self._metrics.record_decision(answer, deadline_ms=deadline_ms)
+        self._metrics.record_decision(answer)
         return answer
 
     async def _choose(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Choice:

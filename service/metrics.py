@@ -35,14 +35,14 @@ class Metrics:
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.missions = Gauge("aicvds_missions", "Missions held in memory", registry=r)
 
-    def record_decision(self, decision: DecideResponse, *, deadline_ms: int) -> None:
+    def record_decision(self, decision: DecideResponse) -> None:
         """Count one answered decision: source, stages, overhead, tokens, lateness."""
         self.decisions.labels(decision.source, decision.reason or "none").inc()
         for stage, milliseconds in decision.latency_ms.items():
             self.decision_seconds.labels(stage).observe(milliseconds / 1e3)
         total = decision.latency_ms["total"]
         self.overhead_seconds.observe((total - decision.latency_ms.get("llm", 0.0)) / 1e3)
-        if total > deadline_ms:
+        if total > decision.deadline_ms:
             self.deadline_missed.inc()
         tokens = decision.tokens
         if tokens.server_prompt is None:

@@ -189,7 +189,8 @@ class DecideResponse(Wire):
     model: str | None = None
     top_k: list[Candidate]
     tokens: Tokens
-    latency_ms: dict[str, float]
+    deadline_ms: int = Field(description="what this decision was given")
+    latency_ms: dict[str, float] = Field(description="by stage, and total")
 
 
 class BatchResponse(Wire):
