@@ -9,8 +9,9 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 
-# In-flight decisions end within their deadline; past this, shutting down does not wait for them.
-_SHUTDOWN_S = 10
+# In-flight decisions end within their deadline; past this, shutting down does not wait for them. Less than the 10 s
+# after which `docker stop` kills.
+_SHUTDOWN_S = 8
 _CONCURRENCY = 256
 
 

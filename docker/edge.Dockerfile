@@ -1,0 +1,60 @@
+# The edge: the decision service, its LLM and its token vocabulary. At run time it fetches nothing.
+#   docker build -f docker/edge.Dockerfile -t aicvds-edge .
+#   docker run --rm -p 127.0.0.1:8000:8000 aicvds-edge
+#
+# --build-arg TORCH_INDEX=…  the address of PyTorch's CPU index, as its "Get Started" selector prints it after
+#                            --index-url; without it torch comes from the ordinary index (on x86: the CUDA build,
+#                            gigabytes larger and no use here).
+
+FROM python:3.11-slim-bookworm AS dependencies
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PATH=/opt/aicvds/bin:$PATH
+WORKDIR /src
+RUN python -m venv /opt/aicvds
+COPY constraints.txt ./
+# Torch alone from its own index; what it requires comes with the rest, from the ordinary one.
+ARG TORCH_INDEX=""
+RUN pip install --no-deps ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$(grep '^torch==' constraints.txt)"
+COPY pyproject.toml ./
+# No source yet, so this installs an empty aic-vds with all that it requires, and outlives every edit of the source.
+# Torch's C++ headers and test programs are a fifth of it, and nothing here compiles.
+RUN touch README.md LICENSE \
+ && pip install --constraint constraints.txt '.[service]' \
+ && rm -rf /opt/aicvds/lib/python3.11/site-packages/torch/include /opt/aicvds/lib/python3.11/site-packages/torch/test
+
+# These files alone, so that an edit elsewhere does not bring the model again.
+FROM dependencies AS model
+COPY shared/ shared/
+COPY service/__init__.py service/model.py service/settings.py service/tokens.py service/
+RUN PYTHONPATH=/src AICVDS_CACHE_DIR=/opt/model aicvds model fetch
+
+FROM dependencies AS application
+COPY README.md LICENSE ./
+COPY shared/ shared/
+COPY service/ service/
+RUN pip wheel --no-deps --wheel-dir /wheels .
+
+FROM dependencies AS slim
+RUN python -m pip uninstall --quiet --yes pip
+
+# Layers from the largest and steadiest to the smallest: an edit of the source ships kilobytes.
+FROM python:3.11-slim-bookworm
+# libgomp1: llama.cpp computes with the system's OpenMP. tini: as process 1 Python would ignore a SIGTERM that comes
+# while it is still importing.
+RUN apt-get update -q \
+ && apt-get install -y -q --no-install-recommends libgomp1 tini \
+ && apt-get clean && rm -rf /var/lib/apt/lists/* \
+ && useradd --uid 10001 --user-group --no-create-home --shell /usr/sbin/nologin aicvds
+COPY --from=slim /opt/aicvds /opt/aicvds
+COPY --from=model /opt/model /opt/model
+COPY --from=application /wheels /tmp/wheels
+RUN python -m pip --python /opt/aicvds/bin/python install \
+    --quiet --no-cache-dir --no-index --no-deps --force-reinstall /tmp/wheels/*.whl \
+ && rm -r /tmp/wheels
+ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model
+USER 10001:10001
+EXPOSE 8000
+# Healthy: it decides, and its LLM is no longer on its way (ready, off, or known to be unavailable).
+HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 CMD ["python", "-c", \
+  "import json, sys, urllib.request as u; sys.exit(json.load(u.build_opener(u.ProxyHandler({})).open('http://127.0.0.1:8000/readyz', timeout=2))['llm'] == 'loading')"]
+ENTRYPOINT ["tini", "--"]
+CMD ["aicvds", "serve", "--host", "0.0.0.0"]

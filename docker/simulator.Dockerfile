@@ -1,0 +1,36 @@
+# The simulator: the UAVs and the world, without torch. It reaches an edge over HTTP and writes a run's folder.
+#   docker build -f docker/simulator.Dockerfile -t aicvds-simulator .
+#   docker run --rm --network host -v aicvds-runs:/runs aicvds-simulator \
+#     aicvds simulate --edge http://127.0.0.1:8000 --out /runs/first
+
+FROM python:3.11-slim-bookworm AS dependencies
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PATH=/opt/aicvds/bin:$PATH
+WORKDIR /src
+RUN python -m venv /opt/aicvds
+COPY constraints.txt pyproject.toml ./
+# No source yet, so this installs an empty aic-vds with all that it requires, and outlives every edit of the source.
+RUN touch README.md LICENSE && pip install --constraint constraints.txt '.[simulator]'
+
+FROM dependencies AS application
+COPY README.md LICENSE ./
+COPY shared/ shared/
+COPY simulator/ simulator/
+RUN pip wheel --no-deps --wheel-dir /wheels .
+
+FROM dependencies AS slim
+RUN python -m pip uninstall --quiet --yes pip setuptools
+
+FROM python:3.11-slim-bookworm
+# A named volume takes over the owner of the folder that it is mounted on.
+RUN useradd --uid 10001 --user-group --no-create-home --shell /usr/sbin/nologin aicvds \
+ && install --directory --owner=aicvds --group=aicvds /runs
+COPY --from=slim /opt/aicvds /opt/aicvds
+COPY --from=application /wheels /tmp/wheels
+RUN python -m pip --python /opt/aicvds/bin/python install \
+    --quiet --no-cache-dir --no-index --no-deps --force-reinstall /tmp/wheels/*.whl \
+ && rm -r /tmp/wheels
+# Matplotlib keeps its list of fonts in a folder that it can write.
+ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 MPLCONFIGDIR=/tmp/matplotlib
+WORKDIR /runs
+USER 10001:10001
+CMD ["aicvds", "simulate", "--help"]

@@ -1,0 +1,196 @@
+#!/usr/bin/env bash
+# Builds the containers, flies the paper's mission in them, and checks what came of it. Needs a Docker engine, Compose
+# (either one) and python3; fails without them. Prometheus is Debian's package in an image made here, unless
+# PROMETHEUS_IMAGE names another.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+
+readonly PROJECT=aicvds-test FLIGHT_S=300 LLM_S=120 STOP_S=10
+WORK=$(mktemp -d)
+OFFLINE=$PROJECT-offline
+
+fail() {
+  echo "FAIL: $*" >&2
+  exit 1
+}
+say() { printf '%4ds  %s\n' "$SECONDS" "$*"; }
+
+docker info >/dev/null 2>&1 || fail "no Docker engine answers"
+if docker compose version >/dev/null 2>&1; then
+  COMPOSE=(docker compose)
+elif command -v docker-compose >/dev/null; then
+  COMPOSE=(docker-compose)
+else
+  fail "there is neither 'docker compose' nor docker-compose"
+fi
+# Without the buildx plug-in there is only the classic builder.
+docker buildx version >/dev/null 2>&1 || export DOCKER_BUILDKIT=0 COMPOSE_DOCKER_CLI_BUILD=0
+
+# Neither this shell's settings nor a .env in the checkout take part, and ports are whatever is free.
+build_network=${AICVDS_BUILD_NETWORK:-default}
+unset "${!AICVDS_@}"
+export AICVDS_BUILD_NETWORK=$build_network AICVDS_PORT=0 PROMETHEUS_PORT=0
+: >"$WORK/env"
+COMPOSE+=(--project-name "$PROJECT" --env-file "$WORK/env")
+compose() { "${COMPOSE[@]}" "$@"; }
+quietly() { "$@" >"$WORK/log" 2>&1 || { tail -n 40 "$WORK/log" >&2; fail "$*"; }; }
+
+clean_up() {
+  local status=$?
+  if ((status != 0)) && [[ $(compose ps -q 2>/dev/null) ]]; then
+    compose logs --no-color --tail 40 >&2 || true
+  fi
+  docker rm --force "$OFFLINE" >/dev/null 2>&1 || true
+  compose down --volumes --remove-orphans >/dev/null 2>&1 || true
+  rm -rf "$WORK"
+  exit "$status"
+}
+trap clean_up EXIT
+trap 'exit 130' INT TERM
+
+published() { # service, port: where it is on this machine
+  compose port "$1" "$2" | sed 's#^#http://#'
+}
+container() { # service: its container, running or not
+  docker ps --all --quiet --filter "label=com.docker.compose.project=$PROJECT" \
+    --filter "label=com.docker.compose.service=$1"
+}
+fetch() { # url
+  python3 -c 'import sys, urllib.request as u
+opener = u.build_opener(u.ProxyHandler({}))
+sys.stdout.write(opener.open(sys.argv[1], timeout=5).read().decode())' "$1"
+}
+llm_of() { # container: what its /readyz says of the LLM, asked from inside
+  docker exec "$1" python -c 'import json, urllib.request as u
+print(json.load(u.urlopen("http://127.0.0.1:8000/readyz", timeout=2))["llm"])' 2>/dev/null || true
+}
+now_ms() { python3 -c 'import time; print(time.monotonic_ns() // 1_000_000)'; }
+stopped() { # container, command that stops it: see that it obeyed the SIGTERM
+  local begin milliseconds code
+  begin=$(now_ms)
+  "${@:2}" >/dev/null 2>&1
+  milliseconds=$(($(now_ms) - begin))
+  code=$(docker inspect --format '{{.State.ExitCode}}' "$1")
+  [[ $code == 0 || $code == 143 ]] || fail "$1 ended with exit code $code after SIGTERM"
+  ((milliseconds < STOP_S * 1000)) || fail "$1 took $milliseconds ms to stop"
+  echo "$milliseconds ms, exit code $code"
+}
+
+# --- build -----------------------------------------------------------------------------------------------------------
+if [[ -z ${PROMETHEUS_IMAGE:-} ]]; then
+  export PROMETHEUS_IMAGE=aicvds-test-prometheus
+  quietly docker build --network "$AICVDS_BUILD_NETWORK" --tag "$PROMETHEUS_IMAGE" - <<'DOCKERFILE'
+FROM python:3.11-slim-bookworm
+RUN apt-get update -q && apt-get install -y -q --no-install-recommends prometheus && rm -rf /var/lib/apt/lists/* \
+ && install --directory --owner=nobody --group=nogroup /prometheus
+USER nobody
+ENTRYPOINT ["/usr/bin/prometheus"]
+DOCKERFILE
+  say "Debian's Prometheus is built"
+fi
+compose down --volumes --remove-orphans >/dev/null 2>&1 || true
+quietly compose build
+say "edge and simulator are built"
+
+# --- fly -------------------------------------------------------------------------------------------------------------
+# Returns when the edge is healthy and the simulator has started.
+quietly compose up --detach
+edge=$(container edge) simulator=$(container simulator)
+[[ $(docker inspect --format '{{.State.Health.Status}}' "$edge") == healthy ]] || fail "the edge is not healthy"
+[[ $(llm_of "$edge") == ready ]] || fail "the edge is healthy without its LLM"
+say "the edge is healthy, its LLM ready"
+
+code=$(timeout "$FLIGHT_S" docker wait "$simulator") || fail "the simulator did not end within $FLIGHT_S s"
+[[ $code == 0 ]] || fail "the simulator ended with exit code $code"
+[[ $(docker inspect --format '{{.State.Status}}' "$edge") == running ]] || fail "the edge ended during the flight"
+docker cp "$simulator:/runs/compose" "$WORK/run" >/dev/null
+for file in decisions.jsonl report.html; do [[ -s $WORK/run/$file ]] || fail "the run has no $file"; done
+python3 - "$WORK/run/summary.json" <<'PYTHON'
+import json, sys
+
+summary = json.load(open(sys.argv[1]))
+by_source = summary["by_source"]
+print("       ", {key: summary[key] for key in ("decisions", "by_source", "by_reason", "lost_packets", "rtt_ms")})
+if (summary["decisions"], sum(by_source.values())) != (90, 90):
+    sys.exit("FAIL: not 90 decisions")
+if by_source["onboard"] or not by_source["llm"]:
+    sys.exit("FAIL: the edge left decisions unanswered, or its LLM took none")
+PYTHON
+say "the simulator flew 90 decisions and ended with exit code 0"
+
+# --- measured --------------------------------------------------------------------------------------------------------
+counted=$(fetch "$(published edge 8000)/metrics" | awk '/^aicvds_decisions_total[{ ]/ {n += $NF} END {print n + 0}')
+[[ $counted == 90 ]] || fail "/metrics counts $counted decisions"
+prometheus=$(published prometheus 9090)
+for _ in {1..30}; do
+  scraped=$(fetch "$prometheus/api/v1/query?query=sum(aicvds_decisions_total)" 2>/dev/null | python3 -c '
+import json, sys
+print(*(sample["value"][1] for sample in json.load(sys.stdin)["data"]["result"]))' 2>/dev/null) || true
+  [[ $scraped == 90 ]] && break
+  sleep 1
+done
+[[ $scraped == 90 ]] || fail "Prometheus knows of '$scraped' decisions"
+say "/metrics counts 90 decisions, and Prometheus has scraped them"
+
+# --- what the images hold --------------------------------------------------------------------------------------------
+edge_image=$(docker inspect --format '{{.Image}}' "$edge")
+simulator_image=$(docker inspect --format '{{.Image}}' "$simulator")
+lacks() { # image, modules it must do without
+  docker run --rm --network none --entrypoint python "$1" -c '
+import sys
+from importlib.util import find_spec
+from os import getuid
+if found := [name for name in sys.argv[1:] if find_spec(name)]:
+    sys.exit(f"FAIL: holds {found}")
+if getuid() == 0:
+    sys.exit("FAIL: runs as root")' "${@:2}"
+}
+lacks "$edge_image" simulator pettingzoo matplotlib pip
+lacks "$simulator_image" service torch scipy xllamacpp pip
+settings=$(docker run --rm --network none --entrypoint python "$edge_image" -c '
+from service.settings import Settings
+print(*(f"AICVDS_{name.upper()}" for name in Settings.model_fields if name != "cache_dir"))')
+for name in $settings; do
+  grep -q "^      - $name$" docker-compose.yml || fail "docker-compose.yml does not pass $name on"
+  grep -q "^#$name=" .env.example || fail ".env.example does not tell of $name"
+done
+say "both run as a plain user and hold only their own; every setting is passed on and told of"
+
+# --- SIGTERM ---------------------------------------------------------------------------------------------------------
+result=$(stopped "$edge" compose stop --timeout "$STOP_S" edge)
+say "the edge stopped: $result"
+compose down --volumes >/dev/null 2>&1
+
+# --- without a network -----------------------------------------------------------------------------------------------
+start_offline() { # as locked up as the compose file has it, and with no network at all
+  docker rm --force "$OFFLINE" >/dev/null 2>&1 || true
+  docker run --detach --name "$OFFLINE" --network none --read-only --tmpfs /tmp --cap-drop ALL \
+    --security-opt no-new-privileges:true "$edge_image" >/dev/null
+}
+start_offline
+begin=$SECONDS
+until [[ $(llm_of "$OFFLINE") == ready ]]; do
+  ((SECONDS - begin < LLM_S)) || { docker logs "$OFFLINE" >&2; fail "with no network the LLM is not ready in $LLM_S s"; }
+  sleep 1
+done
+source=$(docker exec "$OFFLINE" python -c '
+import json, urllib.request as u
+spec = json.load(u.urlopen("http://127.0.0.1:8000/openapi.json"))
+body = spec["paths"]["/decide"]["post"]["requestBody"]["content"]["application/json"]["examples"]["paper"]["value"]
+request = u.Request("http://127.0.0.1:8000/decide", json.dumps(body).encode(), {"Content-Type": "application/json"})
+print(json.load(u.urlopen(request))["source"])')
+[[ $source == llm ]] || fail "with no network the decision came from '$source'"
+say "with no network the LLM was ready in $((SECONDS - begin)) s and took a decision"
+start_offline
+sleep 0.3
+result=$(stopped "$OFFLINE" docker stop -t "$STOP_S" "$OFFLINE")
+say "stopped while still starting: $result"
+
+# --- sizes -----------------------------------------------------------------------------------------------------------
+size() { docker image inspect --format '{{.Size}}' "$1"; }
+base=$(size python:3.11-slim-bookworm 2>/dev/null || echo 0)
+for image in edge simulator; do
+  id=${image}_image
+  say "$image image: $((($(size "${!id}") - base) / 1000000)) MB beyond the base image's $((base / 1000000)) MB"
+done
+echo "PASS: the containers fly the paper's mission (${SECONDS} s)"
