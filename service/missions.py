@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from service.metrics import Metrics
 from service.mission import Mission
-from service.problems import Conflict, NotFound, TooMany
+from service.problems import Conflict, NotFound
 from service.settings import Settings
 from shared.wire import MissionSpec, UavState
 
@@ -61,6 +61,6 @@ class Missions:
     def _add(self, mission: Mission) -> None:
         if mission.mission_id not in self._missions and len(self._missions) >= self._settings.max_missions:
             limit = self._settings.max_missions
-            raise TooMany("mission_id", f"{limit} missions are held already: DELETE one, or raise AICVDS_MAX_MISSIONS")
+            raise Conflict("mission_id", f"{limit} missions are held already: DELETE one, or raise AICVDS_MAX_MISSIONS")
         self._missions[mission.mission_id] = mission
         self._metrics.missions.set(len(self._missions))

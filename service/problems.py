@@ -42,12 +42,6 @@ class Conflict(Refused):
     status = HTTPStatus.CONFLICT
 
 
-class TooMany(Refused):
-    """A bound on what the edge holds is reached."""
-
-    status = HTTPStatus.TOO_MANY_REQUESTS
-
-
 def problem_response(status: int, detail: str, errors: Sequence[dict[str, str]] = ()) -> Response:
     """An ``application/problem+json`` response; never echoes what was sent."""
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))

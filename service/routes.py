@@ -50,7 +50,7 @@ def _engine(request: Request) -> Engine:
 TheEngine = Annotated[Engine, Depends(_engine)]
 
 
-@router.post("/decide", responses=documented(400, 404, 413, 415, 422, 429), tags=["decisions"])
+@router.post("/decide", responses=documented(400, 404, 409, 413, 415, 422), tags=["decisions"])
 async def decide(
     body: Annotated[DecideRequest, Body(openapi_examples={"paper": {"value": EXAMPLE}})],
     engine: TheEngine,
@@ -62,7 +62,7 @@ async def decide(
     return answer
 
 
-@router.post("/decide/batch", responses=documented(400, 404, 413, 415, 422, 429), tags=["decisions"])
+@router.post("/decide/batch", responses=documented(400, 404, 409, 413, 415, 422), tags=["decisions"])
 async def decide_batch(body: BatchRequest, engine: TheEngine) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
     return BatchResponse(decisions=await engine.decide_batch(body))
@@ -74,7 +74,7 @@ async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse
     return engine.feedback(body)
 
 
-@router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422, 429), tags=["missions"])
+@router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422), tags=["missions"])
 async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
     """Make a mission with its scenario, mode and k; the same again changes nothing."""
     return engine.missions.put(mission_id, body).status()

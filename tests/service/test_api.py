@@ -218,7 +218,7 @@ def test_missions(edge: Edge, report: Report) -> None:
     assert custom.status_code == 200, custom.text
     assert client.post("/decide", json=report(mission_id="b", uav_id=1)).status_code == 422
     full = client.post("/decide", json=report(mission_id="c"))
-    assert (full.status_code, fields(full)) == (429, ["mission_id"])
+    assert (full.status_code, fields(full)) == (409, ["mission_id"])
     assert client.delete("/missions/a").status_code == 204
     assert client.delete("/missions/a").status_code == 404
     assert client.post("/decide", json=report(mission_id="c")).status_code == 200

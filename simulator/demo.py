@@ -1,0 +1,151 @@
+"""``aicvds demo``: an edge, its LLM and a whole mission on this machine, in one command."""
+
+from __future__ import annotations
+
+import shlex
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from simulator.client import EdgeError
+from simulator.simulate import (
+    BadUse,
+    Job,
+    check_bounds,
+    chosen_scenario,
+    conduct,
+    refuse_old_result,
+    remove_old_result,
+    reporting,
+)
+
+EDGE_LOG = "edge.log"
+STOP_S = 10.0
+TAIL_LINES = 15
+HOST = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Start an edge on this machine, fly a mission against it, and compare with EOF and WQCS.
+
+    The edge loads its LLM (the embedded one, or the one that the AICVDS_LLM_* variables name), decides for
+    three UAVs at thirty waypoints each, and is stopped again. Written to --out: report.html (open it in a
+    browser), summary.json, decisions.jsonl and edge.log. What an earlier demo left there is overwritten.
+
+    Try it:  aicvds demo --out runs/demo
+
+    Exit code: 0 flown, 1 the edge did not start or answer, 2 bad use, 130 interrupted.
+    """
+
+    out: Path = Path("runs/demo")
+    """Folder to write to, made if missing."""
+    seed: int = 0
+    """Of the world, 0 to 4294967295; the same seed is the same world."""
+    scenario: str = "paper"
+    """The world: paper, pipeline, stress, dense or lossy_uplink; `aicvds simulate --help` says what they are."""
+    port: int = 0
+    """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
+    wait_s: float = 300.0
+    """Seconds that the edge may take to start and to load its LLM."""
+
+
+class EdgeDied(EdgeError):
+    """The edge's process ended by itself; the text has the end of its log."""
+
+
+def main(argv: list[str]) -> int:
+    """Run the demo that the command line describes; returns the exit code."""
+    try:
+        options = tyro.cli(Demo, prog="aicvds demo", args=argv)
+    except SystemExit as done:
+        return done.code if isinstance(done.code, int) else 2
+    command = shlex.join(["aicvds", "demo", *argv])
+    return reporting("aicvds demo", lambda console: demo(options, command, console))
+
+
+def demo(options: Demo, command: str, console: Console) -> int:
+    """Serve, fly, stop; returns the exit code.
+
+    Raises:
+        BadUse: the options make no demo.
+        EdgeError: the edge died at start, or never became ready.
+        OSError: the folder cannot be written.
+    """
+    scenario = chosen_scenario(options.scenario)
+    check_bounds(options.seed, options.wait_s)
+    if not 0 <= options.port <= 65_535:
+        raise BadUse(f"--port {options.port} is not between 0 and 65535")
+    refuse_old_result(options.out, overwrite=True)
+    port = _usable_port(options.port)
+    options.out.mkdir(parents=True, exist_ok=True)
+    remove_old_result(options.out)
+    from simulator.mission import new_mission_id
+
+    job = Job(
+        scenario=scenario,
+        seed=options.seed,
+        mission_id=new_mission_id(scenario, options.seed),
+        out=options.out,
+        command=command,
+        edge=f"http://{HOST}:{port}",
+        wait_s=options.wait_s,
+    )
+    log = options.out / EDGE_LOG
+    with edge_process(port, log) as process:
+        console.print(
+            f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
+        )
+        return conduct(job, console, alive=lambda: _check_alive(process, log))
+
+
+@contextmanager
+def edge_process(port: int, log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """An edge on the loopback's ``port``, its output in ``log``; stopped on leaving, whatever the reason."""
+    command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+    with log.open("wb") as output:
+        # A session of its own: Ctrl-C must reach the flight first, which still needs its edge to land.
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            yield process
+        finally:
+            _stop(process)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    try:
+        process.terminate()
+        process.wait(STOP_S)
+    except subprocess.TimeoutExpired:
+        pass
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+def _check_alive(process: subprocess.Popen[bytes], log: Path) -> None:
+    code = process.poll()
+    if code is not None:
+        tail = log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL_LINES:]
+        raise EdgeDied("\n".join([f"the edge ended with code {code}; the end of {log}:", *tail]))
+
+
+def _usable_port(port: int) -> int:
+    # Were the port taken, the edge would die and the mission fly against whatever listens there.
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise BadUse(f"--port {port}: {error.strerror}; choose another, or 0 for a free one") from None
+        return int(probe.getsockname()[1])

@@ -1,0 +1,301 @@
+"""The report's figures, each one a string of SVG fit to stand inline beside the others.
+
+Colours are Okabe and Ito's, which stay apart for colour-blind readers; lines differ in dashes and markers too.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+
+from shared.scenario import Scenario
+from simulator.record import Decision, Tally, visits_per_sensor
+
+INK = "#222222"
+BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#767676"
+LINES = ((BLUE, "-", "o"), (ORANGE, "--", "s"), (GREEN, ":", "^"), (PURPLE, "-.", "D"))
+SOURCES = {"llm": BLUE, "guided": GREEN, "policy": ORANGE, "onboard": RED}
+MAPS = 9
+WIDTH_IN = 9.0
+
+_RC: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial", "sans-serif"],
+    "font.size": 11,
+    "axes.labelsize": 11,
+    "axes.titlesize": 12,
+    "axes.linewidth": 0.8,
+    "xtick.labelsize": 10,
+    "ytick.labelsize": 10,
+    "legend.fontsize": 10,
+    "legend.frameon": False,
+    "lines.linewidth": 1.8,
+    "text.parse_math": False,
+    "axes.formatter.use_mathtext": False,
+    "axes.unicode_minus": True,
+    "savefig.bbox": "tight",
+}
+
+_HALO = [withStroke(linewidth=2.5, foreground="white")]
+
+
+@contextmanager
+def _drawn(name: str, height_in: float, panels: tuple[int, int], out: list[str]) -> Iterator[list[Axes]]:
+    # A constant salt makes the ids, and so the whole text, the same on every run.
+    with matplotlib.style.context(["default", {**_RC, "svg.hashsalt": name}]):
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout="compressed")
+        yield list(figure.subplots(*panels, squeeze=False).flat)
+        out.append(_inline_svg(figure, name))
+
+
+def _inline_svg(figure: Figure, name: str) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    # Every figure numbers its parts from 1; inline, the ids of all share one page.
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = re.sub(r'href="#', f'href="#{name}-', svg)
+    svg = re.sub(r"url\(#", f"url(#{name}-", svg)
+    svg = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', "", svg, count=1)
+    return svg.replace("<svg", f'<svg role="img" aria-labelledby="{name}-caption"', 1)
+
+
+def _integers(axes: Axes, x: bool = True, y: bool = True) -> None:
+    if x:
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
+    if y:
+        axes.yaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
+
+
+def _plain(axes: Axes) -> None:
+    axes.minorticks_off()
+    axes.tick_params(top=False, right=False, direction="out")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> str:
+    """One map a UAV (the first nine): its circle, its waypoints coloured by round trip, all sensors.
+
+    ``sensor_xy`` is (J, 2) in metres. Waypoints without a round trip, decided on board, are hollow.
+    """
+    shown = min(scenario.uavs, MAPS)
+    columns = min(3, shown)
+    rows = -(-shown // columns)
+    trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
+    low, high = (min(trips), max(trips)) if trips else (0.0, 1.0)
+    out: list[str] = []
+    with _drawn("latency-map", 3.0 * rows + 0.3, (rows, columns), out) as panels:
+        for extra in panels[shown:]:
+            extra.set_visible(False)
+        points = None
+        for uav in range(shown):
+            mine = [d for d in decisions if d.uav_id == uav]
+            drawn = _map_panel(panels[uav], scenario, sensor_xy, uav, mine, (low, high))
+            points = drawn if drawn is not None else points
+            panels[uav].set_xlabel("x (m)")
+            if uav % columns == 0:
+                panels[uav].set_ylabel("y (m)")
+        if points is not None:
+            bar = panels[0].figure.colorbar(points, ax=panels, shrink=0.8, pad=0.02)
+            bar.set_label("round trip (ms)")
+            bar.ax.minorticks_off()
+    return out[0]
+
+
+def _map_panel(
+    axes: Axes,
+    scenario: Scenario,
+    sensor_xy: np.ndarray,
+    uav: int,
+    mine: Sequence[Decision],
+    limits: tuple[float, float],
+) -> PathCollection | None:
+    centre = scenario.lap_centres[uav]
+    axes.add_patch(Circle(centre, scenario.lap_radius_m, fill=False, color=GREY, linewidth=0.8, linestyle="--"))
+    few = len(sensor_xy) <= 20
+    axes.scatter(
+        sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=42 if few else 10, color=INK, edgecolors="white", zorder=5
+    )
+    for j, (x, y) in enumerate(sensor_xy if few else ()):
+        axes.annotate(
+            str(j),
+            (x, y),
+            xytext=(5, 4),
+            textcoords="offset points",
+            fontsize=9,
+            color=INK,
+            zorder=6,
+            path_effects=_HALO,
+        )
+    onboard = np.array([d.position for d in mine if d.rtt_ms is None]).reshape(-1, 2)
+    axes.scatter(onboard[:, 0], onboard[:, 1], s=40, facecolors="none", edgecolors=RED, linewidths=1.4, zorder=4)
+    asked = [d for d in mine if d.rtt_ms is not None]
+    points = None
+    if asked:
+        at = np.array([d.position for d in asked])
+        trips = np.array([d.rtt_ms for d in asked], dtype=float)
+        points = axes.scatter(
+            at[:, 0], at[:, 1], c=trips, cmap="viridis", vmin=limits[0], vmax=limits[1],
+            s=46, edgecolors="white", linewidths=0.5, zorder=3,
+        )  # fmt: skip
+    axes.set_title(f"UAV {uav}")
+    axes.set_aspect("equal")
+    edge = scenario.lap_offset_m + scenario.lap_radius_m - scenario.area_m / 2
+    margin = max(0.0, edge) + 0.04 * scenario.area_m
+    axes.set_xlim(-margin, scenario.area_m + margin)
+    axes.set_ylim(-margin, scenario.area_m + margin)
+    axes.minorticks_off()
+    axes.locator_params(nbins=4)
+    return points
+
+
+def latency_per_step(decisions: Sequence[Decision]) -> str:
+    """Round trip over the steps: the median of the fleet, the range from fastest to slowest, and each UAV's points."""
+    by_step: dict[int, list[float]] = defaultdict(list)
+    for d in decisions:
+        if d.rtt_ms is not None:
+            by_step[d.step].append(d.rtt_ms)
+    steps = sorted(by_step)
+    out: list[str] = []
+    with _drawn("latency-steps", 3.0, (1, 1), out) as (axes,):
+        if steps:
+            low, high = [min(by_step[s]) for s in steps], [max(by_step[s]) for s in steps]
+            axes.fill_between(steps, low, high, color=BLUE, alpha=0.18, linewidth=0, label="fastest to slowest UAV")
+            axes.plot(
+                steps, [float(np.median(by_step[s])) for s in steps], color=BLUE, marker="o", ms=4, label="median"
+            )
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.17), ncols=2)
+            axes.set_ylim(bottom=0)
+        axes.set_xlabel("step")
+        axes.set_ylabel("round trip (ms)")
+        _plain(axes)
+        _integers(axes, y=False)
+    return out[0]
+
+
+def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> str:
+    """Lost packets and loss events of every policy, per step and cumulative; ``names`` labels the policies."""
+    measures: tuple[tuple[str, Callable[[Tally], int]], ...] = (
+        ("lost packets", lambda t: t.lost_packets),
+        ("loss events", lambda t: t.failures + t.overflows),
+    )
+    out: list[str] = []
+    with _drawn("losses", 6.0, (2, 2), out) as panels:
+        for row, (title, measure) in enumerate(measures):
+            for (name, tally), (colour, dash, marker) in zip(tallies.items(), LINES, strict=False):
+                values = np.array([measure(t) for t in tally], dtype=float)
+                for axes, series in ((panels[2 * row], values), (panels[2 * row + 1], values.cumsum())):
+                    axes.plot(
+                        np.arange(len(series)), series, color=colour, linestyle=dash, marker=marker,
+                        markersize=3.5, label=names.get(name, name),
+                    )  # fmt: skip
+            panels[2 * row].set_ylabel(f"{title} a step")
+            panels[2 * row + 1].set_ylabel(f"{title}, cumulative")
+        for axes in panels:
+            _plain(axes)
+            _integers(axes)
+            axes.set_ylim(bottom=0)
+        for axes in panels[2:]:
+            axes.set_xlabel("step")
+        handles, labels = panels[0].get_legend_handles_labels()
+        if handles:
+            panels[0].figure.legend(handles, labels, loc="outside upper center", ncols=len(handles))
+    return out[0]
+
+
+def tokens_per_step(decisions: Sequence[Decision]) -> str:
+    """Tokens a decision, averaged over the fleet at each step: the prompt and its state block, as sent and in full."""
+    by_step = defaultdict(list)
+    for d in decisions:
+        if d.tokens is not None:
+            by_step[d.step].append(d.tokens)
+    steps = sorted(by_step)
+    out: list[str] = []
+    with _drawn("tokens", 3.4, (1, 2), out) as panels:
+        for axes, sent, full, title in (
+            (panels[0], "prompt", "uncompressed", "whole prompt"),
+            (panels[1], "state", "state_uncompressed", "state block"),
+        ):
+            for key, label, (colour, dash, marker) in (
+                (full, "every sensor", LINES[1]),
+                (sent, "as sent", LINES[0]),
+            ):
+                means = [float(np.mean([getattr(t, key) for t in by_step[s]])) for s in steps]
+                axes.plot(steps, means, color=colour, linestyle=dash, marker=marker, markersize=3.5, label=label)
+            axes.set_title(title)
+            axes.set_xlabel("step")
+            axes.set_ylim(bottom=0)
+            _plain(axes)
+            _integers(axes)
+        panels[0].set_ylabel("tokens a decision")
+        handles, labels = panels[0].get_legend_handles_labels()
+        panels[0].figure.legend(handles, labels, loc="outside upper center", ncols=2)
+    return out[0]
+
+
+def visits(decisions: Sequence[Decision], sensors: int) -> str:
+    """Visits of each sensor: served ones, and failed ones on top."""
+    served = np.array(visits_per_sensor(decisions, sensors))
+    tried = np.bincount([d.sensor_id for d in decisions], minlength=sensors)[:sensors]
+    out: list[str] = []
+    with _drawn("visits", 3.0, (1, 1), out) as (axes,):
+        at = np.arange(sensors)
+        axes.bar(at, served, color=BLUE, label="served")
+        missed = np.flatnonzero(tried > served)
+        axes.bar(
+            missed,
+            (tried - served)[missed],
+            bottom=served[missed],
+            color="white",
+            edgecolor=RED,
+            hatch="////",
+            label="failed",
+        )
+        axes.axhline(served.mean(), color=INK, linewidth=1, linestyle=":", label="mean served")
+        if sensors <= 20:
+            axes.set_xticks(at)
+        axes.set_xlabel("sensor")
+        axes.set_ylabel("visits")
+        _plain(axes)
+        _integers(axes, x=False)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=3)
+    return out[0]
+
+
+def deciders(decisions: Sequence[Decision]) -> str:
+    """Who took the decisions of each step, as stacked bars."""
+    steps = sorted({d.step for d in decisions})
+    out: list[str] = []
+    with _drawn("deciders", 2.6, (1, 1), out) as (axes,):
+        below = np.zeros(len(steps))
+        for source, colour in SOURCES.items():
+            counts = np.array([sum(d.step == s and d.source == source for d in decisions) for s in steps], dtype=float)
+            if counts.any():
+                axes.bar(steps, counts, bottom=below, color=colour, label=source, edgecolor="white", linewidth=0.5)
+                below = below + counts
+        axes.set_xlabel("step")
+        axes.set_ylabel("decisions")
+        _plain(axes)
+        _integers(axes)
+        if steps:
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=4)
+    return out[0]

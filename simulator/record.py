@@ -1,0 +1,264 @@
+"""What a mission leaves behind: one line a decision in ``decisions.jsonl``, one ``summary.json``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Literal, Protocol, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from shared.wire import Candidate, Tokens
+
+LATE_SLACK_MS = 50.0
+
+DecidedBy = Literal["llm", "guided", "policy", "onboard"]
+
+
+class Record(BaseModel):
+    """Files written by an older version may lack a field and those by a newer one have more."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Decision(Record):
+    """One decision and what came of it.
+
+    ``position`` is where it was taken, metres. ``source`` is ``onboard`` when the UAV decided itself, and then
+    ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null`` and ``attempts``, ``request_bytes`` and
+    ``response_bytes`` 0. ``rtt_ms`` includes retries; ``lost_packets`` and ``cost`` are this UAV's share.
+    """
+
+    step: int
+    uav_id: int
+    position: tuple[float, float]
+    sensor_id: int
+    velocity: int
+    source: DecidedBy
+    reason: str | None = None
+    model: str | None = None
+    decision_id: str | None = None
+    top_k: list[Candidate] = []
+    tokens: Tokens | None = None
+    latency_ms: dict[str, float] = {}
+    deadline_ms: int | None = None
+    rtt_ms: float | None = None
+    attempts: int = 0
+    request_bytes: int = 0
+    response_bytes: int = 0
+    failed: bool = False
+    collected: int = 0
+    lost_packets: int = 0
+    cost: float = 0.0
+
+
+class BySource(Record):
+    """Decisions, by who took them."""
+
+    llm: int = 0
+    guided: int = 0
+    policy: int = 0
+    onboard: int = 0
+
+
+class TokenSummary(Record):
+    """Means over the decisions that the edge took, ``null`` when it took none or did not say."""
+
+    prompt_mean: float | None = None
+    uncompressed_mean: float | None = None
+    saved_pct: float | None = None
+    cached_mean: float | None = None
+    state_mean: float | None = None
+    state_uncompressed_mean: float | None = None
+    state_saved_pct: float | None = None
+
+
+class RoundTrips(Record):
+    """Percentiles over the decisions that the edge took, milliseconds."""
+
+    p50: float | None = None
+    p99: float | None = None
+
+
+class Flown(Record):
+    """The mission's facts that no single decision holds.
+
+    ``steps`` were asked for and ``steps_flown`` flown; ``policy`` is ``edge`` or a local policy's name;
+    ``deadline_ms`` is what the edge said last, or what it was asked for.
+    """
+
+    scenario: str
+    seed: int
+    steps: int
+    steps_flown: int
+    uavs: int
+    sensors: int
+    policy: str
+    edge: str | None
+    mission_id: str
+    mode: str | None
+    model: str | None
+    deadline_ms: int | None
+    interrupted: bool
+    started_at: datetime
+    duration_s: float
+    version: str
+    command: str
+
+
+class Summary(Flown):
+    """``summary.json``.
+
+    ``lost_packets`` and ``loss_events`` are by policy: ``aic_vds`` (or the local policy that was flown), ``eof``
+    and ``wqcs``, all over ``steps_flown`` steps of one world. ``late`` counts decisions whose round trip took more than
+    their deadline + 50 ms. ``jain`` is Jain's index of the sensors'
+    served visits, ``null`` when none was served; ``failures`` are failed transmissions.
+    """
+
+    decisions: int
+    by_source: BySource
+    by_reason: dict[str, int]
+    lost_packets: dict[str, int]
+    loss_events: dict[str, int]
+    failures: int
+    late: int
+    tokens: TokenSummary
+    rtt_ms: RoundTrips
+    uplink_bytes_mean: float | None
+    jain: float | None
+
+
+class Tally(Protocol):
+    """One step's losses, as ``simulator.world.StepTally`` counts them."""
+
+    @property
+    def failures(self) -> int: ...
+    @property
+    def overflows(self) -> int: ...
+    @property
+    def lost_packets(self) -> int: ...
+
+
+class DecisionLog:
+    """Appends decisions to a new file and flushes each, so that a killed mission loses half a line at most.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file: IO[str] = path.open("w", encoding="utf-8")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._file.close()
+
+    def append(self, decision: Decision) -> None:
+        """Write one line."""
+        self._file.write(decision.model_dump_json() + "\n")
+        self._file.flush()
+
+    def keep(self, decisions: Iterable[Decision]) -> None:
+        """Make these the file's only lines, after an interrupt that may have come in the middle of one."""
+        self._file.seek(0)
+        self._file.truncate()
+        self._file.writelines(decision.model_dump_json() + "\n" for decision in decisions)
+        self._file.flush()
+
+
+def read_decisions(path: Path) -> list[Decision]:
+    """The decisions of a ``decisions.jsonl``; a last line cut off by a crash is left out.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: a line that is not the last is no decision; the text names the line.
+    """
+    lines = path.read_bytes().split(b"\n")
+    decisions = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            decisions.append(Decision.model_validate_json(line))
+        except ValidationError as error:
+            # Every whole line ends in a newline, so only the remainder after the last one may be torn.
+            if number == len(lines):
+                break
+            raise ValueError(f"{path}, line {number}: {error.errors(include_url=False)[0]['msg']}") from None
+    return decisions
+
+
+def visits_per_sensor(decisions: Iterable[Decision], sensors: int) -> list[int]:
+    """Served visits of each of ``sensors`` sensors."""
+    served = Counter(d.sensor_id for d in decisions if not d.failed)
+    return [served[j] for j in range(sensors)]
+
+
+def jain_index(values: Sequence[float]) -> float | None:
+    """Jain's fairness index, 1/n (one has all) to 1 (all alike); ``None`` when every value is 0."""
+    squares = sum(v * v for v in values)
+    return sum(values) ** 2 / (len(values) * squares) if squares else None
+
+
+def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str, Sequence[Tally]]) -> Summary:
+    """The summary of one mission.
+
+    Args:
+        flown: the mission's facts.
+        decisions: every decision of its ``steps_flown`` steps.
+        tallies: per policy, one tally a step flown.
+    """
+    from_edge = [d for d in decisions if d.rtt_ms is not None]
+    trips = [d.rtt_ms for d in from_edge if d.rtt_ms is not None]
+    return Summary(
+        **flown.model_dump(),
+        decisions=len(decisions),
+        by_source=BySource.model_validate(Counter(d.source for d in decisions)),
+        by_reason=dict(sorted(Counter(d.reason for d in decisions if d.reason is not None).items())),
+        lost_packets={name: int(sum(t.lost_packets for t in tally)) for name, tally in tallies.items()},
+        loss_events={name: int(sum(t.failures + t.overflows for t in tally)) for name, tally in tallies.items()},
+        failures=sum(d.failed for d in decisions),
+        late=sum(_is_late(d) for d in from_edge),
+        tokens=_tokens([d.tokens for d in from_edge if d.tokens is not None]),
+        rtt_ms=RoundTrips(p50=_percentile(trips, 50), p99=_percentile(trips, 99)),
+        uplink_bytes_mean=_mean([d.request_bytes for d in from_edge]),
+        jain=jain_index(visits_per_sensor(decisions, flown.sensors)),
+    )
+
+
+def _is_late(decision: Decision) -> bool:
+    if decision.rtt_ms is None or decision.deadline_ms is None:
+        return False
+    return decision.rtt_ms > decision.deadline_ms + LATE_SLACK_MS
+
+
+def _tokens(counts: list[Tokens]) -> TokenSummary:
+    prompt, uncompressed = _mean([t.prompt for t in counts]), _mean([t.uncompressed for t in counts])
+    state, state_uncompressed = _mean([t.state for t in counts]), _mean([t.state_uncompressed for t in counts])
+    return TokenSummary(
+        prompt_mean=prompt,
+        uncompressed_mean=uncompressed,
+        saved_pct=_saved_pct(prompt, uncompressed),
+        cached_mean=_mean([t.cached for t in counts if t.cached is not None]),
+        state_mean=state,
+        state_uncompressed_mean=state_uncompressed,
+        state_saved_pct=_saved_pct(state, state_uncompressed),
+    )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _saved_pct(kept: float | None, whole: float | None) -> float | None:
+    return 100 * (1 - kept / whole) if kept is not None and whole else None
+
+
+def _percentile(values: list[float], q: float) -> float | None:
+    return float(np.percentile(values, q)) if values else None

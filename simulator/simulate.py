@@ -1,0 +1,369 @@
+"""``aicvds simulate``: fly one mission against an edge and leave its summary, decisions and report."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import httpx
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from tyro.conf import FlagCreatePairsOff, arg
+
+from shared.scenario import Scenario, scenario_named
+from shared.wire import Mode
+from simulator.client import EdgeClient, EdgeError, edge_url
+from simulator.record import DecisionLog, Summary, summarise
+from simulator.uplink import LossyTransport
+
+# The world and matplotlib take a second to import; `--help` and bad use answer without them.
+if TYPE_CHECKING:
+    from simulator.mission import Choice, Flight, Pilot
+
+SUMMARY, DECISIONS, REPORT = "summary.json", "decisions.jsonl", "report.html"
+API_KEY = "AICVDS_API_KEY"
+# Without a deadline of our own the edge's applies, and it may be as long as the paper's step.
+DEFAULT_TIMEOUT_S = 10.0
+NETWORK_SLACK_S = 1.0
+INTERRUPTED = 130
+
+
+class BadUse(Exception):
+    """What was asked for cannot be done; the text says what to ask for instead."""
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Fly one mission against an edge and write what came of it.
+
+    The UAVs fly the scenario's world step by step, ask the edge at every waypoint, and report what each decision
+    cost. EOF and WQCS then fly the same world for comparison. Written to --out: summary.json,
+    decisions.jsonl (one decision a line, written as they happen) and report.html (open it in a browser).
+
+    Start an edge, then fly against it from another terminal:
+
+      aicvds serve
+
+      aicvds simulate --edge http://127.0.0.1:8000 --out runs/first
+
+    No edge at hand:
+
+      aicvds simulate --policy eof
+
+    Ctrl-C stops the flight and still writes the report of what was flown. An edge that wants a key gets
+    the one in the environment variable AICVDS_API_KEY. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
+    """
+
+    edge: Annotated[str | None, arg(metavar="URL")] = None
+    """The edge's address, such as http://127.0.0.1:8000. Needed unless --policy is a local one."""
+    scenario: Annotated[str, arg(metavar="NAME")] = "paper"
+    """The world: paper (10 sensors, 3 UAVs, 30 steps), pipeline (sensors in a line), stress (weak link),
+    dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost)."""
+    seed: Annotated[int, arg(metavar="N")] = 0
+    """Of the world: sensors, arrivals and start angles. 0 to 4294967295; the same seed is the same world."""
+    steps: Annotated[int | None, arg(metavar="N")] = None
+    """Waypoints to fly, 1 to 10000. Default: the scenario's (30)."""
+    policy: Annotated[str, arg(metavar="NAME")] = "edge"
+    """Who decides: edge, or with no edge at all eof (earliest overflow first), wqcs (weighted queue and
+    channel), round_robin or random."""
+    mode: Annotated[Mode | None, arg(metavar="MODE")] = None
+    """How the edge decides: llm (the paper's method) or value (what its modules learned). Default: the edge's."""
+    deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
+    """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
+    wait_s: Annotated[float, arg(metavar="S")] = 120.0
+    """Seconds to wait for the edge and its LLM. One still loading its LLM then decides without it."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder to write to, made if missing. Default: runs/ and the mission's ID, such as runs/paper-0-1f6c09ab."""
+    overwrite: Annotated[bool, FlagCreatePairsOff] = False
+    """Write even where a mission's result is already."""
+
+
+def main(argv: list[str]) -> int:
+    """Fly the mission that the command line describes; returns the exit code."""
+    try:
+        options = tyro.cli(Simulate, prog="aicvds simulate", args=argv)
+    except SystemExit as done:
+        return done.code if isinstance(done.code, int) else 2
+    command = shlex.join(["aicvds", "simulate", *argv])
+    return reporting("aicvds simulate", lambda console: simulate(options, command, console))
+
+
+def simulate(options: Simulate, command: str, console: Console) -> int:
+    """Fly, write, print; returns the exit code.
+
+    Raises:
+        BadUse: the options make no mission.
+        EdgeError: no edge answers as one.
+        OSError: the folder cannot be written.
+    """
+    scenario = chosen_scenario(options.scenario, options.steps)
+    check(options)
+    from simulator.mission import new_mission_id
+
+    mission_id = new_mission_id(scenario, options.seed)
+    job = Job(
+        scenario=scenario,
+        seed=options.seed,
+        mission_id=mission_id,
+        out=options.out or Path("runs") / mission_id,
+        command=command,
+        policy=options.policy,
+        edge=options.edge if options.policy == "edge" else None,
+        mode=options.mode,
+        deadline_ms=options.deadline_ms,
+        wait_s=options.wait_s,
+    )
+    refuse_old_result(job.out, options.overwrite)
+    return conduct(job, console)
+
+
+def chosen_scenario(name: str, steps: int | None = None) -> Scenario:
+    """The preset, with other ``steps`` if given; raises ``BadUse``."""
+    try:
+        scenario = scenario_named(name)
+        return scenario if steps is None else Scenario.model_validate({**scenario.model_dump(), "steps": steps})
+    except ValueError as error:
+        known = not str(error).startswith("unknown scenario")
+        raise BadUse(f"--steps {steps} is not between 1 and 10000" if known else f"--scenario: {error}") from None
+
+
+def check(options: Simulate) -> None:
+    """Raises ``BadUse`` for the first option that is out of its bounds."""
+    from simulator.policies import POLICY_NAMES
+
+    check_bounds(options.seed, options.wait_s)
+    if options.policy not in ("edge", *POLICY_NAMES):
+        raise BadUse(f"--policy {options.policy}: choose one of edge, {', '.join(POLICY_NAMES)}")
+    if options.deadline_ms is not None and not 10 <= options.deadline_ms <= 60_000:
+        raise BadUse(f"--deadline-ms {options.deadline_ms} is not between 10 and 60000")
+    if options.policy != "edge":
+        return
+    if options.edge is None:
+        raise BadUse("--edge is missing: give the edge's address, such as --edge http://127.0.0.1:8000")
+    try:
+        edge_url(options.edge)
+    except ValueError as error:
+        raise BadUse(f"--edge: {error}") from None
+
+
+def check_bounds(seed: int, wait_s: float) -> None:
+    """Raises ``BadUse`` for a seed or a wait out of bounds."""
+    if not 0 <= seed < 2**32:
+        raise BadUse(f"--seed {seed} is not between 0 and {2**32 - 1}")
+    if not 0 <= wait_s <= 86_400:
+        raise BadUse(f"--wait-s {wait_s:g} is not between 0 and 86400")
+
+
+def refuse_old_result(out: Path, overwrite: bool) -> None:
+    """Raises ``BadUse`` when ``out`` is no folder, or holds a result that may not be overwritten."""
+    if out.exists() and not out.is_dir():
+        raise BadUse(f"--out {out} is a file; name a folder")
+    if not overwrite and (out / SUMMARY).exists():
+        raise BadUse(f"--out {out} holds a mission's result already; choose another folder or add --overwrite")
+
+
+def remove_old_result(out: Path) -> None:
+    """Remove an earlier summary and report, which would else stand beside another mission's decisions."""
+    for stale in (SUMMARY, REPORT):
+        (out / stale).unlink(missing_ok=True)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One mission to conduct. ``policy`` is ``edge`` or a local policy's name; ``edge`` is ``None`` for those."""
+
+    scenario: Scenario
+    seed: int
+    mission_id: str
+    out: Path
+    command: str
+    policy: str = "edge"
+    edge: str | None = None
+    mode: Mode | None = None
+    deadline_ms: int | None = None
+    wait_s: float = 120.0
+
+
+def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None) -> int:
+    """Wait for the edge, fly, compare, write and print; returns the exit code.
+
+    ``alive`` is called while waiting and raises if there is nothing to wait for.
+
+    Raises:
+        EdgeError: no edge answers as one, before take-off.
+        OSError: the folder cannot be written.
+    """
+    from simulator.mission import EdgePilot, LocalPilot
+
+    if job.edge is None:
+        flight = _fly(job, LocalPilot(job.policy, job.scenario, job.seed), console)
+        return _conclude(job, flight, None, None, console)
+    with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio:
+        model = _wait(ground, job, console, alive)
+        pilot = EdgePilot(radio, job.mission_id, job.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms)
+        mode = ground.put_mission(job.mission_id, pilot.spec).mode
+        flight = _fly(job, pilot, console)
+    code = _conclude(job, flight, mode, model, console)
+    if pilot.last_error is not None:
+        unanswered = len(flight.decisions) - pilot.answered
+        print(
+            f"{unanswered} decisions were taken on board. The edge's last failure: {pilot.last_error}", file=sys.stderr
+        )
+    return code or (1 if flight.decisions and not pilot.answered else 0)
+
+
+def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
+    """The fleet's radio, or the wire on the ground, which loses nothing whatever the scenario."""
+    timeout_s = DEFAULT_TIMEOUT_S if job.deadline_ms is None else job.deadline_ms / 1000 + NETWORK_SLACK_S
+    transport = None
+    if airborne and (job.scenario.uplink_drop or job.scenario.uplink_jitter_ms):
+        transport = LossyTransport(
+            httpx.HTTPTransport(),
+            drop=job.scenario.uplink_drop,
+            jitter_ms=job.scenario.uplink_jitter_ms,
+            seed=job.seed,
+        )
+    key = os.environ.get(API_KEY) or None
+    return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport)
+
+
+def _wait(ground: EdgeClient, job: Job, console: Console, alive: Callable[[], None]) -> str | None:
+    with console.status(f"Waiting for the edge at {ground.base_url}") as status:
+
+        def waiting(cause: str) -> None:
+            alive()
+            status.update(f"Waiting for the edge at {ground.base_url}: {escape(cause)}")
+
+        readiness = ground.wait_ready(job.wait_s, on_wait=waiting)
+        alive()
+    if readiness.llm == "ready":
+        console.print(f"The edge is ready; its LLM is {escape(readiness.model or 'unnamed')}.")
+    else:
+        detail = f" ({readiness.detail})" if readiness.detail else ""
+        console.print(f"The edge is ready; its LLM is {readiness.llm}{escape(detail)}, so its policy decides.")
+    return readiness.model
+
+
+def _fly(job: Job, pilot: Pilot, console: Console) -> Flight:
+    from simulator.mission import fly
+
+    job.out.mkdir(parents=True, exist_ok=True)
+    remove_old_result(job.out)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn("steps"),
+        TextColumn("{task.fields[news]}"),
+        TimeElapsedColumn(),
+    )
+    with DecisionLog(job.out / DECISIONS) as log, Progress(*columns, console=console) as progress:
+        task = progress.add_task("Flying", total=job.scenario.steps, news="")
+        lost = 0
+
+        def decided(choice: Choice) -> None:
+            trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
+            progress.update(task, news=f"{lost} packets lost, {choice.source} decides{trip}")
+
+        def stepped(flight: Flight) -> None:
+            nonlocal lost
+            lost += flight.tally[-1].lost_packets
+            progress.update(task, advance=1, news=f"{lost} packets lost, {flight.decisions[-1].source} decides")
+
+        return fly(job.scenario, pilot, job.seed, log, decided, stepped)
+
+
+def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, console: Console) -> int:
+    from simulator.mission import baselines
+
+    flown_by = "aic_vds" if job.policy == "edge" else job.policy
+    others = baselines(job.scenario, job.seed, flight.steps_flown)
+    tallies = {flown_by: flight.tally, **{name: tally for name, tally in others.items() if name != flown_by}}
+    facts = flight.facts(
+        policy=job.policy,
+        edge=job.edge,
+        mission_id=job.mission_id,
+        mode=mode,
+        model=model,
+        deadline_ms=job.deadline_ms,
+        command=job.command,
+    )
+    summary = summarise(facts, flight.decisions, tallies)
+    (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    with console.status("Drawing the report"):
+        from simulator.report import write_report
+
+        write_report(job.out / REPORT, summary, job.scenario, flight.decisions, tallies, flight.sensor_xy)
+    show(summary, job.out, console)
+    return INTERRUPTED if flight.interrupted else 0
+
+
+def show(summary: Summary, out: Path, console: Console) -> None:
+    """Print the outcome beside EOF and WQCS, who decided, and where it is written."""
+    from simulator.report import policy_label
+
+    steps = f"{summary.steps_flown} of {summary.steps} steps" if summary.interrupted else f"{summary.steps} steps"
+    table = Table(title=f"Scenario {summary.scenario}, seed {summary.seed}, {steps}")
+    table.add_column("policy")
+    table.add_column("lost packets", justify="right")
+    table.add_column("loss events", justify="right")
+    for name, lost in summary.lost_packets.items():
+        table.add_row(policy_label(name), f"{lost:,}", f"{summary.loss_events[name]:,}")
+    console.print(table)
+    sources = ", ".join(f"{count} {name}" for name, count in summary.by_source.model_dump().items() if count)
+    console.print(f"{summary.decisions} decisions: {sources or 'none'}")
+    if summary.rtt_ms.p50 is not None:
+        console.print(f"Round trip: median {summary.rtt_ms.p50:.0f} ms, 99th percentile {summary.rtt_ms.p99:.0f} ms")
+    if summary.tokens.prompt_mean is not None:
+        console.print(
+            f"Prompt: {summary.tokens.prompt_mean:.0f} tokens a decision, "
+            f"{summary.tokens.uncompressed_mean:.0f} with every sensor; "
+            f"the state block {summary.tokens.state_mean:.0f} of {summary.tokens.state_uncompressed_mean:.0f} "
+            f"({summary.tokens.state_saved_pct:.0f} % saved)"
+        )
+    for name in (SUMMARY, DECISIONS, REPORT):
+        console.print(f"Wrote {out / name}", markup=False, highlight=False, soft_wrap=True)
+
+
+def reporting(prog: str, run: Callable[[Console], int]) -> int:
+    """Run a command with its errors as one line on stderr and an exit code; SIGTERM ends it as Ctrl-C does."""
+    try:
+        with sigterm_interrupts():
+            return run(Console())
+    except BadUse as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except EdgeError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"{prog}: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Within, SIGTERM raises KeyboardInterrupt, so that `docker stop` leaves a result as Ctrl-C does."""
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,176 @@
+"""An edge that answers at once, or misbehaves as told; a real server on a real port."""
+
+from __future__ import annotations
+
+import asyncio
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from shared.scenario import Scenario, scenario_named
+from shared.wire import (
+    Candidate,
+    DecideRequest,
+    DecideResponse,
+    FeedbackRequest,
+    FeedbackResponse,
+    MissionSpec,
+    MissionStatus,
+    Problem,
+    Readiness,
+    Tokens,
+)
+from tests.running import serving
+
+Behaviour = Literal["ok", "busy", "busy_retry_after", "garbage", "invalid", "crash", "html", "slow", "forgot", "wrong"]
+LLM = Literal["loading", "ready", "unavailable", "off"]
+
+
+@dataclass
+class EdgeStub:
+    """``script`` is how the next requests to /decide are met, one entry each; then ``otherwise``.
+
+    ``decides``, ``feedbacks`` and ``missions`` are what arrived and was understood.
+    """
+
+    url: str = ""
+    script: list[Behaviour] = field(default_factory=list)
+    otherwise: Behaviour = "ok"
+    readiness: list[tuple[bool, LLM]] = field(default_factory=lambda: [(True, "ready")])
+    model: str = "stub-1"
+    slow_s: float = 0.3
+    asked: int = 0
+    polled: int = 0
+    headers: list[dict[str, str]] = field(default_factory=list)
+    decides: list[DecideRequest] = field(default_factory=list)
+    feedbacks: list[FeedbackRequest] = field(default_factory=list)
+    missions: dict[str, MissionSpec] = field(default_factory=dict)
+
+    async def decide(self, request: Request) -> Response:
+        """POST /decide."""
+        self.asked += 1
+        self.headers.append(dict(request.headers))
+        behaviour = self.script.pop(0) if self.script else self.otherwise
+        asked = DecideRequest.model_validate_json(await request.body())
+        self.decides.append(asked)
+        if behaviour == "slow":
+            await asyncio.sleep(self.slow_s)
+        refusal = _misbehave(behaviour, asked)
+        return refusal or Response(self._answer(asked, behaviour).model_dump_json())
+
+    def _answer(self, asked: DecideRequest, behaviour: Behaviour) -> DecideResponse:
+        sensors = asked.sensors.id
+        sensor = 9_999 if behaviour == "wrong" else sensors[(asked.step + asked.uav_id) % len(sensors)]
+        tokens = Tokens(
+            tokenizer="stub",
+            static=200,
+            experiences=10 * asked.step,
+            state=40,
+            state_uncompressed=90,
+            prompt=240 + 10 * asked.step,
+            uncompressed=290 + 10 * asked.step,
+            saved=50,
+            cached=200,
+        )
+        return DecideResponse(
+            decision_id=uuid.uuid4().hex,
+            mission_id=asked.mission_id,
+            uav_id=asked.uav_id,
+            step=asked.step,
+            sensor_id=sensor,
+            velocity=7,
+            source="llm" if asked.step else "policy",
+            reason=None if asked.step else "llm_timeout",
+            model=self.model,
+            top_k=[Candidate(sensor_id=j, score=-float(j)) for j in sensors[:5]],
+            tokens=tokens,
+            deadline_ms=asked.deadline_ms or 3000,
+            latency_ms={"llm": 1.0, "total": 2.0},
+        )
+
+    async def feedback(self, request: Request) -> Response:
+        """POST /feedback."""
+        outcome = FeedbackRequest.model_validate_json(await request.body())
+        self.feedbacks.append(outcome)
+        return Response(FeedbackResponse(decision_id=outcome.decision_id, result="applied").model_dump_json())
+
+    async def put_mission(self, request: Request) -> Response:
+        """PUT /missions/{mission_id}."""
+        mission_id = request.path_params["mission_id"]
+        spec = MissionSpec.model_validate_json(await request.body())
+        self.missions[mission_id] = spec
+        world = spec.scenario if isinstance(spec.scenario, Scenario) else scenario_named(spec.scenario)
+        counts: dict[str, Any] = dict.fromkeys(("decisions", "feedback", "experiences", "learner_updates"), 0)
+        status = MissionStatus(
+            mission_id=mission_id,
+            scenario=world,
+            mode="llm",
+            top_k=5,
+            seed=spec.seed,
+            learner_loss=None,
+            visits={},
+            **counts,
+        )
+        return Response(status.model_dump_json())
+
+    async def readyz(self, request: Request) -> Response:
+        """GET /readyz."""
+        self.polled += 1
+        ready, llm = self.readiness.pop(0) if len(self.readiness) > 1 else self.readiness[0]
+        decides: Literal["llm", "policy"] = "llm" if llm == "ready" else "policy"
+        return Response(Readiness(ready=ready, decides=decides, llm=llm, model=self.model).model_dump_json())
+
+    def app(self) -> Starlette:
+        """The ASGI application."""
+        return Starlette(
+            routes=[
+                Route("/decide", self.decide, methods=["POST"]),
+                Route("/feedback", self.feedback, methods=["POST"]),
+                Route("/missions/{mission_id}", self.put_mission, methods=["PUT"]),
+                Route("/readyz", self.readyz, methods=["GET"]),
+            ]
+        )
+
+
+def _misbehave(behaviour: Behaviour, asked: DecideRequest) -> Response | None:
+    match behaviour:
+        case "busy":
+            return _problem(503, "overloaded")
+        case "busy_retry_after":
+            return _problem(503, "overloaded", {"Retry-After": "0.2"})
+        case "garbage":
+            return Response("42 7, roughly")
+        case "invalid":
+            errors = [{"field": "sensors.queue[0]", "problem": "Input should be less than 100000"}]
+            return _problem(422, "sensors.queue[0]: too many", errors=errors)
+        case "crash":
+            return _problem(500, "the edge failed; its log says more")
+        case "html":
+            return Response("<h1>Bad gateway</h1>\nnginx", status_code=404)
+        case "forgot" if asked.outcome is not None:
+            errors = [{"field": "outcome.decision_id", "problem": "unknown"}]
+            return _problem(404, "outcome.decision_id: unknown", errors=errors)
+    return None
+
+
+def _problem(
+    status: int, detail: str, headers: dict[str, str] | None = None, errors: list[dict[str, str]] | None = None
+) -> Response:
+    body = Problem(title="no", status=status, detail=detail, errors=errors or [])
+    return Response(body.model_dump_json(), status, headers, media_type="application/problem+json")
+
+
+@contextmanager
+def stub_edge() -> Iterator[EdgeStub]:
+    """A stub on a port of its own."""
+    stub = EdgeStub()
+    with serving(stub.app()) as url:
+        stub.url = url
+        yield stub

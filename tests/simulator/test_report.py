@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.scenario import SCENARIOS, Scenario
+from simulator.mission import Flight, LocalPilot, baselines, fly
+from simulator.record import Decision, DecisionLog, Summary, jain_index, read_decisions, summarise, visits_per_sensor
+from simulator.report import number, render_report, write_report
+
+SHORT = Scenario(steps=5)
+EVIL = '<script>alert("$x$")</script>&amp;'
+SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "provenance")
+
+
+def decision(**changes: object) -> Decision:
+    base = {"step": 0, "uav_id": 0, "position": (1.0, 2.0), "sensor_id": 0, "velocity": 3, "source": "onboard"}
+    return Decision.model_validate({**base, **changes})
+
+
+def page(flight: Flight, model: str | None = "stub-1", decisions: list[Decision] | None = None) -> str:
+    seen = flight.decisions if decisions is None else decisions
+    tallies = {"aic_vds": flight.tally, **baselines(flight.scenario, 0, flight.steps_flown)}
+    return render_report(summary_of(flight, model), flight.scenario, seen, tallies, flight.sensor_xy)
+
+
+def summary_of(flight: Flight, model: str | None) -> Summary:
+    facts = flight.facts(
+        policy="edge", edge="http://edge:8000", mission_id="paper-0-1", mode="llm", model=model,
+        deadline_ms=None, command="aicvds simulate",
+    )  # fmt: skip
+    return summarise(facts, flight.decisions, {"aic_vds": flight.tally})
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """A flight of which every second decision pretends to have come from an edge."""
+    flown = fly(SHORT, LocalPilot("eof", SHORT, 0), seed=0)
+    flown.decisions = [
+        d.model_copy(update={"rtt_ms": 10.0 + n, "source": "llm", "attempts": 1, "request_bytes": 900}) if n % 2 else d
+        for n, d in enumerate(flown.decisions)
+    ]
+    return flown
+
+
+class Page(HTMLParser):
+    """Collects ids and the addresses that a browser would follow or load."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.loaded: list[str] = []
+        self.tags: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in ("src", "href", "xlink:href", "data", "action", "poster", "srcset"):
+                self.loaded.append(value or "")
+
+
+def test_every_section_is_there(flight: Flight) -> None:
+    html = page(flight)
+    for section in SECTIONS:
+        assert f'<section id="{section}">' in html
+    assert Page(html).tags.count("svg") == 6
+    for words in ("AIC-VDS", "EOF", "WQCS", "Jain", "aicvds simulate", "stub-1", "seed 0"):
+        assert words in html
+
+
+def test_the_page_needs_nothing_but_itself(flight: Flight) -> None:
+    html = page(flight)
+    parsed = Page(html)
+    assert all(address.startswith(("#", "data:image/png;base64,")) for address in parsed.loaded)
+    assert not {"script", "link", "img", "iframe"} & set(parsed.tags)
+    assert "@import" not in html and "@font-face" not in html
+    without_names = re.sub(r'xmlns(:\w+)?="[^"]*"', "", html).replace("http://edge:8000", "")
+    assert not re.search(r"https?://", without_names)
+    assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", html))
+
+
+def test_the_figures_ids_do_not_collide_and_all_resolve(flight: Flight) -> None:
+    html = page(flight)
+    parsed = Page(html)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    targets = [a[1:] for a in parsed.loaded if a.startswith("#")] + re.findall(r"url\(#([^)]*)\)", html)
+    targets += re.findall(r'aria-labelledby="([^"]*)"', html)
+    assert set(targets) <= set(parsed.ids)
+
+
+def test_the_page_is_the_same_each_time(flight: Flight) -> None:
+    assert page(flight) == page(flight)
+
+
+def test_what_came_from_the_edge_is_escaped(flight: Flight) -> None:
+    evil = [d.model_copy(update={"reason": EVIL}) for d in flight.decisions]
+    html = page(flight, model=EVIL, decisions=evil)
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;") >= 2
+
+
+def test_a_flight_of_no_step_has_a_page() -> None:
+    nothing = Flight(SHORT, 0, interrupted=True)
+    html = page(nothing)
+    assert "interrupted after step 0 of 5" in html
+
+
+def test_a_large_fleet_fits(tmp_path: Path) -> None:
+    world = SCENARIOS["dense"].model_copy(update={"steps": 3})
+    flown = fly(world, LocalPilot("random", world, 0), seed=0)
+    write_report(
+        tmp_path / "r.html", summary_of(flown, None), world, flown.decisions, {"a": flown.tally}, np.zeros((100, 2))
+    )
+    assert "The first 9 of 10 UAVs are shown" in (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    whole = [decision(step=0), decision(step=1)]
+    with DecisionLog(path) as log:
+        for one in whole:
+            log.append(one)
+    full = path.read_bytes()
+    for torn in (full + b'{"step": 2, "uav', full + b'{"step": 2, "reason": "\xc3', full + b"\n"):
+        path.write_bytes(torn)
+        assert read_decisions(path) == whole
+
+
+def test_a_broken_line_elsewhere_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "decisions.jsonl"
+    path.write_text("{}\n" + decision().model_dump_json() + "\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="line 1"):
+        read_decisions(path)
+
+
+def test_each_line_is_on_disk_at_once(tmp_path: Path) -> None:
+    with DecisionLog(tmp_path / "d.jsonl") as log:
+        log.append(decision())
+        assert len(read_decisions(tmp_path / "d.jsonl")) == 1
+
+
+def test_an_interrupt_in_the_middle_of_a_step_leaves_whole_steps(tmp_path: Path) -> None:
+    with DecisionLog(tmp_path / "d.jsonl") as log:
+        for step in range(3):
+            log.append(decision(step=step))
+        log.keep([decision(step=0)])
+        log.append(decision(step=1))
+    assert [d.step for d in read_decisions(tmp_path / "d.jsonl")] == [0, 1]
+
+
+def test_jains_index() -> None:
+    assert jain_index([3, 3, 3]) == pytest.approx(1)
+    assert jain_index([5, 0, 0, 0]) == pytest.approx(1 / 4)
+    assert jain_index([0, 0]) is None
+    assert visits_per_sensor([decision(), decision(failed=True), decision(sensor_id=2)], 3) == [1, 0, 1]
+
+
+def test_numbers_for_people() -> None:
+    assert [number(None), number(1234.56), number(0.5, 3)] == ["–", "1,234.6", "0.500"]
