@@ -1,4 +1,4 @@
-# make install | demo | test | check | bench | compose | clean
+# make install | demo | test | check | compose | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
@@ -7,7 +7,7 @@ TORCH_INDEX ?=
 TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
-.PHONY: install demo test check bench compose clean
+.PHONY: help install demo test check compose clean
 .DEFAULT_GOAL := help
 
 help:

@@ -30,12 +30,14 @@ from shared.wire import (
     FeedbackResponse,
     Outcome,
     Reason,
+    Source,
     Tokens,
     UavState,
 )
 
 log = logging.getLogger(__name__)
 
+_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value"}
 # Kept back from the LLM's time for checking, answering and the way through the event loop.
 _RESERVE_S = 0.02
 
@@ -137,7 +139,7 @@ class Engine:
             step=step,
             sensor_id=choice.sensor_id,
             velocity=choice.velocity,
-            source="policy" if choice.reason else "llm",
+            source=_SOURCES.get(choice.reason, "policy"),
             reason=choice.reason,
             model=None if choice.reason else self._upstream.model,
             top_k=view.candidates,
@@ -164,7 +166,7 @@ class Engine:
             if sensor in mission.reserved(view.step, view.uav_id):
                 raise NoDecision("answer_reserved", f"sensor {sensor} was given away meanwhile")
         except NoDecision as error:
-            log.info("mission %s: %s: %s", mission.mission_id, error.reason, error)
+            log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reserved = mission.reserved(view.step, view.uav_id)
             sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
             reason = error.reason

@@ -38,10 +38,14 @@ class Modules(nn.Module):
             self.attention = Attention(features)
             self.velocity = VelocityScorer(levels)
 
+    def evaluate(self, sample: Sample) -> tuple[Tensor, Tensor]:
+        """Scores ``(n,)`` of the sensors, and values ``(levels,)`` of the velocities for the sensor decided."""
+        scores, z = self.attention(torch.from_numpy(sample.features))
+        return scores, self.velocity(z[sample.chosen], torch.tensor(sample.distance, dtype=z.dtype))
+
     def loss(self, sample: Sample, reward: float) -> Tensor:
         """``(s_j - r)^2 + (u_v - r)^2`` for the sensor j and velocity v decided, r = -c."""
-        scores, z = self.attention(torch.from_numpy(sample.features))
-        values = self.velocity(z[sample.chosen], torch.tensor(sample.distance, dtype=z.dtype))
+        scores, values = self.evaluate(sample)
         loss: Tensor = (scores[sample.chosen] - reward) ** 2 + (values[sample.velocity] - reward) ** 2
         return loss
 
@@ -65,8 +69,8 @@ class Learner:
     copy, replaced whole after each update, so a decision never sees half a step and never waits for one.
     """
 
-    def __init__(self, features: int, levels: int, *, learning_rate: float, seed: int) -> None:
-        self._training = Modules(features, levels, seed)
+    def __init__(self, modules: Modules, *, learning_rate: float) -> None:
+        self._training = modules
         self._adam = torch.optim.Adam(self._training.parameters(), lr=learning_rate)
         self.current = copy.deepcopy(self._training).requires_grad_(False)
         self.updates = 0
@@ -86,6 +90,6 @@ class Learner:
 
 def rehearse() -> None:
     """Update once on nothing: at its first update torch imports a second's worth of modules."""
-    learner = Learner(1, 1, learning_rate=1e-3, seed=0)
+    learner = Learner(Modules(1, 1, seed=0), learning_rate=1e-3)
     learner.update(Sample(np.zeros((2, 1), np.float32), 0, 0.0, 0), 0.0)
     learner.current.score(np.zeros((2, 1), np.float32))

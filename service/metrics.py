@@ -29,7 +29,7 @@ class Metrics:
         )
         self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
         self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
-        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens that attention pruned away", registry=r)
+        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)

@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from service.features import FEATURES, filled
+from service.checkpoint import initial_modules
+from service.features import filled
 from service.learner import Learner, Sample
 from service.problems import NotFound, Refused
 from service.prompt import experience_text
@@ -60,7 +61,7 @@ class Mission:
         self.decisions = 0
         self.feedback = 0
         levels = self.scenario.max_velocity + 1
-        self.learner = Learner(FEATURES, levels, learning_rate=settings.learning_rate, seed=spec.seed)
+        self.learner = Learner(initial_modules(spec.init, levels, spec.seed), learning_rate=settings.learning_rate)
         sensors = self.scenario.sensors
         self.visits = np.full(sensors, _NEVER, dtype=np.int64)
         self._before_visit: dict[int, int] = {}
@@ -166,6 +167,7 @@ class Mission:
             scenario=self.scenario,
             mode=self.mode,
             top_k=self.top_k,
+            init=self.spec.init,
             seed=self.spec.seed,
             decisions=self.decisions,
             feedback=self.feedback,

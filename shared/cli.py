@@ -9,6 +9,8 @@ _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
     "simulate": "fly one mission against an edge, local or remote, and write its report",
     "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
+    "explore": "record exploring UAVs on training worlds, for pretrain",
+    "pretrain": "train the attention and velocity modules' start on what explore recorded",
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 

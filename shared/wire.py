@@ -24,7 +24,8 @@ Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
 
 Mode = Literal["llm", "value"]
-Source = Literal["llm", "policy"]
+Init = Literal["pretrained", "random"]
+Source = Literal["llm", "value", "policy"]
 Reason = Literal[
     "mode_value",
     "no_candidate",
@@ -218,7 +219,8 @@ class MissionSpec(Wire):
     scenario: str | Scenario = Field("paper", description="a preset's name or a whole scenario")
     mode: Mode | None = Field(None, description="default: the service's")
     top_k: int | None = Field(None, ge=1, le=100, description="default: the service's")
-    seed: int = Field(0, ge=0, lt=2**32, description="of the attention and velocity modules' initial weights")
+    init: Init = Field("pretrained", description="the modules' start; `random` is the paper's")
+    seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights")
 
 
 class MissionStatus(Wire):
@@ -228,6 +230,7 @@ class MissionStatus(Wire):
     scenario: Scenario
     mode: Mode
     top_k: int
+    init: Init
     seed: int
     decisions: int
     feedback: int

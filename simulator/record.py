@@ -16,7 +16,7 @@ from shared.wire import Candidate, Tokens
 
 LATE_SLACK_MS = 50.0
 
-DecidedBy = Literal["llm", "guided", "policy", "onboard"]
+DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
 
 
 class Record(BaseModel):
@@ -61,6 +61,7 @@ class BySource(Record):
 
     llm: int = 0
     guided: int = 0
+    value: int = 0
     policy: int = 0
     onboard: int = 0
 

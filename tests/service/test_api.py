@@ -38,7 +38,7 @@ def test_decides_and_says_how(edge: Edge, report: Report) -> None:
     response = edge().post("/decide", json=report())
     assert response.status_code == 200, response.text
     answer = response.json()
-    assert (answer["source"], answer["reason"]) == ("policy", "mode_value")
+    assert (answer["source"], answer["reason"]) == ("value", "mode_value")
     assert answer["sensor_id"] in [0, 1, 2, 3]
     assert 0 <= answer["velocity"] <= 14
     assert answer["sensor_id"] == answer["top_k"][0]["sensor_id"]
@@ -229,7 +229,7 @@ def test_metrics_tell_what_happened_and_name_no_one(edge: Edge, report: Report) 
     decision = client.post("/decide", json=report(mission_id="secret")).json()["decision_id"]
     client.post("/feedback", json={"mission_id": "secret", "decision_id": decision, "cost": 0.5})
     text = client.get("/metrics").text
-    assert 'aicvds_decisions_total{reason="mode_value",source="policy"} 1.0' in text
+    assert 'aicvds_decisions_total{reason="mode_value",source="value"} 1.0' in text
     assert 'aicvds_feedback_total{result="applied"} 1.0' in text
     assert 'aicvds_decision_seconds_count{stage="total"} 1.0' in text
     assert "aicvds_overhead_seconds_count 1.0" in text

@@ -27,7 +27,7 @@ def test_gradient_equals_a_finite_difference() -> None:
 
 
 def test_both_modules_learn_jointly_and_the_loss_falls() -> None:
-    learner = Learner(5, 15, learning_rate=5e-3, seed=0)
+    learner = Learner(Modules(5, 15, seed=0), learning_rate=5e-3)
     before = {name: p.clone() for name, p in learner.current.named_parameters()}
     losses = [learner.update(sample(), cost=1.0) for _ in range(200)]
     assert losses[-1] < 0.05 * losses[0]
@@ -37,7 +37,7 @@ def test_both_modules_learn_jointly_and_the_loss_falls() -> None:
 
 
 def test_a_decision_holds_a_finished_copy_while_learning_goes_on() -> None:
-    learner = Learner(5, 15, learning_rate=5e-3, seed=0)
+    learner = Learner(Modules(5, 15, seed=0), learning_rate=5e-3)
     held = learner.current
     scores, _ = held.score(sample().features)
     learner.update(sample(), cost=1.0)

@@ -1,0 +1,66 @@
+"""Logged decisions that both sides read: the simulator records them, the edge's modules are pretrained on them."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from pydantic import Field, ValidationError
+
+from shared.scenario import Scenario
+from shared.wire import DecideRequest, SensorId, Wire
+
+
+class Header(Wire):
+    """First line of a rollouts file: the world of every mission in it."""
+
+    scenario: Scenario
+    missions: int
+    behaviour: str
+
+
+class RolloutStep(Wire):
+    """One UAV's decision: what was reported, what was done, and what came of it.
+
+    ``cost`` is the UAV's own c, ``fleet_lost`` the packets lost in that step at all sensors.
+    """
+
+    request: DecideRequest
+    sensor_id: SensorId
+    velocity: int = Field(ge=0, le=14)
+    cost: float = Field(ge=0)
+    failed: bool
+    fleet_lost: int = Field(ge=0)
+
+
+def write_rollouts(path: Path, header: Header, steps: Iterable[RolloutStep]) -> None:
+    """Write gzipped JSON lines, the header first."""
+    with gzip.open(path, "wt", encoding="utf-8", compresslevel=3) as file:
+        file.write(header.model_dump_json() + "\n")
+        file.writelines(step.model_dump_json() + "\n" for step in steps)
+
+
+def read_rollouts(path: Path) -> tuple[Header, Iterator[RolloutStep]]:
+    """The header, and the steps one by one.
+
+    Raises:
+        OSError: the file cannot be read or is no gzip.
+        ValueError: a line is not what it should be; the text names it.
+    """
+
+    def parsed() -> Iterator[Header | RolloutStep]:
+        with gzip.open(path, "rt", encoding="utf-8") as file:
+            for number, line in enumerate(file, start=1):
+                model = Header if number == 1 else RolloutStep
+                try:
+                    yield model.model_validate_json(line)
+                except ValidationError as error:
+                    fault = error.errors(include_url=False)[0]["msg"]
+                    raise ValueError(f"{path}, line {number}: {fault}") from None
+
+    lines = parsed()
+    header = next(lines, None)
+    if not isinstance(header, Header):
+        raise ValueError(f"{path} is empty")
+    return header, (line for line in lines if isinstance(line, RolloutStep))
