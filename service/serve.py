@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import sys
 from dataclasses import dataclass
 from typing import Annotated
@@ -36,18 +37,36 @@ def main(argv: list[str]) -> int:
     """Serve until SIGTERM or Ctrl-C; returns the exit code."""
     args = tyro.cli(Serve, prog="aicvds serve", args=argv)
     if not 0 <= args.port <= 65535:
-        print(f"aicvds serve: --port {args.port} is not between 0 and 65535", file=sys.stderr)
-        return 2
+        return _refused(f"--port {args.port} is not between 0 and 65535")
+    try:
+        family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
+        listener = socket.create_server((args.host, args.port), family=family)
+    except OSError as error:
+        return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}")
+    host = f"[{args.host}]" if ":" in args.host else args.host
+    try:
+        # The system queues requests from here on; they are answered once torch is loaded.
+        print(
+            f"aicvds serve: running on http://{host}:{listener.getsockname()[1]}, loading", file=sys.stderr, flush=True
+        )
+        with listener:
+            return _serve(listener)
+    except KeyboardInterrupt:
+        return 130
 
-    from service.settings import Settings
+
+def _serve(listener: socket.socket) -> int:
+    from service.settings import Settings, unknown_variables
 
     try:
         settings = Settings()
     except ValidationError as error:
         for fault in error.errors():
             name = "AICVDS_" + "_".join(str(part) for part in fault["loc"]).upper()
-            print(f"aicvds serve: {name}: {fault['msg']}", file=sys.stderr)
+            _refused(f"{name}: {fault['msg']}")
         return 2
+    for name in unknown_variables():
+        print(f"aicvds serve: {name} is no setting and changes nothing", file=sys.stderr)
 
     import logging
 
@@ -58,13 +77,17 @@ def main(argv: list[str]) -> int:
     logging.basicConfig(level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # httpx logs every request at level info, address included.
     logging.getLogger("httpx").setLevel(logging.WARNING)
-    uvicorn.run(
+    config = uvicorn.Config(
         create_app(settings),
-        host=args.host,
-        port=args.port,
         log_level=settings.log_level,
         timeout_graceful_shutdown=_SHUTDOWN_S,
         limit_concurrency=_CONCURRENCY,
         access_log=settings.log_level == "debug",
     )
+    uvicorn.Server(config).run(sockets=[listener])
     return 0
+
+
+def _refused(fault: str) -> int:
+    print(f"aicvds serve: {fault}", file=sys.stderr)
+    return 2

@@ -30,6 +30,12 @@ def usable_cores(cpu_max: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
         return cores
 
 
+# Read by `aicvds simulate` and docker-compose.yml, often from the same .env file.
+_SIMULATORS = {
+    f"AICVDS_{name}" for name in ("API_KEY", "BIND", "BUILD_NETWORK", "PORT", "RUNS", "SCENARIO", "SEED", "USER")
+}
+
+
 class Settings(BaseSettings):
     """Settings of one edge service.
 
@@ -91,3 +97,9 @@ class Settings(BaseSettings):
     def embedded_threads(self) -> int:
         """Threads for the embedded llama.cpp: the setting, or cores - 1, at least 1."""
         return self.llm_threads or max(1, usable_cores() - 1)
+
+
+def unknown_variables() -> list[str]:
+    """Variables of the environment that look like settings and are none: typing errors, mostly."""
+    known = {f"AICVDS_{name.upper()}" for name in Settings.model_fields} | _SIMULATORS
+    return sorted(name for name in os.environ if name.startswith("AICVDS_") and name not in known)

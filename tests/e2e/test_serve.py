@@ -6,7 +6,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.e2e.processes import run, serving_edge
+from tests.e2e.processes import output_until, run, serving_edge, started
 
 
 def test_help_names_every_command() -> None:
@@ -40,12 +40,36 @@ def test_bad_use_is_one_clear_line_and_exit_2(args: list[str], env: dict[str, st
     assert "Traceback" not in ended.stderr
 
 
+def test_a_busy_port_is_one_clear_line() -> None:
+    with serving_edge() as (url, _):
+        second = run("serve", "--port", url.rsplit(":", 1)[1])
+    assert second.returncode == 2
+    assert "cannot listen on 127.0.0.1" in second.stderr
+    assert "Traceback" not in second.stderr
+
+
+def test_a_misspelt_setting_is_told() -> None:
+    told = run("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
+    assert "AICVDS_TOP_K" in told.stderr
+    with started("serve", "--port", "0", AICVDS_TOPK="3") as process:
+        output_until(process, "AICVDS_TOPK is no setting")
+
+
+def test_ctrl_c_while_loading_is_quiet() -> None:
+    with started("serve", "--port", "0") as process:
+        output_until(process, "loading")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=15)
+    assert process.returncode in (0, 130, -signal.SIGINT)
+    assert "Traceback" not in output
+
+
 @pytest.mark.parametrize("ask", [signal.SIGTERM, signal.SIGINT])
 def test_the_edge_stops_when_asked(ask: signal.Signals) -> None:
     with serving_edge() as (url, process):
         assert httpx.get(f"{url}/healthz").status_code == 200
         process.send_signal(ask)
-        assert process.wait(timeout=15) in (0, -ask)
+        assert process.wait(timeout=15) in (0, 130, -ask)
 
 
 def test_empty_variables_are_unset_ones(tmp_path: Path) -> None:

@@ -113,6 +113,7 @@ class EdgeStub:
             scenario=world,
             mode="llm",
             top_k=5,
+            init=spec.init,
             seed=spec.seed,
             learner_loss=None,
             visits={},
