@@ -36,7 +36,7 @@ def create_app(settings: Settings) -> FastAPI:
     """One edge service; its LLM begins to load when the application starts."""
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[State]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[State]:
         # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
         torch.set_num_threads(1)
         upstream = Upstream(settings)
@@ -44,6 +44,7 @@ def create_app(settings: Settings) -> FastAPI:
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         await asyncio.to_thread(rehearse)
         engine = Engine(settings, upstream, counter, metrics)
+        app.state.engine = engine
         upstream.start()
         try:
             yield {"engine": engine, "upstream": upstream, "metrics": metrics}

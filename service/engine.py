@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
@@ -40,6 +41,10 @@ log = logging.getLogger(__name__)
 _SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value"}
 # Kept back from the LLM's time for checking, answering and the way through the event loop.
 _RESERVE_S = 0.02
+# After SIGTERM, so that every UAV is answered before the process is killed.
+_HURRY_S = 4.0
+# Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
+_MAX_LESSONS = 256
 
 
 @dataclass(slots=True)
@@ -80,16 +85,28 @@ class Engine:
         self._counter = counter
         self._metrics = metrics
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        self._lessons = 0
+        self._waiting: set[asyncio.Timeout] = set()
+        self._closing = False
         self.missions = Missions(settings, metrics)
 
+    def hurry(self) -> None:
+        """Closing time: the policy answers whoever still waits for the LLM in a few seconds."""
+        self._closing = True
+        ends = asyncio.get_running_loop().time() + _HURRY_S
+        for limit in self._waiting:
+            limit.reschedule(min(limit.when() or ends, ends))
+
     def close(self) -> None:
-        """Finish the learning that is queued."""
-        self._learning.shutdown(wait=True)
+        """Finish the lesson in hand and drop those that are queued."""
+        self._learning.shutdown(wait=True, cancel_futures=True)
 
     async def decide(self, request: DecideRequest) -> DecideResponse:
         """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input."""
         watch = Stopwatch()
         mission = self.missions.checked(request.mission_id, [request])
+        if request.outcome is not None:
+            self._apply(mission, request.outcome)
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
         return await self._decide(mission, request, request.step, deadline_ms, watch)
 
@@ -99,10 +116,14 @@ class Engine:
         total_ms = request.deadline_ms or self._settings.deadline_ms
         answers: list[DecideResponse] = []
         mission = self.missions.checked(request.mission_id, request.uavs)
+        # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
+        for outcome in (uav.outcome for uav in request.uavs if uav.outcome is not None):
+            self._apply(mission, outcome)
         for turn, uav in enumerate(request.uavs):
             left_ms = total_ms - (time.perf_counter() - watch.started) * 1e3
             share_ms = max(1, int(left_ms / (len(request.uavs) - turn)))
             answers.append(await self._decide(mission, uav, request.step, share_ms, Stopwatch()))
+            await asyncio.sleep(0)
         return answers
 
     def feedback(self, request: FeedbackRequest) -> FeedbackResponse:
@@ -117,8 +138,7 @@ class Engine:
     async def _decide(
         self, mission: Mission, uav: UavState, step: int, deadline_ms: int, watch: Stopwatch
     ) -> DecideResponse:
-        if uav.outcome is not None:
-            self._apply(mission, uav.outcome)
+        attempt = mission.attempt(step, uav.uav_id)
         mission.observe(uav)
         view = View.of(mission, uav, step)
         watch.lap("augment")
@@ -130,7 +150,7 @@ class Engine:
         deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
         choice = await self._choose(mission, view, prompt, deadline, watch)
         decision_id = uuid.uuid4().hex
-        mission.commit(view.pending(mission, decision_id, choice.sensor_id, choice.velocity))
+        pending = view.pending(mission, decision_id, choice.sensor_id, choice.velocity)
         watch.lap("check")
         answer = DecideResponse(
             decision_id=decision_id,
@@ -147,6 +167,7 @@ class Engine:
             deadline_ms=deadline_ms,
             latency_ms=watch.total(),
         )
+        mission.commit(pending, attempt)
         self._metrics.record_decision(answer)
         return answer
 
@@ -169,27 +190,37 @@ class Engine:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reserved = mission.reserved(view.step, view.uav_id)
             sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
+            if sensor in reserved:
+                # Every sensor reported is taken: one that was not reported is worth a try, a taken one is not.
+                sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
             reason = error.reason
         if mission.mode == "llm" and reason != "no_candidate":
             self._metrics.llm_requests.labels(reason or "ok").inc()
         return Choice(sensor, velocity, reason, completion)
 
     async def _ask(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Completion:
+        limit = asyncio.timeout(min(deadline - time.perf_counter(), _HURRY_S if self._closing else math.inf))
         try:
-            async with asyncio.timeout(deadline - time.perf_counter()):
+            async with limit:
+                self._waiting.add(limit)
                 return await self._upstream.ask(
                     prompt.static, prompt.user, view.offered, mission.scenario.max_velocity + 1
                 )
         except TimeoutError:
             raise NoDecision("llm_timeout", "no answer within the deadline") from None
         finally:
+            self._waiting.discard(limit)
             watch.lap("llm")
 
     def _apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         result: Literal["applied", "duplicate"] = "duplicate"
         if mission.find(outcome.decision_id) == "pending":
             result = "applied"
-            if (sample := mission.apply(outcome)) is not None:
+            sample = mission.apply(outcome)
+            if sample is not None and self._lessons >= _MAX_LESSONS:
+                log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
+            elif sample is not None:
+                self._lessons += 1
                 self._learning.submit(self._learn, mission, sample, outcome.cost)
         self._metrics.feedback.labels(result).inc()
         return result
@@ -199,6 +230,8 @@ class Engine:
             self._metrics.learner_loss.set(mission.learner.update(sample, cost))
         except Exception:
             log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
+        finally:
+            self._lessons -= 1
 
     def _count(self, prompt: Prompt) -> Tokens:
         static = self._counter.count_repeated(prompt.static)

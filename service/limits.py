@@ -42,6 +42,8 @@ class BodyLimit:
             return
         try:
             body = await self._read(receive, headers.get(b"content-length", b""))
+            if body is None:
+                return
             body = _DECODERS[encoding](body, self.limit)
         except _TooLarge:
             fault = {"field": "body", "problem": f"larger than {self.limit} bytes"}
@@ -57,14 +59,15 @@ class BodyLimit:
         scope["headers"].append((b"content-length", str(len(body)).encode()))
         await self.app(scope, _replay(body, receive), send)
 
-    async def _read(self, receive: Receive, content_length: bytes) -> bytes:
+    async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
+        """The body; None where the client hung up before its end."""
         if content_length.isdigit() and int(content_length) > self.limit:
             raise _TooLarge
         body = bytearray()
         while True:
             message = await receive()
             if message["type"] == "http.disconnect":
-                return bytes(body)
+                return None
             body += message.get("body", b"")
             if len(body) > self.limit:
                 raise _TooLarge
@@ -91,6 +94,8 @@ def _gunzip(body: bytes, limit: int) -> bytes:
         raise _TooLarge
     if not decoder.eof:
         raise _Damaged("gzip ends too early")
+    if decoder.unused_data:
+        raise _Damaged("something follows the gzip member")
     return plain
 
 
@@ -107,6 +112,8 @@ def _unzstd(body: bytes, limit: int) -> bytes:
         raise _Damaged("not valid zstd") from None
     if not decoder.eof:
         raise _Damaged("zstd ends too early")
+    if decoder.unused_data:
+        raise _Damaged("something follows the zstd frame")
     return plain
 
 

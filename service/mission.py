@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from service.checkpoint import initial_modules
 from service.features import filled
 from service.learner import Learner, Sample
-from service.problems import NotFound, Refused
+from service.problems import Conflict, NotFound, Refused
 from service.prompt import experience_text
 from service.settings import Settings
 from shared.channel import FloatArray
@@ -21,7 +21,8 @@ from shared.wire import MissionSpec, MissionStatus, Mode, Outcome, UavState
 # An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
 _PENDING_PER_UAV = 8
 _APPLIED_PER_UAV = 64
-_RESERVED_STEPS = 4
+# UAVs of one fleet may be this many steps apart.
+_RESERVED_STEPS = 64
 # Weight, in steps, of the scenario's mean arrival rate against what is observed.
 _PRIOR_STEPS = 2.0
 _NEVER = -1
@@ -38,6 +39,15 @@ class Pending:
     velocity: int
     row: str
     sample: Sample | None
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """The sensor that a UAV was given at a step, and by which of its attempts."""
+
+    sensor_id: int
+    decision_id: str
+    attempt: int
 
 
 class Mission:
@@ -64,13 +74,15 @@ class Mission:
         self.learner = Learner(initial_modules(spec.init, levels, spec.seed), learning_rate=settings.learning_rate)
         sensors = self.scenario.sensors
         self.visits = np.full(sensors, _NEVER, dtype=np.int64)
-        self._before_visit: dict[int, int] = {}
+        self._confirmed = np.full(sensors, _NEVER, dtype=np.int64)
+        self._open_visits: dict[int, dict[str, int]] = {}
         self._seen = np.full(sensors, _NEVER, dtype=np.int64)
         self._queue = np.zeros(sensors)
         self._arrivals = np.full(sensors, self.scenario.mean_arrival_rate * _PRIOR_STEPS)
         self._exposure = np.full(sensors, _PRIOR_STEPS)
-        self._reserved: OrderedDict[int, dict[int, int]] = OrderedDict()
-        self._pending: OrderedDict[str, Pending] = OrderedDict()
+        self._given: dict[int, dict[int, Given]] = {}
+        self._attempts: dict[int, dict[int, int]] = {}
+        self._pending: dict[str, Pending] = {}
         self._applied: OrderedDict[str, None] = OrderedDict()
         self._experience_limit = settings.experiences
 
@@ -123,34 +135,69 @@ class Mission:
 
     def reserved(self, step: int, uav_id: int) -> frozenset[int]:
         """Sensors that other UAVs were given this step."""
-        return frozenset(s for uav, s in self._reserved.get(step, {}).items() if uav != uav_id)
+        return frozenset(given.sensor_id for uav, given in self._given.get(step, {}).items() if uav != uav_id)
 
-    def commit(self, decision: Pending) -> None:
-        """Reserve the sensor, note the visit, and wait for the outcome."""
-        self._reserved.setdefault(decision.step, {})[decision.uav_id] = decision.sensor_id
-        while len(self._reserved) > _RESERVED_STEPS:
-            self._reserved.popitem(last=False)
-        self._before_visit[decision.sensor_id] = int(self.visits[decision.sensor_id])
-        self.visits[decision.sensor_id] = max(decision.step, self.visits[decision.sensor_id])
+    def attempt(self, step: int, uav_id: int) -> int:
+        """Number a request of a UAV at a step: when it asks again, the later answer counts."""
+        attempts = self._attempts.setdefault(step, {})
+        attempts[uav_id] = attempts.get(uav_id, 0) + 1
+        _forget_lowest(self._attempts)
+        return attempts[uav_id]
+
+    def commit(self, decision: Pending, attempt: int = 1) -> None:
+        """Reserve the sensor, note the visit, and wait for the outcome.
+
+        An earlier decision for the same UAV and step is withdrawn: its sensor is free again and was not visited.
+
+        Raises:
+            Conflict: a later attempt of this UAV at this step was answered already; nothing is recorded.
+        """
+        given = self._given.setdefault(decision.step, {})
+        earlier = given.get(decision.uav_id)
+        if earlier is not None and earlier.attempt > attempt:
+            raise Conflict("step", f"UAV {decision.uav_id} asked again for step {decision.step} and was answered")
+        if earlier is not None:
+            self._close_visit(earlier.sensor_id, earlier.decision_id)
+        given[decision.uav_id] = Given(decision.sensor_id, decision.decision_id, attempt)
+        _forget_lowest(self._given)
+        self._open_visits.setdefault(decision.sensor_id, {})[decision.decision_id] = decision.step
+        self._update_visit(decision.sensor_id)
         self._pending[decision.decision_id] = decision
-        while len(self._pending) > _PENDING_PER_UAV * self.scenario.uavs:
-            self._pending.popitem(last=False)
+        own = [d for d in self._pending.values() if d.uav_id == decision.uav_id]
+        for forgotten in own[:-_PENDING_PER_UAV]:
+            del self._pending[forgotten.decision_id]
+            self._confirm_visit(forgotten)
         self.decisions += 1
 
     def apply(self, outcome: Outcome) -> Sample | None:
         """Record the outcome of a pending decision; returns what the modules saw, to learn from.
 
-        A failed transmission was no visit: the visiting record goes back to what it was.
+        A failed transmission was no visit: the visiting record goes back to the latest visit that was one.
         """
         decision = self._pending.pop(outcome.decision_id)
         self._applied[decision.decision_id] = None
         while len(self._applied) > _APPLIED_PER_UAV * self.scenario.uavs:
             self._applied.popitem(last=False)
         self.feedback += 1
-        if outcome.failed and self.visits[decision.sensor_id] == decision.step:
-            self.visits[decision.sensor_id] = self._before_visit.get(decision.sensor_id, _NEVER)
+        if outcome.failed:
+            self._close_visit(decision.sensor_id, decision.decision_id)
+        else:
+            self._confirm_visit(decision)
         self._remember(experience_text(decision.row, decision.sensor_id, decision.velocity, outcome.cost))
         return decision.sample
+
+    def _confirm_visit(self, decision: Pending) -> None:
+        self._confirmed[decision.sensor_id] = max(self._confirmed[decision.sensor_id], decision.step)
+        self._close_visit(decision.sensor_id, decision.decision_id)
+
+    def _close_visit(self, sensor_id: int, decision_id: str) -> None:
+        self._open_visits.get(sensor_id, {}).pop(decision_id, None)
+        self._update_visit(sensor_id)
+
+    def _update_visit(self, sensor_id: int) -> None:
+        """TVR_j: the latest step of a visit that is confirmed, or still open and so presumed to succeed."""
+        presumed = max(self._open_visits.get(sensor_id, {}).values(), default=_NEVER)
+        self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
 
     def _remember(self, line: str) -> None:
         """Append only, so that the LLM's prefix cache lives; at the limit the older half goes at once."""
@@ -176,3 +223,8 @@ class Mission:
             learner_loss=self.learner.last_loss,
             visits={int(s): int(self.visits[s]) for s in np.flatnonzero(self.visits >= 0)},
         )
+
+
+def _forget_lowest(by_step: dict[int, Any]) -> None:
+    while len(by_step) > _RESERVED_STEPS:
+        del by_step[min(by_step)]

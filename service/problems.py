@@ -16,6 +16,9 @@ from shared.wire import Problem
 
 log = logging.getLogger(__name__)
 
+# How pydantic names the branches of a union, which are no fields.
+_UNION_TAGS = ("constrained-", "function-")
+
 CONTENT_TYPE = "application/problem+json"
 
 
@@ -63,12 +66,15 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: Request, error: RequestValidationError) -> Response:
-        errors = [{"field": _path(e["loc"]), "problem": e["msg"]} for e in error.errors()[:20]]
+        # The deepest first: of a union's branches, the one that came nearest.
+        faults = sorted(error.errors()[:20], key=lambda e: -len(e["loc"]))
+        errors = [{"field": _path(e["loc"]), "problem": e["msg"]} for e in faults]
         return problem_response(422, f"{errors[0]['field']}: {errors[0]['problem']}", errors)
 
     @app.exception_handler(HTTPException)
     async def http(_: Request, error: HTTPException) -> Response:
-        response = problem_response(error.status_code, str(error.detail))
+        faults = [{"field": "body", "problem": str(error.detail)}] if error.status_code == 400 else []
+        response = problem_response(error.status_code, str(error.detail), faults)
         response.headers.update(error.headers or {})
         return response
 
@@ -79,6 +85,7 @@ def install(app: FastAPI) -> None:
 
 
 def _path(location: Sequence[int | str]) -> str:
+    location = [p for p in location if not (isinstance(p, str) and p.startswith(_UNION_TAGS))]
     parts = list(location[1:]) if location and location[0] in ("body", "path", "query", "header") else list(location)
     # A JSON syntax error has the byte offset for a location.
     if not parts or (len(parts) == 1 and isinstance(parts[0], int)):

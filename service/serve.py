@@ -13,7 +13,6 @@ from pydantic import ValidationError
 # In-flight decisions end within their deadline; past this, shutting down does not wait for them. Less than the 10 s
 # after which `docker stop` kills.
 _SHUTDOWN_S = 8
-_CONCURRENCY = 256
 
 
 @dataclass(frozen=True)
@@ -77,14 +76,21 @@ def _serve(listener: socket.socket) -> int:
     logging.basicConfig(level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # httpx logs every request at level info, address included.
     logging.getLogger("httpx").setLevel(logging.WARNING)
+    app = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings),
+        app,
         log_level=settings.log_level,
         timeout_graceful_shutdown=_SHUTDOWN_S,
-        limit_concurrency=_CONCURRENCY,
         access_log=settings.log_level == "debug",
     )
-    uvicorn.Server(config).run(sockets=[listener])
+
+    class Server(uvicorn.Server):
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            if (engine := getattr(app.state, "engine", None)) is not None:
+                engine.hurry()
+            await super().shutdown(sockets)
+
+    Server(config).run(sockets=[listener])
     return 0
 
 

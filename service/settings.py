@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, SecretStr, field_validator
+import httpx
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from shared.wire import Mode
+
+# Upper bounds in the embedded model's tokens, which has one for each digit.
+_STATIC_TOKENS, _ROW_TOKENS = 400, 32
 
 
 def _default_cache() -> Path:
@@ -55,7 +59,7 @@ class Settings(BaseSettings):
     # Threads of the embedded llama.cpp. 0: cores - 1, because with as many threads as cores and
     # anything else running, llama.cpp's spinning workers slow each token a hundredfold.
     llm_threads: int = Field(0, ge=0, le=256)
-    # Tokens of the embedded model's context: static prefix, experiences and 100 rows fit in a third of it.
+    # Tokens of the embedded model's context; the settings are refused where the longest prompt would not fit.
     llm_context: int = Field(4096, ge=512, le=131_072)
 
     # Who decides by default: `llm` (the paper's method) or `value` (what the modules learned; no LLM is started).
@@ -91,7 +95,34 @@ class Settings(BaseSettings):
             return None
         if not url.startswith(("http://", "https://")):
             raise ValueError("must start with http:// or https://, for example http://localhost:8080/v1")
+        try:
+            parsed = httpx.URL(url)
+        except (httpx.InvalidURL, ValueError):
+            raise ValueError("is not a valid address") from None
+        if parsed.userinfo or not parsed.host:
+            raise ValueError("must name a host and no user: the key goes into AICVDS_LLM_API_KEY")
         return url.rstrip("/")
+
+    @field_validator("llm_api_key")
+    @classmethod
+    def _header_safe(cls, key: SecretStr | None) -> SecretStr | None:
+        if key is None:
+            return None
+        # A key read from a file ends in a newline.
+        stripped = key.get_secret_value().strip()
+        if not (stripped.isascii() and stripped.isprintable()):
+            raise ValueError("must be printable ASCII")
+        return SecretStr(stripped)
+
+    @model_validator(mode="after")
+    def _prompt_fits(self) -> Self:
+        needed = _STATIC_TOKENS + _ROW_TOKENS * (self.experiences + self.top_k)
+        if needed > self.llm_context:
+            raise ValueError(
+                f"{self.experiences} experiences and {self.top_k} sensors need up to {needed} tokens: "
+                f"raise AICVDS_LLM_CONTEXT (now {self.llm_context}) or lower AICVDS_EXPERIENCES"
+            )
+        return self
 
     @property
     def embedded_threads(self) -> int:

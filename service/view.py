@@ -72,9 +72,10 @@ class View:
 
     def pending(self, mission: Mission, decision_id: str, sensor_id: int, velocity: int) -> Pending:
         """The decision, as its outcome will need it."""
-        row = int(np.flatnonzero(self.state.ids == sensor_id)[0])
+        rows = np.flatnonzero(self.state.ids == sensor_id)
+        row = int(rows[0]) if len(rows) else None
         sample = None
-        if row in self._admissible:
+        if row is not None and row in self._admissible:
             sample = Sample(
                 features=self._features,
                 chosen=self._admissible.index(row),
@@ -87,6 +88,6 @@ class View:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            row=row_text(self.state, row),
+            row=f"{sensor_id},?,?,?,?" if row is None else row_text(self.state, row),
             sample=sample,
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -22,7 +22,7 @@ class Scenario(BaseModel):
         pydantic.ValidationError: a field is out of bounds, or two fields contradict each other.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     name: str = Field("paper", pattern=r"^[a-z][a-z0-9_]{0,31}$")
     sensors: int = Field(10, ge=1, le=10_000, description="number of ground sensors J")
@@ -31,9 +31,11 @@ class Scenario(BaseModel):
 
     area_m: float = Field(1000.0, ge=1, le=1e6, description="side of the square area")
     layout: Literal["uniform", "pipeline"] = "uniform"
-    pipeline: tuple[Point, ...] = Field(
+    pipeline: tuple[Annotated[Point, Field(strict=False)], ...] = Field(
         ((50.0, 120.0), (350.0, 300.0), (500.0, 560.0), (720.0, 640.0), (950.0, 900.0)),
         min_length=2,
+        max_length=1000,
+        strict=False,
         description="polyline that layout `pipeline` strings the sensors along",
     )
     pipeline_spread_m: float = Field(20.0, ge=0, le=1e6, description="largest offset from the polyline, each axis")
@@ -111,4 +113,4 @@ def scenario_named(name: str) -> Scenario:
     try:
         return SCENARIOS[name]
     except KeyError:
-        raise ValueError(f"unknown scenario {name!r}: choose one of {', '.join(SCENARIOS)}") from None
+        raise ValueError(f"unknown scenario {name[:32]!r}: choose one of {', '.join(SCENARIOS)}") from None

@@ -54,24 +54,26 @@ class SensorColumns(Wire):
     beacon) are all ``null`` for a sensor never heard, and none of them for one that was.
     """
 
-    id: Annotated[list[SensorId], Field(min_length=1, max_length=MAX_SENSORS, description="no duplicates")]
-    x: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, description="m, surveyed")]
-    y: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, description="m, surveyed")]
+    id: Annotated[
+        list[SensorId], Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="no duplicates")
+    ]
+    x: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="m, surveyed")]
+    y: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="m, surveyed")]
     queue: Annotated[
         list[Annotated[float, Field(ge=0, le=100_000)] | None],
-        Field(min_length=1, max_length=MAX_SENSORS, description="packets waiting"),
+        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="packets waiting"),
     ]
     battery: Annotated[
         list[Annotated[float, Field(ge=0, le=1e9)] | None],
-        Field(min_length=1, max_length=MAX_SENSORS, description="J left"),
+        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="J left"),
     ]
     channel_gain: Annotated[
         list[Annotated[float, Field(ge=-400, le=0)] | None],
-        Field(min_length=1, max_length=MAX_SENSORS, description="dB, minus the path loss"),
+        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="dB, minus the path loss"),
     ]
     last_seen: Annotated[
         list[Step | None],
-        Field(min_length=1, max_length=MAX_SENSORS, description="step of the last beacon"),
+        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="step of the last beacon"),
     ]
 
     @model_validator(mode="after")
@@ -128,7 +130,7 @@ class BatchRequest(Wire):
     mission_id: MissionId = "default"
     step: Step
     deadline_ms: DeadlineMs | None = Field(None, description="for the whole batch")
-    uavs: list[UavState] = Field(min_length=1, max_length=100)
+    uavs: list[UavState] = Field(min_length=1, max_length=100, fail_fast=True)
 
     @model_validator(mode="after")
     def _one_state_a_uav(self) -> Self:
@@ -216,7 +218,9 @@ class FeedbackResponse(Wire):
 class MissionSpec(Wire):
     """``PUT /missions/{id}``: the world that a fleet flies in and how it decides."""
 
-    scenario: str | Scenario = Field("paper", description="a preset's name or a whole scenario")
+    scenario: Annotated[str, Field(max_length=32)] | Scenario = Field(
+        "paper", description="a preset's name or a whole scenario"
+    )
     mode: Mode | None = Field(None, description="default: the service's")
     top_k: int | None = Field(None, ge=1, le=100, description="default: the service's")
     init: Init = Field("pretrained", description="the modules' start; `random` is the paper's")

@@ -12,6 +12,17 @@ from service.llm.answer import Constraint, NoDecision, constrain
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES = 256 * 1024
+_MAX_TOKENS = 10**9
+# What servers answer to a field that they do not know; anything else says nothing about the field.
+_NOT_UNDERSTOOD = (400, 404, 422)
+
+
+class NotUnderstood(NoDecision):
+    """The server refused the request as it was put."""
+
+
+class Unreachable(NoDecision):
+    """Nobody listens at the address."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +40,16 @@ class LLMClient:
 
     Args:
         base_url: up to and including ``/v1``.
+        trust_env: heed ``HTTP_PROXY`` and its like.
     """
 
-    def __init__(self, base_url: str, *, api_key: str | None = None) -> None:
+    def __init__(self, base_url: str, *, api_key: str | None = None, trust_env: bool = True) -> None:
         self.base_url = base_url
-        headers = {"Authorization": f"Bearer {api_key}"} if api_key else {}
-        self._http = httpx.AsyncClient(base_url=base_url + "/", headers=headers, timeout=None)
+        # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before it is counted.
+        headers = {"Accept-Encoding": "identity"}
+        if api_key:
+            headers["Authorization"] = f"Bearer {api_key}"
+        self._http = httpx.AsyncClient(base_url=base_url + "/", headers=headers, timeout=None, trust_env=trust_env)
 
     async def close(self) -> None:
         """Close every connection."""
@@ -44,7 +59,8 @@ class LLMClient:
         """Names of the models that the server lists; raises :class:`NoDecision`."""
         listed = await self._call("GET", "models", None)
         try:
-            return [str(model["id"]) for model in listed["data"]]
+            names = [model["id"] for model in listed["data"]]
+            return [name for name in names if isinstance(name, str) and name.isprintable()]
         except (KeyError, TypeError):
             raise NoDecision("llm_error", f"{self.base_url}/models: no list of models") from None
 
@@ -60,18 +76,28 @@ class LLMClient:
             raise NoDecision("llm_error", f"{self.base_url}: a 200 that is no chat completion") from None
         if not isinstance(text, str):
             raise NoDecision("llm_error", f"{self.base_url}: a completion without text")
-        return Completion(text, *(count if type(count) is int and count >= 0 else None for count in counts))
+        prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
+        if prompt is not None and cached is not None:
+            cached = min(cached, prompt)
+        return Completion(text, prompt, cached, completion)
 
     async def _call(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
         content = bytearray()
         try:
             async with self._http.stream(method, path, json=body) as response:
-                async for chunk in response.aiter_bytes():
+                if response.headers.get("content-encoding", "identity") != "identity":
+                    raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
+                async for chunk in response.aiter_raw():
                     content += chunk
                     if len(content) > _MAX_RESPONSE_BYTES:
                         raise NoDecision("llm_error", f"{self.base_url}: more than {_MAX_RESPONSE_BYTES} bytes")
-        except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise NoDecision("llm_error", f"{self.base_url}: {type(error).__name__} {error}") from error
+        except httpx.ConnectError as error:
+            raise Unreachable("llm_error", f"{self.base_url}: {type(error).__name__}") from error
+        except (httpx.HTTPError, httpx.InvalidURL, UnicodeError) as error:
+            # Its text may quote the Authorization header.
+            raise NoDecision("llm_error", f"{self.base_url}: {type(error).__name__}") from error
+        if response.status_code in _NOT_UNDERSTOOD:
+            raise NotUnderstood("llm_status", f"{self.base_url}: HTTP {response.status_code}")
         if response.status_code != 200:
             raise NoDecision("llm_status", f"{self.base_url}: HTTP {response.status_code}")
         try:

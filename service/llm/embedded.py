@@ -10,6 +10,11 @@ import xllamacpp
 # llama.cpp sets aside up to 8 GB of host memory for old prompts unless told otherwise.
 _PROMPT_CACHE_MIB = 64
 _ONLY_ERRORS = 1
+_BATCH = 128
+
+
+class LoadFailed(RuntimeError):
+    """The model file is none that llama.cpp can load."""
 
 
 class EmbeddedServer:
@@ -18,7 +23,7 @@ class EmbeddedServer:
     The server wants a key made at start, so that other users of the machine cannot spend its time.
 
     Raises:
-        RuntimeError: llama.cpp could not load the file.
+        LoadFailed: llama.cpp could not load the file.
     """
 
     def __init__(self, gguf: Path, *, threads: int, context: int) -> None:
@@ -29,12 +34,17 @@ class EmbeddedServer:
         params.n_ctx = context
         # One slot: the static prefix and the experiences are one prefix for the whole fleet.
         params.n_parallel = 1
+        # llama.cpp notices a cancelled call between batches: large ones keep the next decision waiting for seconds.
+        params.n_batch = params.n_ubatch = _BATCH
         params.cache_ram_mib = _PROMPT_CACHE_MIB
         params.verbosity = _ONLY_ERRORS
         params.ui = False
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
-        self._server: xllamacpp.Server | None = xllamacpp.Server(params)
+        try:
+            self._server: xllamacpp.Server | None = xllamacpp.Server(params)
+        except RuntimeError as error:
+            raise LoadFailed(f"llama.cpp cannot load {gguf.name}: {error}") from error
         self.base_url = f"{self._server.listening_address}/v1"
         self.model = gguf.stem
 

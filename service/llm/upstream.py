@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.llm.answer import Constraint, NoDecision
-from service.llm.client import Completion, LLMClient, chat_body
-from service.llm.embedded import EmbeddedServer
+from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body
+from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
 from service.prompt import static_block
 from service.settings import Settings
@@ -88,7 +88,13 @@ class Upstream:
         if self._client is None or self.status != "ready":
             raise NoDecision("llm_loading" if self.status == "loading" else "llm_unavailable", self.status)
         body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
-        return await self._client.complete(body)
+        try:
+            return await self._client.complete(body)
+        except Unreachable as gone:
+            if self.status == "ready":
+                self._status = _Status("unavailable", str(gone))
+                self.start()
+            raise
 
     async def _bring_up(self) -> None:
         while True:
@@ -97,14 +103,17 @@ class Upstream:
                 self._status = _Status("ready")
                 log.info("LLM ready: %s at %s, constraint %s", self.model, client.base_url, self.constraint)
                 return
-            except (ModelMissing, RuntimeError) as error:
+            except (ModelMissing, LoadFailed) as error:
                 self._status = _Status("unavailable", str(error))
                 log.error("no embedded LLM: %s", error)
                 return
             except (NoDecision, TimeoutError) as error:
                 self._status = _Status("unavailable", str(error) or f"no answer in {_PROBE_TIMEOUT_S:g} s")
                 log.warning("LLM not ready, next try in %g s: %s", _RETRY_S, self._status.detail)
-                await asyncio.sleep(_RETRY_S)
+            except Exception as error:
+                self._status = _Status("unavailable", f"{type(error).__name__}: see the log")
+                log.exception("LLM not ready, next try in %g s", _RETRY_S)
+            await asyncio.sleep(_RETRY_S)
 
     async def _connect(self) -> LLMClient:
         """Reach the server, learn what it obeys, and have it read the static block before a decision pays for it."""
@@ -117,7 +126,7 @@ class Upstream:
             self._embedded = await asyncio.to_thread(
                 EmbeddedServer, gguf, threads=settings.embedded_threads, context=settings.llm_context
             )
-            self._client = LLMClient(self._embedded.base_url, api_key=self._embedded.api_key)
+            self._client = LLMClient(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
             if self.model is None:
@@ -130,14 +139,12 @@ class Upstream:
 
     async def _probe(self, client: LLMClient) -> Constraint:
         """The first way of constraining that the server really obeys: it may ignore an unknown field silently."""
-        refusal: NoDecision | None = None
+        refusal: NotUnderstood | None = None
         for constraint in _PROBES:
             try:
                 body = self._probe_body(constraint)
                 text = (await client.complete(body)).text
-            except NoDecision as failed:
-                if failed.reason != "llm_status":
-                    raise
+            except NotUnderstood as failed:
                 refusal = failed
                 continue
             if str(_PROBE_SENSOR) in text:

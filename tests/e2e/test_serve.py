@@ -1,12 +1,19 @@
 """``aicvds`` and ``aicvds serve`` as processes."""
 
+import asyncio
 import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
 from tests.e2e.processes import output_until, run, serving_edge, started
+from tests.running import listening
+from tests.service.test_upstream import misbehaving, wait_for
 
 
 def test_help_names_every_command() -> None:
@@ -70,6 +77,27 @@ def test_the_edge_stops_when_asked(ask: signal.Signals) -> None:
         assert httpx.get(f"{url}/healthz").status_code == 200
         process.send_signal(ask)
         assert process.wait(timeout=15) in (0, 130, -ask)
+
+
+async def _silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    await reader.read()
+
+
+def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable[..., dict[str, Any]]) -> None:
+    """Its LLM is silent and its deadline far: the policy answers, in less time than `docker stop` grants."""
+    with (
+        listening(misbehaving(_silent)) as llm,
+        serving_edge(AICVDS_LLM_URL=f"{llm}/v1", AICVDS_LLM_MODEL="x") as (url, process),
+        httpx.Client(base_url=url, timeout=60) as client,
+        ThreadPoolExecutor() as pool,
+    ):
+        wait_for(client, "ready")
+        waiting = pool.submit(client.post, "/decide", json=report(deadline_ms=60_000))
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+        answer = waiting.result(timeout=30)
+        process.wait(timeout=15)
+    assert (answer.status_code, answer.json()["reason"]) == (200, "llm_timeout")
 
 
 def test_empty_variables_are_unset_ones(tmp_path: Path) -> None:

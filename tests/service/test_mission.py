@@ -1,7 +1,7 @@
 import pytest
 
 from service.mission import Mission
-from service.problems import NotFound
+from service.problems import Conflict, NotFound
 from shared.wire import Outcome
 from tests.service.making import attended, mission, uav
 
@@ -86,3 +86,67 @@ def test_a_decision_outside_the_modules_view_teaches_nothing() -> None:
     view = attended(m, uav(queue=[10.0, None]))
     m.commit(view.pending(m, "b" * 32, 1, 14))
     assert m.apply(outcome("b" * 32)) is None
+
+
+def test_a_fleet_whose_uavs_are_steps_apart_still_shares_its_sensors() -> None:
+    m = mission()
+    for step in range(10):
+        decide(m, 1 + step, step=step, uav_id=0, sensor=2)
+    for step in range(10):
+        assert m.reserved(step, uav_id=1) == {2}
+        decide(m, 100 + step, step=step, uav_id=1, sensor=3)
+    assert m.reserved(0, uav_id=2) == {2, 3}
+
+
+def test_reservations_are_bounded() -> None:
+    m = mission()
+    for step in [1_000_000, *range(500)]:
+        m.attempt(step, 0)
+        decide(m, step + 1, step=step)
+    assert m.reserved(0, uav_id=1) == frozenset()
+    assert m.reserved(499, uav_id=1) == {1}
+    assert len(m._given) == len(m._attempts) == 64
+
+
+def test_an_answer_to_an_earlier_attempt_does_not_undo_a_later_one() -> None:
+    m = mission()
+    slow, fast = m.attempt(1, 0), m.attempt(1, 0)
+    view = attended(m, uav(step=1), 1)
+    m.commit(view.pending(m, "a" * 32, 4, 7), fast)
+    with pytest.raises(Conflict):
+        m.commit(view.pending(m, "b" * 32, 1, 7), slow)
+    assert m.reserved(1, uav_id=1) == {4}
+    assert m.status().visits == {4: 1}
+
+
+def test_a_uav_that_asks_again_gives_its_first_sensor_back() -> None:
+    m = mission()
+    decide(m, 1, step=5, sensor=0)
+    decide(m, 2, step=5, sensor=1)
+    assert m.reserved(5, uav_id=1) == {1}
+    assert m.status().visits == {1: 5}
+
+
+@pytest.mark.parametrize("order", [(1, 2), (2, 1)])
+def test_failures_in_any_order_leave_the_last_real_visit(order: tuple[int, int]) -> None:
+    m = mission()
+    m.apply(outcome(decide(m, 9, step=1)))
+    ids = {1: decide(m, 1, step=3), 2: decide(m, 2, step=7)}
+    for number in order:
+        m.apply(outcome(ids[number], failed=True))
+    assert m.visits[1] == 1
+
+
+def test_a_failure_of_a_later_visit_leaves_an_earlier_one_that_is_still_open() -> None:
+    m = mission()
+    decide(m, 1, step=3)
+    m.apply(outcome(decide(m, 2, step=7), failed=True))
+    assert m.visits[1] == 3
+
+
+def test_one_uav_that_retries_forgets_only_its_own_decisions() -> None:
+    m = mission()
+    other = decide(m, 1, uav_id=1, sensor=2)
+    for number in range(2, 60):
+        decide(m, number, step=number, uav_id=0)
+    assert m.find(other) == "pending"

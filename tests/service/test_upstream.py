@@ -9,6 +9,7 @@ from typing import Any
 
 import httpx
 import pytest
+import zstandard
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
@@ -152,6 +153,13 @@ def saying(status: bytes, body: bytes) -> Handler:
     return fault
 
 
+async def _compressed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """A few kilobytes that would unpack to half a gigabyte."""
+    bomb = zstandard.compress(b" " * 500_000_000)
+    writer.write(b"HTTP/1.1 200 OK\r\ncontent-encoding: zstd\r\ncontent-length: %d\r\n\r\n%s" % (len(bomb), bomb))
+    await writer.drain()
+
+
 FAULTS: dict[str, tuple[Handler, str]] = {
     "silent": (silent, "llm_timeout"),
     "dripping": (dripping, "llm_timeout"),
@@ -165,6 +173,7 @@ FAULTS: dict[str, tuple[Handler, str]] = {
     "empty object": (saying(b"200 OK", b"{}"), "llm_error"),
     "a list": (saying(b"200 OK", b"[1]"), "llm_error"),
     "no text": (saying(b"200 OK", b'{"choices": [{"message": {"content": null}}]}'), "llm_error"),
+    "compressed": (_compressed, "llm_error"),
     "not http": (saying(b"", b"\x00\x01"), "llm_error"),
 }
 
@@ -186,8 +195,12 @@ def test_a_misbehaving_upstream_never_keeps_a_uav_waiting(edge: Edge, report: Re
     assert len({a.json()["sensor_id"] for a in answers}) == 3
 
 
-def test_a_usage_that_makes_no_sense_is_no_usage(edge: Edge, report: Report) -> None:
-    usage = b'{"prompt_tokens": -3, "completion_tokens": "x", "prompt_tokens_details": {"cached_tokens": 1.5}}'
+@pytest.mark.parametrize("prompt_tokens", [b"-3", b"1" + b"0" * 400, b"true", b"null"])
+def test_a_usage_that_makes_no_sense_is_no_usage(edge: Edge, report: Report, prompt_tokens: bytes) -> None:
+    usage = (
+        b'{"prompt_tokens": %s, "completion_tokens": "x", "prompt_tokens_details": {"cached_tokens": 1.5}}'
+        % prompt_tokens
+    )
     answer = b'{"choices": [{"message": {"content": "0 7"}}], "usage": %s}' % usage
     with listening(misbehaving(saying(b"200 OK", answer))) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1")
@@ -195,6 +208,58 @@ def test_a_usage_that_makes_no_sense_is_no_usage(edge: Edge, report: Report) -> 
         decision = client.post("/decide", json=report()).json()
     assert decision["source"] == "llm"
     assert [decision["tokens"][key] for key in ("server_prompt", "cached", "completion")] == [None] * 3
+
+
+@pytest.mark.parametrize("status", [503, 429])
+def test_a_server_that_is_still_loading_is_probed_again(
+    edge: Edge, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    """A refusal for want of time says nothing about what the server obeys."""
+    monkeypatch.setattr("service.llm.upstream._RETRY_S", 0.05)
+    model = Model("grammar")
+    complete, early = model.complete, [status] * 3
+
+    async def loading(request: Request) -> Response:
+        return JSONResponse({}, status_code=early.pop()) if early else await complete(request)
+
+    app = FastAPI()
+    app.get("/v1/models")(model.models)
+    app.post("/v1/chat/completions")(loading)
+    with serving(app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        for _ in range(200):
+            if (ready := client.get("/readyz").json())["llm"] == "ready":
+                break
+            time.sleep(0.05)
+    assert (ready["llm"], ready["constraint"]) == ("ready", "grammar")
+
+
+def test_a_server_that_goes_away_is_told_and_found_again(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.llm.upstream._RETRY_S", 0.05)
+    with serving(Model("grammar").app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+    answers = [client.post("/decide", json=report(uav_id=uav)).json()["reason"] for uav in (0, 1)]
+    assert answers[-1] == "llm_unavailable"
+    wait_for(client, "unavailable")
+    with serving(Model("grammar").app, port=int(url.rsplit(":", 1)[1])):
+        wait_for(client, "ready")
+        assert client.post("/decide", json=report(step=1)).json()["source"] == "llm"
+
+
+@pytest.mark.parametrize("models", [{"data": [{"id": "\ud800"}]}, {"data": [{"id": None}]}, {"data": 7}, []])
+def test_a_list_of_models_that_is_none(edge: Edge, report: Report, models: Any) -> None:
+    app = FastAPI()
+    app.get("/v1/models")(lambda: Response(json.dumps(models), media_type="application/json"))
+    app.post("/v1/chat/completions")(Model("grammar").complete)
+    with serving(app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        for _ in range(20):
+            assert client.get("/readyz").status_code == 200
+            time.sleep(0.02)
+        assert client.post("/decide", json=report()).status_code == 200
 
 
 def test_a_timed_out_call_is_hung_up(edge: Edge, report: Report) -> None:
