@@ -22,7 +22,7 @@ from rich.table import Table
 from scipy.stats import bootstrap
 
 from shared.scenario import scenario_named
-from shared.wire import Mode
+from shared.wire import Init, Mode
 from simulator.client import EdgeClient
 from simulator.mission import EdgePilot, fly, new_mission_id
 from simulator.policies import POLICY_NAMES, policy_named
@@ -46,6 +46,8 @@ class Outcome:
     """The world."""
     mode: Mode | None = None
     """How the edge decides; default: its own setting."""
+    init: Init = "pretrained"
+    """The modules' start."""
     out: Path = Path("runs/outcome.json")
     """Where to write; schemes already there, of other labels, are kept and shown beside."""
 
@@ -60,6 +62,7 @@ def main(args: Outcome) -> int:
         for seed in track(range(args.seeds), description=f"flying {args.label}"):
             mission_id = new_mission_id(scenario, seed)
             pilot = EdgePilot(client, mission_id, scenario, seed, mode=args.mode, deadline_ms=_DEADLINE_MS)
+            pilot.spec = pilot.spec.model_copy(update={"init": args.init})
             client.put_mission(mission_id, pilot.spec)
             flight = fly(scenario, pilot, seed)
             if flight.interrupted:
@@ -87,6 +90,9 @@ def _table(lost: dict[str, list[list[int]]], args: Outcome) -> Table:
     eof = np.array(lost["eof"])[:, 0]
     for name, rows in sorted(lost.items(), key=lambda item: np.mean(item[1], axis=0)[0]):
         packets, events = np.array(rows).T
+        if name == "eof":
+            table.add_row(name, _mean(packets), _mean(events), "1")
+            continue
         ratio = bootstrap((packets, eof), lambda a, b, axis=-1: a.mean(axis) / b.mean(axis), paired=True, rng=0)
         low, high = ratio.confidence_interval
         table.add_row(name, _mean(packets), _mean(events), f"{packets.mean() / eof.mean():.2f} [{low:.2f}, {high:.2f}]")

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 from tyro.conf import arg
 
+from service.attention import top_k
 from service.features import FEATURES
 from service.learner import Modules, Sample
 from service.mission import Mission
@@ -85,6 +86,8 @@ def main(argv: list[str]) -> int:
         if not train or not test:
             raise ValueError(f"{args.rollouts} holds {len(missions)} missions; at least 2 are needed")
         modules = fit(train, test, header.scenario.max_velocity + 1, args, console)
+        for k in (5, 3):
+            console.print(f"held-out recall of the teacher's sensor in the top {k}: {recall(modules, test, k):.3f}")
         args.out.parent.mkdir(parents=True, exist_ok=True)
         torch.save(modules.state_dict(), args.out)
     except (ValueError, OSError) as error:
@@ -121,6 +124,15 @@ def replay(header: Header, steps: Iterable[RolloutStep], horizon: int, discount:
                 reward = -sum(w * c for w, c in zip(weights, ahead, strict=True)) / sum(weights)
                 examples.append(Example(sample, reward, teacher))
         yield examples
+
+
+def recall(modules: Modules, examples: Iterable[Example], k: int) -> float:
+    """How often the teacher's sensor is among the k best scored, of the decisions with more than k candidates."""
+    hits = []
+    for teacher in (example.teacher for example in examples if example.teacher is not None):
+        if len(teacher.features) > k:
+            hits.append(teacher.chosen in top_k(modules.score(teacher.features)[0], k))
+    return sum(hits) / len(hits) if hits else float("nan")
 
 
 def _loss(modules: Modules, example: Example, ranking: float) -> Tensor:

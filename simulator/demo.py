@@ -15,16 +15,8 @@ import tyro
 from rich.console import Console
 
 from simulator.client import EdgeError
-from simulator.simulate import (
-    BadUse,
-    Job,
-    check_bounds,
-    chosen_scenario,
-    conduct,
-    refuse_old_result,
-    remove_old_result,
-    reporting,
-)
+from simulator.record import BadUse, fresh_folder, naming_out, refuse_old_result
+from simulator.simulate import Job, check_bounds, chosen_scenario, conduct, reporting
 
 EDGE_LOG = "edge.log"
 STOP_S = 10.0
@@ -75,9 +67,8 @@ def demo(options: Demo, command: str, console: Console) -> int:
     """Serve, fly, stop; returns the exit code.
 
     Raises:
-        BadUse: the options make no demo.
+        BadUse: the options make no demo, or the folder cannot be written.
         EdgeError: the edge died at start, or never became ready.
-        OSError: the folder cannot be written.
     """
     scenario = chosen_scenario(options.scenario)
     check_bounds(options.seed, options.wait_s)
@@ -85,8 +76,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         raise BadUse(f"--port {options.port} is not between 0 and 65535")
     refuse_old_result(options.out, overwrite=True)
     port = _usable_port(options.port)
-    options.out.mkdir(parents=True, exist_ok=True)
-    remove_old_result(options.out)
+    fresh_folder(options.out)
     from simulator.mission import new_mission_id
 
     job = Job(
@@ -110,7 +100,9 @@ def demo(options: Demo, command: str, console: Console) -> int:
 def edge_process(port: int, log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """An edge on the loopback's ``port``, its output in ``log``; stopped on leaving, whatever the reason."""
     command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
-    with log.open("wb") as output:
+    with naming_out(log.parent):
+        output = log.open("wb")
+    with output:
         # A session of its own: Ctrl-C must reach the flight first, which still needs its edge to land.
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True

@@ -16,8 +16,10 @@ import matplotlib
 import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
@@ -27,9 +29,22 @@ from simulator.record import Decision, Tally, visits_per_sensor
 
 INK = "#222222"
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#767676"
-LINES = ((BLUE, "-", "o"), (ORANGE, "--", "s"), (GREEN, ":", "^"), (PURPLE, "-.", "D"))
-SOURCES = {"llm": BLUE, "guided": GREEN, "policy": ORANGE, "onboard": RED}
+SKY = "#56B4E9"
+AS_SENT, IN_FULL = (BLUE, "-", "o"), (ORANGE, "--", "s")
+# A policy looks alike on every page, whoever else flies.
+POLICIES = {
+    "aic_vds": (BLUE, "-", "o"),
+    "eof": (ORANGE, "--", "s"),
+    "wqcs": (GREEN, ":", "^"),
+    "round_robin": (PURPLE, "-.", "D"),
+    "random": (SKY, (0, (5, 1, 1, 1)), "v"),
+}
+OTHER_POLICY = (GREY, "-", "x")
+SOURCES = {"llm": BLUE, "guided": PURPLE, "value": GREEN, "policy": ORANGE, "onboard": RED}
+MARKERS = {"llm": "o", "guided": "P", "value": "^", "policy": "D", "onboard": "o"}
 MAPS = 9
+# Of the area's side, from a sensor to its number.
+LABEL_OFFSET = 0.06
 WIDTH_IN = 9.0
 
 _RC: dict[Any, Any] = {
@@ -95,95 +110,125 @@ def _plain(axes: Axes) -> None:
 def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> str:
     """One map a UAV (the first nine): its circle, its waypoints coloured by round trip, all sensors.
 
-    ``sensor_xy`` is (J, 2) in metres. Waypoints without a round trip, decided on board, are hollow.
+    ``sensor_xy`` is (J, 2) in metres. The marker says who decided; what was decided on board is hollow.
     """
     shown = min(scenario.uavs, MAPS)
     columns = min(3, shown)
     rows = -(-shown // columns)
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
-    low, high = (min(trips), max(trips)) if trips else (0.0, 1.0)
+    scale = Normalize(min(trips), max(trips)) if trips else Normalize(0.0, 1.0)
     out: list[str] = []
-    with _drawn("latency-map", 3.0 * rows + 0.3, (rows, columns), out) as panels:
+    with _drawn("latency-map", 3.0 * rows + 0.5, (rows, columns), out) as panels:
         for extra in panels[shown:]:
             extra.set_visible(False)
-        points = None
         for uav in range(shown):
             mine = [d for d in decisions if d.uav_id == uav]
-            drawn = _map_panel(panels[uav], scenario, sensor_xy, uav, mine, (low, high))
-            points = drawn if drawn is not None else points
-            panels[uav].set_xlabel("x (m)")
+            _map_frame(panels[uav], scenario, uav)
+            arrow = _map_lap(panels[uav], scenario, uav, mine)
+            _map_sensors(panels[uav], scenario, sensor_xy, [*(np.array(d.position) for d in mine), *arrow])
+            _map_waypoints(panels[uav], mine, scale)
             if uav % columns == 0:
                 panels[uav].set_ylabel("y (m)")
-        if points is not None:
-            bar = panels[0].figure.colorbar(points, ax=panels, shrink=0.8, pad=0.02)
+        figure = panels[0].figure
+        if trips:
+            bar = figure.colorbar(ScalarMappable(scale, "viridis"), ax=panels, shrink=0.8, pad=0.02)
             bar.set_label("round trip (ms)")
             bar.ax.minorticks_off()
+        present = {d.source for d in decisions}
+        keys = [_key(source) for source in SOURCES if source in present]
+        keys.append(Line2D([], [], color=INK, marker="s", linestyle="", label="sensor"))
+        figure.legend(handles=keys, loc="outside lower center", ncols=len(keys))
     return out[0]
 
 
-def _map_panel(
-    axes: Axes,
-    scenario: Scenario,
-    sensor_xy: np.ndarray,
-    uav: int,
-    mine: Sequence[Decision],
-    limits: tuple[float, float],
-) -> PathCollection | None:
-    centre = scenario.lap_centres[uav]
-    axes.add_patch(Circle(centre, scenario.lap_radius_m, fill=False, color=GREY, linewidth=0.8, linestyle="--"))
+def _key(source: str) -> Line2D:
+    face = "none" if source == "onboard" else GREY
+    edge = RED if source == "onboard" else GREY
+    return Line2D([], [], linestyle="", marker=MARKERS[source], markerfacecolor=face, color=edge, label=source)
+
+
+def _map_frame(axes: Axes, scenario: Scenario, uav: int) -> None:
+    axes.set_title(f"UAV {uav}")
+    axes.set_aspect("equal")
+    edge = scenario.lap_offset_m + scenario.lap_radius_m - scenario.area_m / 2
+    margin = max(0.0, edge) + 0.06 * scenario.area_m
+    axes.set_xlim(-margin, scenario.area_m + margin)
+    axes.set_ylim(-margin, scenario.area_m + margin)
+    axes.set_xlabel("x (m)")
+    axes.minorticks_off()
+    axes.locator_params(nbins=4)
+
+
+def _map_lap(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Decision]) -> list[np.ndarray]:
+    centre = np.array(scenario.lap_centres[uav])
+    axes.add_patch(Circle(tuple(centre), scenario.lap_radius_m, fill=False, color=GREY, linewidth=0.8, linestyle="--"))
+    if not mine:
+        return []
+    x, y = np.array(mine[0].position) - centre
+    start = np.arctan2(y, x)
+    # Inside the lap, where neither the waypoints nor the frame is; counter-clockwise, as every lap is flown.
+    along = start + np.linspace(0.0, 0.7, 20)
+    arc = centre + 0.8 * scenario.lap_radius_m * np.column_stack([np.cos(along), np.sin(along)])
+    axes.plot(arc[:-1, 0], arc[:-1, 1], color=RED, linewidth=1.4, zorder=6)
+    axes.annotate("", arc[-1], arc[-3], arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.4}, zorder=6)
+    inner = centre + 0.5 * scenario.lap_radius_m * np.array([np.cos(start), np.sin(start)])
+    axes.text(
+        inner[0], inner[1], "start", color=RED, fontsize=9, ha="center", va="center", zorder=7, path_effects=_HALO
+    )  # fmt: skip
+    return [*arc[::5], inner]
+
+
+def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: list[np.ndarray]) -> None:
     few = len(sensor_xy) <= 20
     axes.scatter(
         sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=42 if few else 10, color=INK, edgecolors="white", zorder=5
     )
-    for j, (x, y) in enumerate(sensor_xy if few else ()):
-        axes.annotate(
-            str(j),
-            (x, y),
-            xytext=(5, 4),
-            textcoords="offset points",
-            fontsize=9,
-            color=INK,
-            zorder=6,
-            path_effects=_HALO,
-        )
-    onboard = np.array([d.position for d in mine if d.rtt_ms is None]).reshape(-1, 2)
-    axes.scatter(onboard[:, 0], onboard[:, 1], s=40, facecolors="none", edgecolors=RED, linewidths=1.4, zorder=4)
-    asked = [d for d in mine if d.rtt_ms is not None]
-    points = None
-    if asked:
-        at = np.array([d.position for d in asked])
-        trips = np.array([d.rtt_ms for d in asked], dtype=float)
-        points = axes.scatter(
-            at[:, 0], at[:, 1], c=trips, cmap="viridis", vmin=limits[0], vmax=limits[1],
+    crowd = [*drawn, *sensor_xy]
+    reach = LABEL_OFFSET * scenario.area_m
+    turns = np.arange(8) * np.pi / 4 + np.pi / 4
+    for j, at in enumerate(sensor_xy if few else ()):
+        spots = at + reach * np.column_stack([np.cos(turns), np.sin(turns)])
+        spot = max(spots, key=lambda s: min((float(np.hypot(*(s - other))) for other in crowd), default=0.0))
+        crowd.append(spot)
+        axes.text(
+            spot[0], spot[1], str(j), fontsize=9, color=INK, ha="center", va="center", zorder=7, path_effects=_HALO
+        )  # fmt: skip
+
+
+def _map_waypoints(axes: Axes, mine: Sequence[Decision], scale: Normalize) -> None:
+    for source, marker in MARKERS.items():
+        asked = [(*d.position, d.rtt_ms) for d in mine if d.source == source and d.rtt_ms is not None]
+        x, y, trips = np.array(asked, dtype=float).reshape(-1, 3).T
+        axes.scatter(
+            x, y, c=trips, cmap="viridis", norm=scale, marker=marker,
             s=46, edgecolors="white", linewidths=0.5, zorder=3,
         )  # fmt: skip
-    axes.set_title(f"UAV {uav}")
-    axes.set_aspect("equal")
-    edge = scenario.lap_offset_m + scenario.lap_radius_m - scenario.area_m / 2
-    margin = max(0.0, edge) + 0.04 * scenario.area_m
-    axes.set_xlim(-margin, scenario.area_m + margin)
-    axes.set_ylim(-margin, scenario.area_m + margin)
-    axes.minorticks_off()
-    axes.locator_params(nbins=4)
-    return points
+    onboard = np.array([d.position for d in mine if d.rtt_ms is None]).reshape(-1, 2)
+    axes.scatter(
+        onboard[:, 0], onboard[:, 1], s=40, marker=MARKERS["onboard"], facecolors="none", edgecolors=RED,
+        linewidths=1.4, zorder=4,
+    )  # fmt: skip
 
 
 def latency_per_step(decisions: Sequence[Decision]) -> str:
-    """Round trip over the steps: the median of the fleet, the range from fastest to slowest, and each UAV's points."""
-    by_step: dict[int, list[float]] = defaultdict(list)
+    """Round trip over the steps, apart for each source: the median of the fleet, the range from fastest to slowest."""
+    trips: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for d in decisions:
         if d.rtt_ms is not None:
-            by_step[d.step].append(d.rtt_ms)
-    steps = sorted(by_step)
+            trips[d.source][d.step].append(d.rtt_ms)
     out: list[str] = []
     with _drawn("latency-steps", 3.0, (1, 1), out) as (axes,):
-        if steps:
+        for source in (name for name in SOURCES if name in trips):
+            by_step, colour = trips[source], SOURCES[source]
+            steps = sorted(by_step)
+            medians = [float(np.median(by_step[s])) for s in steps]
             low, high = [min(by_step[s]) for s in steps], [max(by_step[s]) for s in steps]
-            axes.fill_between(steps, low, high, color=BLUE, alpha=0.18, linewidth=0, label="fastest to slowest UAV")
+            axes.vlines(steps, low, high, color=colour, alpha=0.3, linewidth=5)
             axes.plot(
-                steps, [float(np.median(by_step[s])) for s in steps], color=BLUE, marker="o", ms=4, label="median"
+                steps, medians, color=colour, marker=MARKERS[source], ms=5, linestyle="", label=source, clip_on=False
             )
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.17), ncols=2)
+        if trips:
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.17), ncols=len(trips))
             axes.set_ylim(bottom=0)
         axes.set_xlabel("step")
         axes.set_ylabel("round trip (ms)")
@@ -201,7 +246,8 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> str
     out: list[str] = []
     with _drawn("losses", 6.0, (2, 2), out) as panels:
         for row, (title, measure) in enumerate(measures):
-            for (name, tally), (colour, dash, marker) in zip(tallies.items(), LINES, strict=False):
+            for name, tally in tallies.items():
+                colour, dash, marker = POLICIES.get(name, OTHER_POLICY)
                 values = np.array([measure(t) for t in tally], dtype=float)
                 for axes, series in ((panels[2 * row], values), (panels[2 * row + 1], values.cumsum())):
                     axes.plot(
@@ -236,8 +282,8 @@ def tokens_per_step(decisions: Sequence[Decision]) -> str:
             (panels[1], "state", "state_uncompressed", "state block"),
         ):
             for key, label, (colour, dash, marker) in (
-                (full, "every sensor", LINES[1]),
-                (sent, "as sent", LINES[0]),
+                (full, "every sensor", IN_FULL),
+                (sent, "as sent", AS_SENT),
             ):
                 means = [float(np.mean([getattr(t, key) for t in by_step[s]])) for s in steps]
                 axes.plot(steps, means, color=colour, linestyle=dash, marker=marker, markersize=3.5, label=label)
@@ -297,5 +343,5 @@ def deciders(decisions: Sequence[Decision]) -> str:
         _plain(axes)
         _integers(axes)
         if steps:
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=4)
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=len(SOURCES))
     return out[0]

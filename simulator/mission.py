@@ -73,7 +73,8 @@ class EdgePilot:
     """Asks an edge, and decides on board with EOF when it gives no usable answer: a UAV in the air must fly on.
 
     ``spec`` is the mission to make at the edge before the first decision; ``answered`` counts the edge's
-    decisions; ``last_error`` is the last reason for going without.
+    decisions; ``last_error`` is the last reason for going without. After a step in which the edge was out of
+    reach, the fleet waits until ``scout`` finds it ready, ``reconnect_s`` seconds in all per outage at most.
     """
 
     def __init__(
@@ -85,8 +86,15 @@ class EdgePilot:
         *,
         mode: Mode | None = None,
         deadline_ms: int | None = None,
+        scout: EdgeClient | None = None,
+        reconnect_s: float = 0.0,
+        on_wait: Callable[[str], None] | None = None,
     ) -> None:
         self._client = client
+        self._scout = scout or client
+        self._reconnect_s = self._patience_s = reconnect_s
+        self._on_wait = on_wait
+        self._step = 0
         self._mission_id = mission_id
         self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode)
         self._deadline_ms = deadline_ms
@@ -100,6 +108,10 @@ class EdgePilot:
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
         """The edge's choice, or EOF's with source ``onboard`` and the reason."""
+        step = int(observation["step"][0])
+        if step != self._step and self._lost and self._patience_s > 0:
+            self._await_edge()
+        self._step = step
         request = decide_request(
             uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._owed.get(uav)
         )
@@ -114,6 +126,17 @@ class EdgePilot:
         answer = exchange.response
         return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
+    def _await_edge(self) -> None:
+        # Without an edge a step takes microseconds, so the mission would be over before a restarted edge is up.
+        began = time.monotonic()
+        try:
+            self._scout.wait_ready(self._patience_s, on_wait=self._on_wait)
+            # A restarted edge must not make the mission anew from a request, with another spec.
+            self._scout.put_mission(self._mission_id, self.spec)
+        except EdgeError as error:
+            self.last_error = str(error)
+        self._patience_s -= time.monotonic() - began
+
     def _ask(self, request: DecideRequest) -> Exchange:
         try:
             # One attempt is enough to notice that a lost edge is back, and it delays the fleet least.
@@ -127,7 +150,7 @@ class EdgePilot:
                 raise
             self._client.put_mission(self._mission_id, self.spec)
             exchange = self._client.decide(request.model_copy(update={"outcome": None}))
-        self._lost = False
+        self._lost, self._patience_s = False, self._reconnect_s
         if exchange.response.velocity > self._max_velocity:
             raise EdgeProtocolError(
                 f"the edge chose {exchange.response.velocity} m/s, the limit is {self._max_velocity}"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -14,9 +15,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from shared.wire import Candidate, Tokens
 
+SUMMARY, DECISIONS, REPORT = "summary.json", "decisions.jsonl", "report.html"
 LATE_SLACK_MS = 50.0
+# Reasons with which the LLM was asked, and its answer or its silence not used.
+_ASKED_IN_VAIN = frozenset(
+    {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
+)
 
 DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
+
+
+class BadUse(Exception):
+    """What was asked for cannot be done; the text says what to ask for instead."""
 
 
 class Record(BaseModel):
@@ -57,7 +67,7 @@ class Decision(Record):
 
 
 class BySource(Record):
-    """Decisions, by who took them."""
+    """Decisions, by who took them; ``value`` is what the edge's modules learned, ``policy`` its LLM-free policy."""
 
     llm: int = 0
     guided: int = 0
@@ -65,14 +75,27 @@ class BySource(Record):
     policy: int = 0
     onboard: int = 0
 
+    def present(self) -> dict[str, int]:
+        """Those who took any, most decisions first."""
+        return dict(sorted(((k, n) for k, n in self.model_dump().items() if n), key=lambda item: -item[1]))
+
+
+def told_sources(by_source: BySource) -> str:
+    """Who decided, as people write it: ``87 llm, 3 policy``."""
+    return ", ".join(f"{count} {name}" for name, count in by_source.present().items()) or "none"
+
 
 class TokenSummary(Record):
-    """Means over the decisions that the edge took, ``null`` when it took none or did not say."""
+    """Means over the decisions that the edge took, ``null`` when it took none or did not say.
+
+    ``cached_pct`` is what the LLM server read from its prefix cache, of the prompt tokens that it counted itself.
+    """
 
     prompt_mean: float | None = None
     uncompressed_mean: float | None = None
     saved_pct: float | None = None
     cached_mean: float | None = None
+    cached_pct: float | None = None
     state_mean: float | None = None
     state_uncompressed_mean: float | None = None
     state_saved_pct: float | None = None
@@ -116,8 +139,8 @@ class Summary(Flown):
 
     ``lost_packets`` and ``loss_events`` are by policy: ``aic_vds`` (or the local policy that was flown), ``eof``
     and ``wqcs``, all over ``steps_flown`` steps of one world. ``late`` counts decisions whose round trip took more than
-    their deadline + 50 ms. ``jain`` is Jain's index of the sensors'
-    served visits, ``null`` when none was served; ``failures`` are failed transmissions.
+    their deadline + 50 ms. ``jain`` is Jain's index of the sensors' served visits, ``null`` when none was served;
+    ``failures`` are failed transmissions; ``llm_asked`` counts decisions for which the LLM was asked, in vain or not.
     """
 
     decisions: int
@@ -131,6 +154,7 @@ class Summary(Flown):
     rtt_ms: RoundTrips
     uplink_bytes_mean: float | None
     jain: float | None
+    llm_asked: int = 0
 
 
 class Tally(Protocol):
@@ -142,6 +166,38 @@ class Tally(Protocol):
     def overflows(self) -> int: ...
     @property
     def lost_packets(self) -> int: ...
+
+
+def refuse_old_result(out: Path, overwrite: bool) -> None:
+    """Raises ``BadUse`` when ``out`` is no folder, or holds a result that may not be overwritten."""
+    with naming_out(out):
+        if out.exists() and not out.is_dir():
+            raise BadUse(f"--out {out} is a file; name a folder")
+        held = (out / SUMMARY).exists()
+    if held and not overwrite:
+        raise BadUse(f"--out {out} holds a mission's result already; choose another folder or add --overwrite")
+
+
+def fresh_folder(out: Path) -> None:
+    """Make the folder, without the earlier summary and report, which would stand beside another mission's decisions.
+
+    Raises:
+        BadUse: it cannot be written.
+    """
+    with naming_out(out):
+        out.mkdir(parents=True, exist_ok=True)
+        for stale in (SUMMARY, REPORT):
+            (out / stale).unlink(missing_ok=True)
+
+
+@contextmanager
+def naming_out(out: Path) -> Iterator[None]:
+    """Within, an ``OSError`` becomes a ``BadUse`` that names the option to change."""
+    try:
+        yield
+    except OSError as error:
+        at = f" ({error.filename})" if error.filename and str(error.filename) != str(out) else ""
+        raise BadUse(f"--out {out}: {error.strerror or error}{at}") from None
 
 
 class DecisionLog:
@@ -230,7 +286,14 @@ def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str,
         rtt_ms=RoundTrips(p50=_percentile(trips, 50), p99=_percentile(trips, 99)),
         uplink_bytes_mean=_mean([d.request_bytes for d in from_edge]),
         jain=jain_index(visits_per_sensor(decisions, flown.sensors)),
+        llm_asked=sum(_asked_llm(d) for d in decisions),
     )
+
+
+def _asked_llm(decision: Decision) -> bool:
+    if decision.source in ("llm", "guided") or decision.reason in _ASKED_IN_VAIN:
+        return True
+    return decision.tokens is not None and decision.tokens.server_prompt is not None
 
 
 def _is_late(decision: Decision) -> bool:
@@ -247,6 +310,7 @@ def _tokens(counts: list[Tokens]) -> TokenSummary:
         uncompressed_mean=uncompressed,
         saved_pct=_saved_pct(prompt, uncompressed),
         cached_mean=_mean([t.cached for t in counts if t.cached is not None]),
+        cached_pct=_cached_pct(counts),
         state_mean=state,
         state_uncompressed_mean=state_uncompressed,
         state_saved_pct=_saved_pct(state, state_uncompressed),
@@ -255,6 +319,11 @@ def _tokens(counts: list[Tokens]) -> TokenSummary:
 
 def _mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None
+
+
+def _cached_pct(counts: list[Tokens]) -> float | None:
+    told = [(t.cached, t.server_prompt) for t in counts if t.cached is not None and t.server_prompt]
+    return 100 * sum(cached for cached, _ in told) / sum(prompt for _, prompt in told) if told else None
 
 
 def _saved_pct(kept: float | None, whole: float | None) -> float | None:

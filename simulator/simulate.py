@@ -6,6 +6,7 @@ import os
 import shlex
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,29 +19,37 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, arg
 
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient, EdgeError, edge_url
-from simulator.record import DecisionLog, Summary, summarise
+from simulator.record import (
+    DECISIONS,
+    REPORT,
+    SUMMARY,
+    BadUse,
+    BySource,
+    DecisionLog,
+    fresh_folder,
+    naming_out,
+    refuse_old_result,
+    summarise,
+    told_sources,
+)
 from simulator.uplink import LossyTransport
 
 # The world and matplotlib take a second to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
     from simulator.mission import Choice, Flight, Pilot
 
-SUMMARY, DECISIONS, REPORT = "summary.json", "decisions.jsonl", "report.html"
 API_KEY = "AICVDS_API_KEY"
 # Without a deadline of our own the edge's applies, and it may be as long as the paper's step.
 DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
+# A poll that nobody answers must not outlast the pause that it is part of by much.
+SCOUT_TIMEOUT_S = 2.0
 INTERRUPTED = 130
-
-
-class BadUse(Exception):
-    """What was asked for cannot be done; the text says what to ask for instead."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +70,15 @@ class Simulate:
 
       aicvds simulate --policy eof
 
+    An edge lost on the way: the UAVs decide on board with EOF, and before the next step wait up to --reconnect-s
+    seconds for the edge to come back. Steps are not real time, so without a pause the mission would be over first.
+
     Ctrl-C stops the flight and still writes the report of what was flown. An edge that wants a key gets
     the one in the environment variable AICVDS_API_KEY. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
     """
 
     edge: Annotated[str | None, arg(metavar="URL")] = None
-    """The edge's address, such as http://127.0.0.1:8000. Needed unless --policy is a local one."""
+    """The edge's address, such as http://127.0.0.1:8000. Needed, unless --policy is a local one: that asks no edge."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
     """The world: paper (10 sensors, 3 UAVs, 30 steps), pipeline (sensors in a line), stress (weak link),
     dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost)."""
@@ -83,6 +95,8 @@ class Simulate:
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
     """Seconds to wait for the edge and its LLM. One still loading its LLM then decides without it."""
+    reconnect_s: Annotated[float, arg(metavar="S")] = 10.0
+    """Seconds, in all per outage, to wait in the air for a lost edge and its LLM, 0 to 3600; 0 never waits."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to write to, made if missing. Default: runs/ and the mission's ID, such as runs/paper-0-1f6c09ab."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
@@ -103,9 +117,8 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     """Fly, write, print; returns the exit code.
 
     Raises:
-        BadUse: the options make no mission.
+        BadUse: the options make no mission, or the folder cannot be written.
         EdgeError: no edge answers as one.
-        OSError: the folder cannot be written.
     """
     scenario = chosen_scenario(options.scenario, options.steps)
     check(options)
@@ -123,6 +136,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         mode=options.mode,
         deadline_ms=options.deadline_ms,
         wait_s=options.wait_s,
+        reconnect_s=options.reconnect_s,
     )
     refuse_old_result(job.out, options.overwrite)
     return conduct(job, console)
@@ -147,7 +161,11 @@ def check(options: Simulate) -> None:
         raise BadUse(f"--policy {options.policy}: choose one of edge, {', '.join(POLICY_NAMES)}")
     if options.deadline_ms is not None and not 10 <= options.deadline_ms <= 60_000:
         raise BadUse(f"--deadline-ms {options.deadline_ms} is not between 10 and 60000")
+    if not 0 <= options.reconnect_s <= 3600:
+        raise BadUse(f"--reconnect-s {options.reconnect_s:g} is not between 0 and 3600")
     if options.policy != "edge":
+        if options.edge is not None:
+            raise BadUse(f"--policy {options.policy} asks no edge, so --edge contradicts it; give one of the two")
         return
     if options.edge is None:
         raise BadUse("--edge is missing: give the edge's address, such as --edge http://127.0.0.1:8000")
@@ -165,20 +183,6 @@ def check_bounds(seed: int, wait_s: float) -> None:
         raise BadUse(f"--wait-s {wait_s:g} is not between 0 and 86400")
 
 
-def refuse_old_result(out: Path, overwrite: bool) -> None:
-    """Raises ``BadUse`` when ``out`` is no folder, or holds a result that may not be overwritten."""
-    if out.exists() and not out.is_dir():
-        raise BadUse(f"--out {out} is a file; name a folder")
-    if not overwrite and (out / SUMMARY).exists():
-        raise BadUse(f"--out {out} holds a mission's result already; choose another folder or add --overwrite")
-
-
-def remove_old_result(out: Path) -> None:
-    """Remove an earlier summary and report, which would else stand beside another mission's decisions."""
-    for stale in (SUMMARY, REPORT):
-        (out / stale).unlink(missing_ok=True)
-
-
 @dataclass(frozen=True)
 class Job:
     """One mission to conduct. ``policy`` is ``edge`` or a local policy's name; ``edge`` is ``None`` for those."""
@@ -193,6 +197,7 @@ class Job:
     mode: Mode | None = None
     deadline_ms: int | None = None
     wait_s: float = 120.0
+    reconnect_s: float = 0.0
 
 
 def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None) -> int:
@@ -201,19 +206,23 @@ def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None
     ``alive`` is called while waiting and raises if there is nothing to wait for.
 
     Raises:
+        BadUse: the folder cannot be written.
         EdgeError: no edge answers as one, before take-off.
-        OSError: the folder cannot be written.
     """
     from simulator.mission import EdgePilot, LocalPilot
 
     if job.edge is None:
         flight = _fly(job, LocalPilot(job.policy, job.scenario, job.seed), console)
         return _conclude(job, flight, None, None, console)
-    with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio:
+    with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _scout(job.edge) as scout:
         model = _wait(ground, job, console, alive)
-        pilot = EdgePilot(radio, job.mission_id, job.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms)
+        news = _News()
+        pilot = EdgePilot(
+            radio, job.mission_id, job.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
+            scout=scout, reconnect_s=job.reconnect_s, on_wait=news.waiting,
+        )  # fmt: skip
         mode = ground.put_mission(job.mission_id, pilot.spec).mode
-        flight = _fly(job, pilot, console)
+        flight = _fly(job, pilot, console, news)
     code = _conclude(job, flight, mode, model, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
@@ -238,6 +247,10 @@ def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
     return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport)
 
 
+def _scout(edge: str) -> EdgeClient:
+    return EdgeClient(edge, timeout_s=SCOUT_TIMEOUT_S, attempts=1, api_key=os.environ.get(API_KEY) or None)
+
+
 def _wait(ground: EdgeClient, job: Job, console: Console, alive: Callable[[], None]) -> str | None:
     with console.status(f"Waiting for the edge at {ground.base_url}") as status:
 
@@ -249,39 +262,69 @@ def _wait(ground: EdgeClient, job: Job, console: Console, alive: Callable[[], No
         alive()
     if readiness.llm == "ready":
         console.print(f"The edge is ready; its LLM is {escape(readiness.model or 'unnamed')}.")
+    elif readiness.llm == "off":
+        console.print("The edge is ready, without an LLM.")
     else:
         detail = f" ({readiness.detail})" if readiness.detail else ""
         console.print(f"The edge is ready; its LLM is {readiness.llm}{escape(detail)}, so its policy decides.")
     return readiness.model
 
 
-def _fly(job: Job, pilot: Pilot, console: Console) -> Flight:
+class _News:
+    """What the progress line says: the packets lost and the deciders so far, and what is being waited for."""
+
+    def __init__(self) -> None:
+        self._update: Callable[[str], None] = lambda text: None
+        self._lost = 0
+        self._sources: Counter[str] = Counter()
+
+    def tell(self, update: Callable[[str], None]) -> None:
+        """Say it with ``update`` from now on."""
+        self._update = update
+
+    def waiting(self, cause: str) -> None:
+        """The edge is lost, and the fleet waits for it."""
+        self._update(f"waiting for the edge: {escape(cause)}")
+
+    def decided(self, choice: Choice) -> None:
+        """One UAV knows where to go."""
+        self._sources[choice.source] += 1
+        trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
+        self._update(f"{self._lost} lost; {choice.source} decides{trip}")
+
+    def stepped(self, flight: Flight) -> None:
+        """The whole fleet has flown a step."""
+        self._lost += flight.tally[-1].lost_packets
+        self._update(f"{self._lost} lost; {told_sources(BySource(**self._sources))}")
+
+
+def _fly(job: Job, pilot: Pilot, console: Console, news: _News | None = None) -> Flight:
     from simulator.mission import fly
 
-    job.out.mkdir(parents=True, exist_ok=True)
-    remove_old_result(job.out)
+    news = news or _News()
+    fresh_folder(job.out)
+    with naming_out(job.out):
+        log = DecisionLog(job.out / DECISIONS)
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
+        BarColumn(bar_width=12),
         MofNCompleteColumn(),
         TextColumn("steps"),
         TextColumn("{task.fields[news]}"),
         TimeElapsedColumn(),
     )
-    with DecisionLog(job.out / DECISIONS) as log, Progress(*columns, console=console) as progress:
+    with log, Progress(*columns, console=console) as progress:
         task = progress.add_task("Flying", total=job.scenario.steps, news="")
-        lost = 0
-
-        def decided(choice: Choice) -> None:
-            trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
-            progress.update(task, news=f"{lost} packets lost, {choice.source} decides{trip}")
+        news.tell(lambda text: progress.update(task, news=text))
 
         def stepped(flight: Flight) -> None:
-            nonlocal lost
-            lost += flight.tally[-1].lost_packets
-            progress.update(task, advance=1, news=f"{lost} packets lost, {flight.decisions[-1].source} decides")
+            progress.advance(task)
+            news.stepped(flight)
 
-        return fly(job.scenario, pilot, job.seed, log, decided, stepped)
+        flight = fly(job.scenario, pilot, job.seed, log, news.decided, stepped)
+    if flight.interrupted:
+        console.print(f"interrupted after {flight.steps_flown} steps; writing what was flown", highlight=False)
+    return flight
 
 
 def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, console: Console) -> int:
@@ -300,40 +343,15 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
         command=job.command,
     )
     summary = summarise(facts, flight.decisions, tallies)
-    (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    with console.status("Drawing the report"):
-        from simulator.report import write_report
+    with console.status("Drawing the report"), naming_out(job.out):
+        (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        from simulator.report import show, write_report
 
         write_report(job.out / REPORT, summary, job.scenario, flight.decisions, tallies, flight.sensor_xy)
-    show(summary, job.out, console)
-    return INTERRUPTED if flight.interrupted else 0
-
-
-def show(summary: Summary, out: Path, console: Console) -> None:
-    """Print the outcome beside EOF and WQCS, who decided, and where it is written."""
-    from simulator.report import policy_label
-
-    steps = f"{summary.steps_flown} of {summary.steps} steps" if summary.interrupted else f"{summary.steps} steps"
-    table = Table(title=f"Scenario {summary.scenario}, seed {summary.seed}, {steps}")
-    table.add_column("policy")
-    table.add_column("lost packets", justify="right")
-    table.add_column("loss events", justify="right")
-    for name, lost in summary.lost_packets.items():
-        table.add_row(policy_label(name), f"{lost:,}", f"{summary.loss_events[name]:,}")
-    console.print(table)
-    sources = ", ".join(f"{count} {name}" for name, count in summary.by_source.model_dump().items() if count)
-    console.print(f"{summary.decisions} decisions: {sources or 'none'}")
-    if summary.rtt_ms.p50 is not None:
-        console.print(f"Round trip: median {summary.rtt_ms.p50:.0f} ms, 99th percentile {summary.rtt_ms.p99:.0f} ms")
-    if summary.tokens.prompt_mean is not None:
-        console.print(
-            f"Prompt: {summary.tokens.prompt_mean:.0f} tokens a decision, "
-            f"{summary.tokens.uncompressed_mean:.0f} with every sensor; "
-            f"the state block {summary.tokens.state_mean:.0f} of {summary.tokens.state_uncompressed_mean:.0f} "
-            f"({summary.tokens.state_saved_pct:.0f} % saved)"
-        )
+    show(summary, console)
     for name in (SUMMARY, DECISIONS, REPORT):
-        console.print(f"Wrote {out / name}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)
+    return INTERRUPTED if flight.interrupted else 0
 
 
 def reporting(prog: str, run: Callable[[Console], int]) -> int:

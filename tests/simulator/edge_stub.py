@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import threading
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
@@ -78,6 +82,7 @@ class EdgeStub:
             uncompressed=290 + 10 * asked.step,
             saved=50,
             cached=200,
+            server_prompt=250,
         )
         return DecideResponse(
             decision_id=uuid.uuid4().hex,
@@ -175,3 +180,28 @@ def stub_edge() -> Iterator[EdgeStub]:
     with serving(stub.app()) as url:
         stub.url = url
         yield stub
+
+
+def free_port() -> int:
+    """A port of the loopback that nobody listened on just now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def stub_edge_at(port: int) -> Iterator[EdgeStub]:
+    """A new stub, that knows no mission, on a port that another had before."""
+    stub = EdgeStub(url=f"http://127.0.0.1:{port}")
+    server = uvicorn.Server(uvicorn.Config(stub.app(), host="127.0.0.1", port=port, log_level="warning"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        if not thread.is_alive():
+            raise RuntimeError(f"the stub did not start on port {port}")
+        time.sleep(0.01)
+    try:
+        yield stub
+    finally:
+        server.should_exit = True
+        thread.join(timeout=30)

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,7 @@ from simulator.policies import policy_named
 from simulator.record import DecisionLog, Flown, Summary, read_decisions, summarise
 from simulator.rollout import rollout
 from simulator.world import PipelineWorld
-from tests.simulator.edge_stub import EdgeStub, stub_edge
+from tests.simulator.edge_stub import EdgeStub, free_port, stub_edge, stub_edge_at
 
 SHORT = Scenario(steps=4)
 
@@ -89,6 +92,34 @@ def test_an_edge_that_restarted_gets_the_mission_again(stub: EdgeStub, client: E
     assert stub.missions["m-7"].scenario == SHORT and stub.missions["m-7"].seed == 9
 
 
+def test_an_edge_that_comes_back_in_time_rejoins() -> None:
+    port = free_port()
+    with ExitStack() as first, ExitStack() as second, EdgeClient(f"http://127.0.0.1:{port}", timeout_s=5) as client:
+        first.enter_context(stub_edge_at(port))
+        again: list[EdgeStub] = []
+        waits: list[str] = []
+        back = threading.Timer(1.0, lambda: again.append(second.enter_context(stub_edge_at(port))))
+
+        def goes_away(flight: Flight) -> None:
+            if flight.steps_flown == 1:
+                first.close()
+                back.start()
+
+        pilot = EdgePilot(client, "m", SHORT, seed=9, reconnect_s=20, on_wait=waits.append)
+        flight = fly(SHORT, pilot, 9, on_step=goes_away)
+        back.join()
+        assert [d.source == "onboard" for d in flight.decisions] == [False] * 3 + [True] * 3 + [False] * 6
+        assert waits and again[0].missions["m"] == pilot.spec
+
+
+def test_an_edge_that_stays_away_costs_one_pause() -> None:
+    with EdgeClient(f"http://127.0.0.1:{free_port()}", timeout_s=1, attempts=1) as nobody:
+        began = time.monotonic()
+        flight = fly(SHORT, EdgePilot(nobody, "m", SHORT, seed=0, reconnect_s=0.7), seed=0)
+    assert 0.7 <= time.monotonic() - began < 3
+    assert {d.source for d in flight.decisions} == {"onboard"} and flight.steps_flown == 4
+
+
 def test_an_interrupt_keeps_the_whole_steps(stub: EdgeStub, client: EdgeClient, tmp_path: Path) -> None:
     def interrupt(choice: Choice) -> None:
         if stub.asked == 8:
@@ -113,19 +144,20 @@ def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient) -> None:
         *("scenario", "seed", "steps", "uavs", "sensors", "decisions", "by_source", "lost_packets", "loss_events"),
         *("tokens", "rtt_ms", "uplink_bytes_mean", "jain"),
         *("by_reason", "late", "failures", "model", "edge", "mission_id", "mode", "interrupted", "steps_flown"),
-        *("started_at", "duration_s", "version", "policy", "deadline_ms", "command"),
+        *("started_at", "duration_s", "version", "policy", "deadline_ms", "command", "llm_asked"),
     }
-    assert set(told["by_source"]) == {"llm", "guided", "policy", "onboard"}
+    assert set(told["by_source"]) == {"llm", "guided", "value", "policy", "onboard"}
     assert set(told["lost_packets"]) == set(told["loss_events"]) == {"aic_vds", *BASELINES}
     assert set(told["rtt_ms"]) == {"p50", "p99"}
-    assert told["by_source"] == {"llm": 9, "guided": 0, "policy": 3, "onboard": 0}
+    assert told["by_source"] == {"llm": 9, "guided": 0, "value": 0, "policy": 3, "onboard": 0}
     assert told["by_reason"] == {"llm_timeout": 3}
-    assert told["late"] >= 1 and told["model"] == "stub-1"
+    assert told["late"] >= 1 and told["llm_asked"] == 12 and told["model"] == "stub-1"
     assert told["tokens"] == {
         "prompt_mean": 255.0,
         "uncompressed_mean": 305.0,
         "saved_pct": pytest.approx(100 * 50 / 305),
         "cached_mean": 200.0,
+        "cached_pct": 80.0,
         "state_mean": 40.0,
         "state_uncompressed_mean": 90.0,
         "state_saved_pct": pytest.approx(100 * 50 / 90),

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from shared.scenario import SCENARIOS, Scenario
+from simulator import figures
 from simulator.mission import Flight, LocalPilot, baselines, fly
 from simulator.record import Decision, DecisionLog, Summary, jain_index, read_decisions, summarise, visits_per_sensor
-from simulator.report import number, render_report, write_report
+from simulator.report import costliest, llm_notice, number, policy_labels, render_report, verdict, write_report
 
 SHORT = Scenario(steps=5)
 EVIL = '<script>alert("$x$")</script>&amp;'
-SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "provenance")
+SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "glossary", "provenance")
 
 
 def decision(**changes: object) -> Decision:
@@ -73,6 +74,64 @@ def test_every_section_is_there(flight: Flight) -> None:
     assert Page(html).tags.count("svg") == 6
     for words in ("AIC-VDS", "EOF", "WQCS", "Jain", "aicvds simulate", "stub-1", "seed 0"):
         assert words in html
+
+
+def test_the_row_says_who_decided(flight: Flight) -> None:
+    summary = summary_of(flight, None)
+    assert policy_labels(summary)["aic_vds"] == "AIC-VDS (8 onboard, 7 llm)"
+    notice = llm_notice(summary)
+    assert notice is not None and "The LLM took 7 of 15 decisions" in notice and "policy_eof 15" in notice
+    html = page(flight)
+    assert "AIC-VDS (8 onboard, 7 llm)" in html and "this is not a result of the LLM" in html
+    assert "guided" not in html and "<td>value</td>" not in html
+    by_llm = summary.by_source.model_copy(update={"llm": 14, "onboard": 1})
+    assert llm_notice(summary.model_copy(update={"by_source": by_llm})) is None
+    assert llm_notice(summary.model_copy(update={"mode": "value"})) is None
+
+
+def test_learned_values_are_told_and_cost_no_tokens(flight: Flight) -> None:
+    learned = Flight(flight.scenario, 0, tally=flight.tally, sensor_xy=flight.sensor_xy)
+    learned.decisions = [
+        d.model_copy(update={"source": "value", "reason": "mode_value", "rtt_ms": 3.0}) for d in flight.decisions
+    ]
+    html = page(learned)
+    assert "value: what the edge&#39;s modules learned" in html or "value: what the edge's modules learned" in html
+    assert "<td>value</td><td>15</td>" in html and '<section id="tokens">' not in html
+
+
+def test_a_local_policys_page_has_nothing_of_an_edge() -> None:
+    flown = fly(SHORT, LocalPilot("eof", SHORT, 0), seed=0)
+    facts = flown.facts(
+        policy="eof", edge=None, mission_id="m", mode=None, model=None, deadline_ms=None, command="c"
+    )  # fmt: skip
+    tallies = {"eof": flown.tally}
+    html = render_report(
+        summarise(facts, flown.decisions, tallies), SHORT, flown.decisions, tallies, flown.sensor_xy
+    )  # fmt: skip
+    for absent in ("latency", "tokens", "deciders"):
+        assert f'<section id="{absent}">' not in html
+    assert "round trip" not in html and "<dt>edge</dt>" not in html and "135 million" not in html
+    assert Page(html).tags.count("svg") == 2
+
+
+def test_a_policy_has_one_colour_on_every_page(flight: Flight) -> None:
+    alone = figures.losses({"eof": flight.tally}, {})
+    assert figures.POLICIES["eof"][0].lower() in alone and figures.POLICIES["aic_vds"][0].lower() not in alone
+
+
+def test_the_verdict_ranks(flight: Flight) -> None:
+    summary = summary_of(flight, None)
+    for lost, rank in ((1, "the fewest"), (2, "as many as the best"), (3, "neither"), (4, "neither"), (5, "the most")):
+        told = verdict(summary.model_copy(update={"lost_packets": {"aic_vds": lost, "eof": 2, "wqcs": 4}}))
+        assert rank in told and told.count(".") == 1
+    assert "the same" in verdict(summary.model_copy(update={"lost_packets": {"eof": 2, "wqcs": 2}}))
+    assert "Nothing was flown" in verdict(summary.model_copy(update={"steps_flown": 0}))
+
+
+def test_the_costliest_decisions_come_first() -> None:
+    flown = [decision(step=n, cost=float(n % 7)) for n in range(30)]
+    shown = costliest(flown)
+    assert len(shown) == 15 and [d.step for d in shown[:4]] == [6, 13, 20, 27]
 
 
 def test_the_page_needs_nothing_but_itself(flight: Flight) -> None:

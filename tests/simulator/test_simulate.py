@@ -40,6 +40,9 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
     assert stub.missions[summary.mission_id].seed == 4
     assert {d.deadline_ms for d in stub.decides} == {900}
     printed = capsys.readouterr().out
+    assert "AIC-VDS (6 llm, 3 policy)" in printed
+    assert "The LLM took 6 of 9 decisions" in printed and "llm_timeout 3" in printed
+    assert "80 % read from" in printed and "lost; 6 llm, 3 policy" in printed
     for words in ("AIC-VDS", "EOF", "WQCS", "summary.json", "report.html"):
         assert words in printed
 
@@ -70,8 +73,10 @@ def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
         (["--edge", "http://e", "--policy", "magic"], "--policy magic"),
         (["--edge", "http://e", "--deadline-ms", "5"], "--deadline-ms 5"),
         (["--edge", "http://e", "--wait-s", "nan"], "--wait-s nan"),
+        (["--edge", "http://e", "--reconnect-s", "-1"], "--reconnect-s -1"),
+        (["--edge", "http://e", "--policy", "eof"], "--policy eof asks no edge"),
         (["--edge", "http://e", "--out", __file__], "is a file"),
-        (["--policy", "eof", "--out", f"{__file__}/below"], "Not a directory"),
+        (["--policy", "eof", "--out", f"{__file__}/below"], f"--out {__file__}/below: Not a directory"),
     ],
 )
 def test_bad_use_is_one_line_and_code_2(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,17 +111,19 @@ def test_an_edge_that_never_decides_is_code_1(
 def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
     stub.otherwise, stub.slow_s = "slow", 0.1
     arguments = ["simulate", "--edge", stub.url, "--out", str(tmp_path)]
-    process = subprocess.Popen([sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.PIPE, text=True)
     try:
         give_up = time.monotonic() + 60
         while stub.asked < 8 and time.monotonic() < give_up:
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 130
+        printed, _ = process.communicate(timeout=60)
+        assert process.returncode == 130
     finally:
         process.kill()
         process.wait()
     summary = summary_in(tmp_path)
+    assert f"interrupted after {summary.steps_flown} steps; writing what was flown" in printed
     assert summary.interrupted and 2 <= summary.steps_flown < 30
     assert summary.decisions == 3 * summary.steps_flown == len(read_decisions(tmp_path / "decisions.jsonl"))
     assert f"interrupted after step {summary.steps_flown} of 30" in (tmp_path / "report.html").read_text("utf-8")
@@ -136,7 +143,8 @@ def test_the_demo_serves_flies_and_stops(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "summary.json").write_text("{}", encoding="utf-8")
     assert demo.main(["--out", str(tmp_path), "--seed", "1"]) == 0
     summary = summary_in(tmp_path)
-    assert summary.decisions == 90 and summary.mode == "value" and summary.by_source.policy == 90
+    assert summary.decisions == 90 and summary.mode == "value"
+    assert summary.by_source.value > 80 and summary.by_source.value + summary.by_source.policy == 90
     assert "Finished server process" in (tmp_path / "edge.log").read_text("utf-8")
     assert summary.edge is not None
     port = int(summary.edge.rsplit(":", 1)[1])
