@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+import threading
 import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
@@ -85,7 +86,7 @@ class Engine:
         self._counter = counter
         self._metrics = metrics
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
-        self._lessons = 0
+        self._room = threading.Semaphore(_MAX_LESSONS)
         self._waiting: set[asyncio.Timeout] = set()
         self._closing = False
         self.missions = Missions(settings, metrics)
@@ -130,10 +131,6 @@ class Engine:
         """Apply an outcome once; raises ``NotFound`` for an unknown mission or decision."""
         mission = self.missions.get(request.mission_id)
         return FeedbackResponse(decision_id=request.decision_id, result=self._apply(mission, request))
-
-    async def learned(self) -> None:
-        """Wait until every outcome applied so far has been learned from."""
-        await asyncio.wrap_future(self._learning.submit(lambda: None))
 
     async def _decide(
         self, mission: Mission, uav: UavState, step: int, deadline_ms: int, watch: Stopwatch
@@ -217,11 +214,10 @@ class Engine:
         if mission.find(outcome.decision_id) == "pending":
             result = "applied"
             sample = mission.apply(outcome)
-            if sample is not None and self._lessons >= _MAX_LESSONS:
-                log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
-            elif sample is not None:
-                self._lessons += 1
+            if sample is not None and self._room.acquire(blocking=False):
                 self._learning.submit(self._learn, mission, sample, outcome.cost)
+            elif sample is not None:
+                log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
         self._metrics.feedback.labels(result).inc()
         return result
 
@@ -231,7 +227,7 @@ class Engine:
         except Exception:
             log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
         finally:
-            self._lessons -= 1
+            self._room.release()
 
     def _count(self, prompt: Prompt) -> Tokens:
         static = self._counter.count_repeated(prompt.static)

@@ -280,3 +280,19 @@ def test_operation(edge: Edge) -> None:
     assert client.get("/").json()["docs"] == "/docs"
     assert client.get("/nowhere").headers["content-type"] == "application/problem+json"
     assert client.get("/decide").status_code == 405
+
+
+def test_the_modules_learn_from_feedback(edge: Edge, report: Report) -> None:
+    client, outcome = edge(), None
+    scores = []
+    for step in range(12):
+        answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
+        outcome = {"decision_id": answer["decision_id"], "cost": 2.0}
+        scores.append(answer["top_k"][0]["score"])
+    for _ in range(100):
+        status = client.get("/missions/test").json()
+        if status["learner_updates"] == 11:
+            break
+    assert status["learner_updates"] == status["feedback"] == 11
+    assert status["learner_loss"] > 0
+    assert "aicvds_learner_loss 0.0" not in client.get("/metrics").text
