@@ -105,7 +105,7 @@ class Engine:
     async def decide(self, request: DecideRequest) -> DecideResponse:
         """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input."""
         watch = Stopwatch()
-        mission = self.missions.checked(request.mission_id, [request])
+        mission = self.missions.checked(request)
         if request.outcome is not None:
             self._apply(mission, request.outcome)
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
@@ -116,7 +116,7 @@ class Engine:
         watch = Stopwatch()
         total_ms = request.deadline_ms or self._settings.deadline_ms
         answers: list[DecideResponse] = []
-        mission = self.missions.checked(request.mission_id, request.uavs)
+        mission = self.missions.checked(request)
         # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
         for outcome in (uav.outcome for uav in request.uavs if uav.outcome is not None):
             self._apply(mission, outcome)

@@ -92,22 +92,28 @@ class Mission:
         rates: FloatArray = self._arrivals / self._exposure
         return rates
 
-    def check(self, uav: UavState) -> None:
+    def check(self, uav: UavState, step: int, at: str = "") -> None:
         """Refuse, before anything is recorded, what this mission's world does not have.
 
+        Args:
+            at: where in the request's body this UAV stands, such as ``uavs[1].``.
+
         Raises:
-            Refused: an unknown UAV or sensor, or a queue past its capacity.
+            Refused: an unknown UAV or sensor, a queue past its capacity, or a beacon later than the step.
             NotFound: an outcome of a decision that this mission does not know.
         """
         if uav.uav_id >= self.scenario.uavs:
-            raise Refused("uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
+            raise Refused(f"{at}uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
         if (highest := max(uav.sensors.id)) >= self.scenario.sensors:
-            raise Refused("sensors.id", f"sensor {highest} is unknown: there are {self.scenario.sensors}, from 0")
+            raise Refused(f"{at}sensors.id", f"sensor {highest} is unknown: there are {self.scenario.sensors}, from 0")
         fullest = max((q for q in uav.sensors.queue if q is not None), default=0.0)
         if fullest > self.scenario.queue_capacity:
-            raise Refused("sensors.queue", f"{fullest:g} packets exceed the capacity of {self.scenario.queue_capacity}")
+            limit = self.scenario.queue_capacity
+            raise Refused(f"{at}sensors.queue", f"{fullest:g} packets exceed the capacity of {limit}")
+        if (latest := max((s for s in uav.sensors.last_seen if s is not None), default=0)) > step:
+            raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if uav.outcome is not None:
-            self.find(uav.outcome.decision_id, "outcome.decision_id")
+            self.find(uav.outcome.decision_id, f"{at}outcome.decision_id")
 
     def find(self, decision_id: str, field: str = "decision_id") -> Literal["pending", "applied"]:
         """Where a decision stands; raises :class:`NotFound` for one that this mission does not know."""

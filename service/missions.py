@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from service.metrics import Metrics
 from service.mission import Mission
 from service.problems import Conflict, NotFound
 from service.settings import Settings
-from shared.wire import MissionSpec, UavState
+from shared.wire import BatchRequest, DecideRequest, MissionSpec
 
 
 class Missions:
@@ -26,15 +24,19 @@ class Missions:
         except KeyError:
             raise NotFound("mission_id", f"there is no mission {mission_id}") from None
 
-    def checked(self, mission_id: str, uavs: Sequence[UavState]) -> Mission:
+    def checked(self, request: DecideRequest | BatchRequest) -> Mission:
         """The mission for a request that fits it; one with scenario ``paper`` is made on first use.
 
         Raises:
             Refused: a UAV's report does not fit the mission's world; nothing was recorded.
         """
+        mission_id = request.mission_id
         mission = self._missions.get(mission_id) or Mission(mission_id, MissionSpec(), self._settings)
-        for uav in uavs:
-            mission.check(uav)
+        if isinstance(request, DecideRequest):
+            mission.check(request, request.step)
+        else:
+            for index, uav in enumerate(request.uavs):
+                mission.check(uav, request.step, f"uavs[{index}].")
         self._add(mission)
         return mission
 

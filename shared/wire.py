@@ -118,11 +118,6 @@ class DecideRequest(UavState):
     step: Step
     deadline_ms: DeadlineMs | None = None
 
-    @model_validator(mode="after")
-    def _no_beacon_from_the_future(self) -> Self:
-        _check_beacons(self.sensors, self.step)
-        return self
-
 
 class BatchRequest(Wire):
     """``POST /decide/batch``: a fleet's UAVs at one step, decided in the order given."""
@@ -137,15 +132,7 @@ class BatchRequest(Wire):
         ids = [uav.uav_id for uav in self.uavs]
         if len(set(ids)) != len(ids):
             raise ValueError("uavs: a UAV appears more than once")
-        for uav in self.uavs:
-            _check_beacons(uav.sensors, self.step)
         return self
-
-
-def _check_beacons(sensors: SensorColumns, step: int) -> None:
-    late = [s for s in sensors.last_seen if s is not None and s > step]
-    if late:
-        raise ValueError(f"sensors.last_seen has step {late[0]}, later than this step {step}")
 
 
 class Candidate(Wire):

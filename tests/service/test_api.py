@@ -80,6 +80,16 @@ def test_uavs_that_report_nothing_but_one_sensor_still_get_different_ones(edge: 
     assert len(set(given)) == 3
 
 
+@pytest.mark.parametrize(("column", "value"), [("id", 77), ("queue", 61), ("last_seen", 1)])
+def test_a_batch_names_the_uav_at_fault(edge: Edge, report: Report, column: str, value: int) -> None:
+    client = edge()
+    uavs = [{k: report()[k] for k in ("position", "sensors")} | {"uav_id": uav} for uav in range(2)]
+    uavs[1]["sensors"][column][0] = value
+    response = client.post("/decide/batch", json={"mission_id": "test", "step": 0, "uavs": uavs})
+    assert (response.status_code, fields(response)) == (422, [f"uavs[1].sensors.{column}"])
+    assert client.get("/missions/test").status_code == 404
+
+
 def test_a_batch_uses_every_outcome_before_it_decides(edge: Edge, report: Report) -> None:
     """Also those of decisions so old that the batch itself would make the mission forget them."""
     client = edge()
@@ -143,7 +153,7 @@ BAD: list[tuple[str, Callable[[Body], Any], str]] = [
     ("queue past its capacity", lambda b: b["sensors"]["queue"].__setitem__(0, 61), "sensors.queue"),
     ("string for a number", lambda b: b["sensors"]["queue"].__setitem__(0, "5"), "sensors.queue[0]"),
     ("half a beacon", lambda b: b["sensors"]["queue"].__setitem__(0, None), "sensors"),
-    ("beacon from the future", lambda b: b["sensors"]["last_seen"].__setitem__(0, 1), "body"),
+    ("beacon from the future", lambda b: b["sensors"]["last_seen"].__setitem__(0, 1), "sensors.last_seen"),
     ("true for a step", lambda b: b.update(step=True), "step"),
     ("three coordinates", lambda b: b.update(position=[1.0, 2.0, 3.0]), "position"),
     ("unknown field", lambda b: b.update(velocity=3), "velocity"),
