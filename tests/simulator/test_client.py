@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Iterator
 
 import httpx
@@ -204,12 +203,10 @@ def test_a_lossy_uplink_loses_the_same_requests_again() -> None:
 
 def test_a_lossy_uplink_is_retried(stub: EdgeStub, request_: DecideRequest) -> None:
     transport = LossyTransport(httpx.HTTPTransport(), drop=0.5, jitter_ms=5, seed=0)
-    began = time.perf_counter()
     with EdgeClient(stub.url, timeout_s=5, attempts=12, transport=transport) as edge:
         attempts = [edge.decide(request_).attempts for _ in range(6)]
     assert max(attempts) > 1
     assert stub.asked == 6
-    assert time.perf_counter() - began < 60
 
 
 def test_a_lossy_uplink_has_bounds() -> None:
