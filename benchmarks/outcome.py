@@ -21,15 +21,31 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from shared.scenario import scenario_named
+from shared.scenario import Scenario, scenario_named
 from shared.wire import Init, Mode
 from simulator.client import EdgeClient
 from simulator.mission import EdgePilot, fly, new_mission_id
-from simulator.policies import POLICY_NAMES, policy_named
+from simulator.policies import POLICY_NAMES, Policy, policy_named
 from simulator.rollout import rollout
-from simulator.world import PipelineWorld
+from simulator.world import Observation, PipelineWorld
 
 _DEADLINE_MS = 30_000
+
+
+class FullSpeed:
+    """Another policy's sensors at the scenario's full speed, to tell scheduling from flying fast."""
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+
+    def reset(self, scenario: Scenario, seed: int) -> None:
+        """Start a mission."""
+        self._policy.reset(scenario, seed)
+        self._velocity = scenario.max_velocity
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+        """The policy's sensor, full speed."""
+        return self._policy.decide(uav, observation, taken)[0], self._velocity
 
 
 @dataclass(frozen=True)
@@ -69,8 +85,10 @@ def main(args: Outcome) -> int:
                 return 130
             flown.append([sum(t.lost_packets for t in flight.tally), sum(t.events for t in flight.tally)])
         lost[args.label] = flown
-    for name in POLICY_NAMES:
-        tallies = [rollout(PipelineWorld(scenario), policy_named(name), seed) for seed in range(args.seeds)]
+    schemes: dict[str, Policy] = {name: policy_named(name) for name in POLICY_NAMES}
+    schemes |= {f"{name} at full speed": FullSpeed(policy_named(name)) for name in ("eof", "wqcs")}
+    for name, policy in schemes.items():
+        tallies = [rollout(PipelineWorld(scenario), policy, seed) for seed in range(args.seeds)]
         lost[name] = [[sum(t.lost_packets for t in tally), sum(t.events for t in tally)] for tally in tallies]
     if args.out.exists():
         earlier = json.loads(args.out.read_text())["lost_packets_and_events"]
