@@ -80,7 +80,7 @@ class Settings(BaseSettings):
     price_cached: float = Field(0.0, ge=0)
     price_output: float = Field(0.0, ge=0)
 
-    # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take about 0.6 MB.
+    # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take 0.4 to 0.8 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
     # Missions held in memory at once; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
