@@ -27,6 +27,7 @@ from simulator.client import EdgeClient
 from simulator.mission import EdgePilot, fly, new_mission_id
 from simulator.policies import POLICY_NAMES, Policy, policy_named
 from simulator.rollout import rollout
+from simulator.site import Site
 from simulator.world import Observation, PipelineWorld
 
 _DEADLINE_MS = 30_000
@@ -80,7 +81,7 @@ def main(args: Outcome) -> int:
             pilot = EdgePilot(client, mission_id, scenario, seed, mode=args.mode, deadline_ms=_DEADLINE_MS)
             pilot.spec = pilot.spec.model_copy(update={"init": args.init})
             client.put_mission(mission_id, pilot.spec)
-            flight = fly(scenario, pilot, seed)
+            flight = fly(Site(scenario), pilot, seed)
             if flight.interrupted:
                 return 130
             flown.append([sum(t.lost_packets for t in flight.tally), sum(t.events for t in flight.tally)])

@@ -20,11 +20,13 @@ FEATURES = 5
 class State:
     """One UAV's view at one step; arrays have shape ``(J,)``, ``places`` ``(J, 2)``, in the request's order.
 
-    ``queue`` packets, ``battery`` J, ``gain`` dB, ``since_visit`` steps, ``urgency`` 0..1, ``distance`` m from
-    the UAV now. Sensors never heard (``heard`` false) hold zeros in what only a beacon tells.
+    ``progress_m`` along the trajectory, if the UAV told it; ``queue`` packets, ``battery`` J, ``gain`` dB,
+    ``since_visit`` steps, ``urgency`` 0..1, ``distance`` m from the UAV now. Sensors
+    never heard (``heard`` false) hold zeros in what only a beacon tells.
     """
 
     position: Point
+    progress_m: float | None
     places: FloatArray
     ids: NDArray[np.int64]
     heard: NDArray[np.bool_]
@@ -85,6 +87,7 @@ def augment(
     queue, battery = filled(sensors.queue), filled(sensors.battery)
     return State(
         position=position,
+        progress_m=uav.progress_m,
         places=places,
         ids=ids,
         heard=heard,

@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Point = tuple[float, float]
 
+Coordinate = Annotated[float, Field(ge=-1e7, le=1e7)]
+Waypoint = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
+
 _MAX_ARRIVALS = 10_000_000
 
 
@@ -30,7 +33,13 @@ class Scenario(BaseModel):
     steps: int = Field(30, ge=1, le=10_000, description="waypoints of a mission T")
 
     area_m: float = Field(1000.0, ge=1, le=1e6, description="side of the square area")
-    layout: Literal["uniform", "pipeline"] = "uniform"
+    layout: Literal["uniform", "pipeline", "surveyed"] = "uniform"
+    sites: tuple[Annotated[Point, Field(strict=False)], ...] = Field(
+        (),
+        max_length=10_000,
+        strict=False,
+        description="sensor positions inside the area, one a sensor, of layout `surveyed`",
+    )
     pipeline: tuple[Annotated[Point, Field(strict=False)], ...] = Field(
         ((50.0, 120.0), (350.0, 300.0), (500.0, 560.0), (720.0, 640.0), (950.0, 900.0)),
         min_length=2,
@@ -46,6 +55,13 @@ class Scenario(BaseModel):
     max_velocity: int = Field(14, ge=1, le=14, description="velocity levels are 0..max, in m/s")
     lap_radius_m: float = Field(300.0, ge=1, le=1e6)
     lap_offset_m: float = Field(250.0, ge=0, le=1e6, description="lap centres' distance from the area's centre")
+    routes: tuple[Annotated[tuple[Waypoint, ...], Field(strict=False, min_length=2, max_length=1000)], ...] = Field(
+        (),
+        max_length=100,
+        strict=False,
+        description="waypoints of each UAV's trajectory, instead of laps; flown round where the last is the first, "
+        "else there and back",
+    )
 
     queue_capacity: int = Field(60, ge=1, le=100_000, description="packets, W")
     initial_queue_min: float = Field(0.3, ge=0, le=1, description="fraction of W")
@@ -75,6 +91,17 @@ class Scenario(BaseModel):
     def _consistent(self) -> Self:
         if self.arrival_rate_min > self.arrival_rate_max:
             raise ValueError("arrival_rate_min exceeds arrival_rate_max")
+        if self.layout == "surveyed" and len(self.sites) != self.sensors:
+            raise ValueError(
+                f"layout surveyed needs a site for each of {self.sensors} sensors, sites has {len(self.sites)}"
+            )
+        if self.sites and not all(0 <= value <= self.area_m for site in self.sites for value in site):
+            raise ValueError(f"sites has a position outside the area of 0..{self.area_m:g} m")
+        if self.routes and len(self.routes) != self.uavs:
+            raise ValueError(f"routes has {len(self.routes)} trajectories for {self.uavs} UAVs")
+        for uav, route in enumerate(self.routes):
+            if len(set(route)) < 2:
+                raise ValueError(f"routes[{uav}] needs at least two different waypoints")
         if self.sensors * self.steps > _MAX_ARRIVALS:
             raise ValueError(f"sensors x steps exceeds {_MAX_ARRIVALS:,}: a world draws that many arrivals at once")
         return self

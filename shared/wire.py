@@ -107,6 +107,9 @@ class UavState(Wire):
 
     uav_id: UavId
     position: list[Metres] = Field(min_length=2, max_length=2, description="x, y in m")
+    progress_m: float | None = Field(
+        None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
+    )
     sensors: SensorColumns
     outcome: Outcome | None = Field(None, description="of this UAV's previous decision")
 

@@ -78,9 +78,10 @@ def demo(options: Demo, command: str, console: Console) -> int:
     port = _usable_port(options.port)
     fresh_folder(options.out)
     from simulator.mission import new_mission_id
+    from simulator.site import Site
 
     job = Job(
-        scenario=scenario,
+        site=Site(scenario),
         seed=options.seed,
         mission_id=new_mission_id(scenario, options.seed),
         out=options.out,

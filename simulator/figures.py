@@ -20,11 +20,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from shared.scenario import Scenario
+from shared.trajectory import trajectories
 from simulator.record import Decision, Tally, visits_per_sensor
 
 INK = "#222222"
@@ -108,7 +108,7 @@ def _plain(axes: Axes) -> None:
 
 
 def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> str:
-    """One map a UAV (the first nine): its circle, its waypoints coloured by round trip, all sensors.
+    """One map a UAV (the first nine): its trajectory, its waypoints coloured by round trip, all sensors.
 
     ``sensor_xy`` is (J, 2) in metres. The marker says who decided; what was decided on board is hollow.
     """
@@ -124,7 +124,7 @@ def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[D
         for uav in range(shown):
             mine = [d for d in decisions if d.uav_id == uav]
             _map_frame(panels[uav], scenario, uav)
-            arrow = _map_lap(panels[uav], scenario, uav, mine)
+            arrow = _map_trajectory(panels[uav], scenario, uav, mine)
             _map_sensors(panels[uav], scenario, sensor_xy, [*(np.array(d.position) for d in mine), *arrow])
             _map_waypoints(panels[uav], mine, scale)
             if uav % columns == 0:
@@ -150,32 +150,34 @@ def _key(source: str) -> Line2D:
 def _map_frame(axes: Axes, scenario: Scenario, uav: int) -> None:
     axes.set_title(f"UAV {uav}")
     axes.set_aspect("equal")
-    edge = scenario.lap_offset_m + scenario.lap_radius_m - scenario.area_m / 2
-    margin = max(0.0, edge) + 0.06 * scenario.area_m
-    axes.set_xlim(-margin, scenario.area_m + margin)
-    axes.set_ylim(-margin, scenario.area_m + margin)
+    corners = [corner for path in trajectories(scenario) for corner in path.bounds]
+    low, high = np.min(corners, axis=0).clip(max=0.0), np.max(corners, axis=0).clip(min=scenario.area_m)
+    margin = 0.06 * scenario.area_m
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_xlabel("x (m)")
     axes.minorticks_off()
     axes.locator_params(nbins=4)
 
 
-def _map_lap(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Decision]) -> list[np.ndarray]:
-    centre = np.array(scenario.lap_centres[uav])
-    axes.add_patch(Circle(tuple(centre), scenario.lap_radius_m, fill=False, color=GREY, linewidth=0.8, linestyle="--"))
-    if not mine:
+def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Decision]) -> list[np.ndarray]:
+    path = trajectories(scenario)[uav]
+    axes.plot(*path.at(np.linspace(0.0, path.length_m, 361)).T, color=GREY, linewidth=0.8, linestyle="--")
+    flown = [np.array(d.position) for d in mine]
+    moved = next((place for place in flown if np.hypot(*(place - flown[0])) > 1.0), None)
+    if moved is None:
         return []
-    x, y = np.array(mine[0].position) - centre
-    start = np.arctan2(y, x)
-    # Inside the lap, where neither the waypoints nor the frame is; counter-clockwise, as every lap is flown.
-    along = start + np.linspace(0.0, 0.7, 20)
-    arc = centre + 0.8 * scenario.lap_radius_m * np.column_stack([np.cos(along), np.sin(along)])
-    axes.plot(arc[:-1, 0], arc[:-1, 1], color=RED, linewidth=1.4, zorder=6)
-    axes.annotate("", arc[-1], arc[-3], arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.4}, zorder=6)
-    inner = centre + 0.5 * scenario.lap_radius_m * np.array([np.cos(start), np.sin(start)])
+    ahead = (moved - flown[0]) / np.hypot(*(moved - flown[0]))
+    # On the left, which of a lap is the inside: neither waypoints nor the frame are there.
+    left = np.array([-ahead[1], ahead[0]])
+    tail = flown[0] + 0.06 * scenario.area_m * left
+    tip = tail + 0.15 * scenario.area_m * ahead
+    label = flown[0] + 0.15 * scenario.area_m * left
+    axes.annotate("", tuple(tip), tuple(tail), arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.4}, zorder=6)
     axes.text(
-        inner[0], inner[1], "start", color=RED, fontsize=9, ha="center", va="center", zorder=7, path_effects=_HALO
-    )  # fmt: skip
-    return [*arc[::5], inner]
+        label[0], label[1], "start", color=RED, fontsize=9, ha="center", va="center", zorder=7, path_effects=_HALO
+    )
+    return [tail, tip, label]
 
 
 def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: list[np.ndarray]) -> None:

@@ -19,7 +19,8 @@ from simulator.client import EdgeClient, EdgeError, EdgeProtocolError, EdgeRefus
 from simulator.policies import Policy, policy_named
 from simulator.record import DecidedBy, Decision, DecisionLog, Flown
 from simulator.rollout import rollout
-from simulator.world import Info, Observation, PipelineWorld, StepTally
+from simulator.site import Site
+from simulator.world import Info, Observation, StepTally
 
 BASELINES = ("eof", "wqcs")
 FALLBACK = "eof"
@@ -206,6 +207,7 @@ def decide_request(
         uav_id=uav,
         step=int(observation["step"][0]),
         position=observation["position"].tolist(),
+        progress_m=float(observation["progress"][0]),
         sensors=SensorColumns(
             id=list(range(len(heard))),
             x=places[:, 0].tolist(),
@@ -280,7 +282,7 @@ def new_mission_id(scenario: Scenario, seed: int) -> str:
 
 
 def fly(
-    scenario: Scenario,
+    site: Site,
     pilot: Pilot,
     seed: int,
     log: DecisionLog | None = None,
@@ -290,17 +292,18 @@ def fly(
     """Fly one mission, or as much of it as a KeyboardInterrupt lets it: then ``interrupted`` is true.
 
     Args:
-        scenario: the world's numbers.
+        site: where.
         pilot: who decides; it hears the outcomes, and at the end it is told to land.
         seed: of the world.
         log: takes every decision of each whole step.
         on_decision: called after every decision.
         on_step: called after every step with the flight so far.
     """
+    scenario = site.scenario
     flight = Flight(scenario, seed)
     began = time.monotonic()
     try:
-        world = PipelineWorld(scenario)
+        world = site.world()
         observations, _ = world.reset(seed=seed)
         flight.sensor_xy = np.array(observations["uav_0"]["sensor_position"], dtype=float)
         for _step in range(scenario.steps):
@@ -377,7 +380,7 @@ def _of_the_exchange(exchange: Exchange | None) -> dict[str, Any]:
     }
 
 
-def baselines(scenario: Scenario, seed: int, steps: int) -> dict[str, list[StepTally]]:
-    """EOF and WQCS on the same world and seed: per policy, the first ``steps`` steps' tallies."""
-    flown = {name: rollout(PipelineWorld(scenario), policy_named(name), seed) for name in BASELINES}
+def baselines(site: Site, seed: int, steps: int) -> dict[str, list[StepTally]]:
+    """EOF and WQCS on the same site and seed: per policy, the first ``steps`` steps' tallies."""
+    flown = {name: rollout(site.world(), policy_named(name), seed) for name in BASELINES}
     return {name: tally[:steps] for name, tally in flown.items()}

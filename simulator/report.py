@@ -92,7 +92,7 @@ def render_report(
 
     Args:
         summary: what ``summary.json`` holds.
-        scenario: the world's numbers, for the laps.
+        scenario: the world's numbers, for the trajectories.
         decisions: in order of step and UAV; may be none.
         tallies: per policy, one entry a step flown.
         sensor_xy: (J, 2), metres.

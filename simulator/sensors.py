@@ -35,20 +35,27 @@ class Sensors:
     Attributes:
         positions: shape ``(J, 2)``, metres.
         rates: shape ``(J,)``, arrival rates, packets a step.
-        arrivals: shape ``(T, J)``, packets that arrive in each step, Poisson of ``rates``.
+        arrivals: shape ``(T, J)``, packets that arrive in each step: a trace's, else Poisson of ``rates``.
         initial_queue: shape ``(J,)``, packets.
         queue: shape ``(J,)``, packets waiting now, 0..W.
         battery: shape ``(J,)``, joules left.
+
+    Raises:
+        ValueError: the trace does not cover the mission.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams) -> None:
+    def __init__(self, scenario: Scenario, streams: Streams, trace: IntArray | None = None) -> None:
         self._scenario = scenario
         count, capacity = scenario.sensors, scenario.queue_capacity
         self.positions = place(scenario, streams.layout)
         self.rates: FloatArray = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)
         fewest = math.ceil(scenario.initial_queue_min * capacity - 1e-9)
         self.initial_queue: IntArray = streams.queues.integers(fewest, capacity, count, endpoint=True)
-        self.arrivals: IntArray = streams.arrivals.poisson(self.rates, (scenario.steps, count)).astype(np.int64)
+        drawn = streams.arrivals.poisson(self.rates, (scenario.steps, count)) if trace is None else trace
+        self.arrivals: IntArray = np.asarray(drawn[: scenario.steps], dtype=np.int64)
+        if self.arrivals.shape != (scenario.steps, count):
+            shape = self.arrivals.shape
+            raise ValueError(f"the trace has shape {shape}, the mission is {scenario.steps} steps of {count} sensors")
         self.queue = self.initial_queue.copy()
         self.battery: FloatArray = np.full(count, scenario.battery_j)
 
@@ -84,7 +91,10 @@ def place(scenario: Scenario, rng: np.random.Generator) -> FloatArray:
 
     ``uniform``: independent over the area. ``pipeline``: at equal arc lengths along the polyline, from its
     first point to its last (a single sensor at its middle), each moved by up to the spread on each axis.
+    ``surveyed``: the scenario's sites.
     """
+    if scenario.layout == "surveyed":
+        return np.array(scenario.sites, dtype=np.float64)
     shape = (scenario.sensors, 2)
     if scenario.layout == "uniform":
         return rng.uniform(0.0, scenario.area_m, shape)

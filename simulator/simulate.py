@@ -42,6 +42,7 @@ from simulator.uplink import LossyTransport
 # The world and matplotlib take a second to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
     from simulator.mission import Choice, Flight, Pilot
+    from simulator.site import Site
 
 API_KEY = "AICVDS_API_KEY"
 # Without a deadline of our own the edge's applies, and it may be as long as the paper's step.
@@ -123,10 +124,11 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     scenario = chosen_scenario(options.scenario, options.steps)
     check(options)
     from simulator.mission import new_mission_id
+    from simulator.site import Site
 
     mission_id = new_mission_id(scenario, options.seed)
     job = Job(
-        scenario=scenario,
+        site=Site(scenario),
         seed=options.seed,
         mission_id=mission_id,
         out=options.out or Path("runs") / mission_id,
@@ -187,7 +189,7 @@ def check_bounds(seed: int, wait_s: float) -> None:
 class Job:
     """One mission to conduct. ``policy`` is ``edge`` or a local policy's name; ``edge`` is ``None`` for those."""
 
-    scenario: Scenario
+    site: Site
     seed: int
     mission_id: str
     out: Path
@@ -212,13 +214,13 @@ def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None
     from simulator.mission import EdgePilot, LocalPilot
 
     if job.edge is None:
-        flight = _fly(job, LocalPilot(job.policy, job.scenario, job.seed), console)
+        flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console)
         return _conclude(job, flight, None, None, console)
     with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _scout(job.edge) as scout:
         model = _wait(ground, job, console, alive)
         news = _News()
         pilot = EdgePilot(
-            radio, job.mission_id, job.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
+            radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
             scout=scout, reconnect_s=job.reconnect_s, on_wait=news.waiting,
         )  # fmt: skip
         mode = ground.put_mission(job.mission_id, pilot.spec).mode
@@ -236,11 +238,11 @@ def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
     """The fleet's radio, or the wire on the ground, which loses nothing whatever the scenario."""
     timeout_s = DEFAULT_TIMEOUT_S if job.deadline_ms is None else job.deadline_ms / 1000 + NETWORK_SLACK_S
     transport = None
-    if airborne and (job.scenario.uplink_drop or job.scenario.uplink_jitter_ms):
+    if airborne and (job.site.scenario.uplink_drop or job.site.scenario.uplink_jitter_ms):
         transport = LossyTransport(
             httpx.HTTPTransport(),
-            drop=job.scenario.uplink_drop,
-            jitter_ms=job.scenario.uplink_jitter_ms,
+            drop=job.site.scenario.uplink_drop,
+            jitter_ms=job.site.scenario.uplink_jitter_ms,
             seed=job.seed,
         )
     key = os.environ.get(API_KEY) or None
@@ -314,14 +316,14 @@ def _fly(job: Job, pilot: Pilot, console: Console, news: _News | None = None) ->
         TimeElapsedColumn(),
     )
     with log, Progress(*columns, console=console) as progress:
-        task = progress.add_task("Flying", total=job.scenario.steps, news="")
+        task = progress.add_task("Flying", total=job.site.scenario.steps, news="")
         news.tell(lambda text: progress.update(task, news=text))
 
         def stepped(flight: Flight) -> None:
             progress.advance(task)
             news.stepped(flight)
 
-        flight = fly(job.scenario, pilot, job.seed, log, news.decided, stepped)
+        flight = fly(job.site, pilot, job.seed, log, news.decided, stepped)
     if flight.interrupted:
         console.print(f"interrupted after {flight.steps_flown} steps; writing what was flown", highlight=False)
     return flight
@@ -331,7 +333,7 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
     from simulator.mission import baselines
 
     flown_by = "aic_vds" if job.policy == "edge" else job.policy
-    others = baselines(job.scenario, job.seed, flight.steps_flown)
+    others = baselines(job.site, job.seed, flight.steps_flown)
     tallies = {flown_by: flight.tally, **{name: tally for name, tally in others.items() if name != flown_by}}
     facts = flight.facts(
         policy=job.policy,
@@ -347,7 +349,7 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
         (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
         from simulator.report import show, write_report
 
-        write_report(job.out / REPORT, summary, job.scenario, flight.decisions, tallies, flight.sensor_xy)
+        write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, flight.sensor_xy)
     show(summary, console)
     for name in (SUMMARY, DECISIONS, REPORT):
         console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)

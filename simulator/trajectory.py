@@ -1,7 +1,8 @@
-"""Trajectories: every UAV flies counter-clockwise laps of a circle of its own."""
+"""A fleet on its trajectories: where each UAV began, and how far it has flown."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -9,56 +10,43 @@ from numpy.typing import ArrayLike
 
 from shared.channel import FloatArray
 from shared.scenario import Scenario
+from shared.trajectory import Trajectory, trajectories
 
 
-class Laps:
-    """The circles of a fleet of I UAVs, and how far along its own each UAV is.
+class Fleet:
+    """I UAVs, each on a trajectory of its own.
 
     Attributes:
-        centres: shape ``(I, 2)``, metres.
-        radius_m: of every circle.
-        start_angle: shape ``(I,)``, radians, counter-clockwise from due east.
-        travelled_m: shape ``(I,)``, arc length flown since the start.
+        trajectories: one a UAV.
+        start_m: shape ``(I,)``, arc length from each trajectory's beginning to where the UAV began.
+        progress_m: shape ``(I,)``, that and what was flown since.
 
     Raises:
-        ValueError: the radius is not positive, or the shapes do not agree.
+        ValueError: the number of starts is not that of the trajectories.
     """
 
-    def __init__(self, centres: ArrayLike, radius_m: float, start_angle: ArrayLike) -> None:
-        self.centres: FloatArray = np.array(centres, dtype=np.float64)
-        self.radius_m = float(radius_m)
-        self.start_angle: FloatArray = np.array(start_angle, dtype=np.float64)
-        if not self.radius_m > 0:
-            raise ValueError(f"radius_m is {radius_m}, must be above 0")
-        if self.centres.ndim != 2 or self.centres.shape != (len(self.start_angle), 2):
-            raise ValueError(f"centres have shape {self.centres.shape}, start_angle {self.start_angle.shape}")
-        self.travelled_m: FloatArray = np.zeros(len(self.start_angle))
+    def __init__(self, paths: Sequence[Trajectory], start_m: ArrayLike) -> None:
+        self.trajectories = tuple(paths)
+        self.start_m: FloatArray = np.array(start_m, dtype=np.float64)
+        if self.start_m.shape != (len(self.trajectories),):
+            raise ValueError(f"{len(self.trajectories)} trajectories, start_m has shape {self.start_m.shape}")
+        self.progress_m = self.start_m
 
     @classmethod
     def draw(cls, scenario: Scenario, rng: np.random.Generator) -> Self:
-        """A scenario's laps with start angles uniform in 0..2 pi."""
-        return cls(scenario.lap_centres, scenario.lap_radius_m, rng.uniform(0.0, 2.0 * np.pi, scenario.uavs))
+        """A scenario's fleet, each start uniform along its trajectory."""
+        paths = trajectories(scenario)
+        return cls(paths, rng.uniform(0.0, 1.0, len(paths)) * [path.length_m for path in paths])
 
     @property
     def positions(self) -> FloatArray:
         """Where the UAVs are now, shape ``(I, 2)``, metres."""
-        return self.at(self.travelled_m)
+        return self.at(self.progress_m)
 
-    def at(self, travelled_m: ArrayLike) -> FloatArray:
-        """Where the UAVs are after an arc length from their starts.
-
-        Args:
-            travelled_m: shape ``(..., I)`` or anything that broadcasts to it, metres.
-
-        Returns:
-            ``centre + radius (cos, sin)(start + travelled / radius)``, shape ``(..., I, 2)``, metres.
-        """
-        return self.at_angle(self.start_angle + np.asarray(travelled_m, dtype=np.float64) / self.radius_m)
-
-    def at_angle(self, angle: ArrayLike) -> FloatArray:
-        """The points of the circles at angles ``(..., I)`` in radians, shape ``(..., I, 2)``, metres."""
-        turn = np.broadcast_to(angle, np.broadcast_shapes(np.shape(angle), self.start_angle.shape))
-        return self.centres + self.radius_m * np.stack((np.cos(turn), np.sin(turn)), axis=-1)
+    def at(self, progress_m: ArrayLike) -> FloatArray:
+        """Where UAVs are at arc lengths ``(..., I)`` along their trajectories, ``(..., I, 2)``, metres."""
+        progress = np.asarray(progress_m, dtype=np.float64)
+        return np.stack([path.at(progress[..., uav]) for uav, path in enumerate(self.trajectories)], axis=-2)
 
     def advance(self, distance_m: ArrayLike) -> FloatArray:
         """Fly on by a distance, and return the new positions.
@@ -72,5 +60,5 @@ class Laps:
         distance = np.asarray(distance_m, dtype=np.float64)
         if not np.all(np.isfinite(distance) & (distance >= 0)):
             raise ValueError(f"distance_m is {distance_m!r}, must be finite and at least 0")
-        self.travelled_m = self.travelled_m + distance
+        self.progress_m = self.progress_m + distance
         return self.positions

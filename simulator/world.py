@@ -13,8 +13,9 @@ from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
 from shared.channel import FloatArray, channel_gain_db, link_holds, packets_per_step, path_loss_db, rate_bps
 from shared.scenario import SCENARIOS, Scenario
+from shared.trajectory import Trajectory, trajectories
 from simulator.sensors import IntArray, Sensors, Streams
-from simulator.trajectory import Laps
+from simulator.trajectory import Fleet
 
 Cost = Literal["default", "paper"]
 
@@ -24,6 +25,7 @@ class Observation(TypedDict):
 
     step: IntArray
     position: FloatArray
+    progress: FloatArray
     sensor_position: FloatArray
     queue: FloatArray
     battery: FloatArray
@@ -61,7 +63,7 @@ class StepTally:
 
 
 class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]
-    """UAVs fly laps over a field of ground sensors and collect their packets before the queues overflow.
+    """UAVs fly over a field of ground sensors and collect their packets before the queues overflow.
 
     J sensors, I UAVs and T steps are the scenario's, and so is every other number named here.
 
@@ -77,7 +79,8 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     | key | shape, type | meaning |
     |---|---|---|
     | ``step`` | ``(1,)`` int64 | steps flown so far, 0..T |
-    | ``position`` | ``(2,)`` float64 | of this UAV, m; a lap may leave the area |
+    | ``position`` | ``(2,)`` float64 | of this UAV, m; a trajectory may leave the area |
+    | ``progress`` | ``(1,)`` float64 | of this UAV along its trajectory, m, its start included |
     | ``sensor_position`` | ``(J, 2)`` float64 | surveyed, m |
     | ``queue`` | ``(J,)`` float64 | packets waiting when last heard, 0..W |
     | ``battery`` | ``(J,)`` float64 | J left when last heard |
@@ -90,7 +93,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     UAVs do not share what they hear.
 
     ## A step
-    1. All UAVs fly ``velocity x step_s`` metres along their circles, counter-clockwise.
+    1. All UAVs fly ``velocity x step_s`` metres along their trajectories (circles counter-clockwise, or routes).
     2. From the new positions, ``uav_0`` first, each collects from its sensor. The transmission fails (f = 1) if
        the link does not hold (out of the radio radius, or path loss at the threshold or past it), if a UAV of a
        lower index was served by that sensor in this step, or if the battery cannot pay for one packet. Else
@@ -118,7 +121,8 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     Every agent is truncated at step T; nothing terminates.
 
     ## For reports
-    ``scenario``; ``sensors`` (true queues and batteries); ``laps``; ``tally``, one :class:`StepTally` a step flown.
+    ``scenario``; ``sensors`` (true queues and batteries); ``fleet`` (where the UAVs are);
+    ``tally``, one :class:`StepTally` a step flown.
 
     Raises:
         ValueError: ``step`` before ``reset`` or after the end, without an action of a live agent, or with an
@@ -129,30 +133,36 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": ["rgb_array"], "render_fps": 4}
 
     def __init__(
-        self, scenario: Scenario = SCENARIOS["paper"], *, cost: Cost = "default", render_mode: str | None = None
+        self,
+        scenario: Scenario = SCENARIOS["paper"],
+        *,
+        arrivals: IntArray | None = None,
+        cost: Cost = "default",
+        render_mode: str | None = None,
     ) -> None:
         if cost not in ("default", "paper"):
             raise ValueError(f"unknown cost {cost!r}: choose one of default, paper")
         self.scenario = scenario
+        self.arrivals = arrivals
         self.cost = cost
         self.render_mode = render_mode
         self.possible_agents = [f"uav_{i}" for i in range(scenario.uavs)]
         self.agents: list[str] = []
         self.tally: list[StepTally] = []
         self.sensors: Sensors
-        self.laps: Laps
+        self.fleet: Fleet
         levels = [scenario.sensors, scenario.max_velocity + 1]
         self._action_spaces = {agent: spaces.MultiDiscrete(levels) for agent in self.possible_agents}
         self._observation_spaces = {
-            agent: _observation_space(scenario, centre)
-            for agent, centre in zip(self.possible_agents, scenario.lap_centres, strict=True)
+            agent: _observation_space(scenario, path)
+            for agent, path in zip(self.possible_agents, trajectories(scenario), strict=True)
         }
         self.state_space = spaces.Box(-np.inf, np.inf, (1 + 2 * scenario.uavs + 4 * scenario.sensors,), np.float32)
         self._entropy: Any = None
         self._missions = 0
 
     def observation_space(self, agent: str) -> spaces.Dict:
-        """The agent's observation space; the laps, hence the bounds of ``position``, differ between agents."""
+        """The agent's observation space; the trajectories, hence the bounds of ``position``, differ between agents."""
         return self._observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.MultiDiscrete:
@@ -169,14 +179,14 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         key = (self._missions,) if self._missions else ()
         self._missions += 1
         streams = Streams.of(np.random.SeedSequence(self._entropy, spawn_key=key))
-        self.sensors = Sensors(self.scenario, streams)
-        self.laps = Laps.draw(self.scenario, streams.angles)
+        self.sensors = Sensors(self.scenario, streams, self.arrivals)
+        self.fleet = Fleet.draw(self.scenario, streams.angles)
         self.tally = []
         self.agents = self.possible_agents[:]
         shape = (self.scenario.uavs, self.scenario.sensors)
         self._queue, self._battery, self._gain = np.zeros((3, *shape))
         self._last_heard: IntArray = np.full(shape, -1)
-        position = self.laps.positions
+        position = self.fleet.positions
         observations = self._observe(position, self._distances(position))
         nothing = np.zeros(self.scenario.uavs, dtype=np.int64)
         return observations, self._infos(nothing, nothing, nothing, nothing.astype(np.float64))
@@ -187,7 +197,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         """Fly one step; see the class docstring."""
         chosen = self._checked(actions)
         step = len(self.tally)
-        position = self.laps.advance(chosen[:, 1] * self.scenario.step_s)
+        position = self.fleet.advance(chosen[:, 1] * self.scenario.step_s)
         distance = self._distances(position)
         failed, moved = self._collect(chosen[:, 0], distance)
         lost = self.sensors.arrive(step)
@@ -223,7 +233,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         side, sensors = self.scenario.area_m, self.sensors
         parts = (
             [len(self.tally) / self.scenario.steps],
-            self.laps.positions.ravel() / side,
+            self.fleet.positions.ravel() / side,
             sensors.positions.ravel() / side,
             sensors.queue / self.scenario.queue_capacity,
             sensors.battery / self.scenario.battery_j,
@@ -231,12 +241,14 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         return np.concatenate(parts).astype(np.float32)
 
     def render(self) -> NDArray[np.uint8]:
-        """The map as an RGB image, shape ``(600, 600, 3)``: laps, UAVs, and sensors filled by their queues."""
+        """The map as an RGB image, shape ``(600, 600, 3)``: trajectories, UAVs, and sensors filled by their queues."""
         if self.render_mode != "rgb_array":
             raise ValueError(f"render_mode is {self.render_mode!r}: only 'rgb_array' can be rendered")
         if not hasattr(self, "sensors"):
             raise ValueError("render before reset")
-        return _drawn(self)
+        from simulator.picture import picture
+
+        return picture(self)
 
     def _checked(self, actions: Mapping[str, ArrayLike]) -> IntArray:
         """The actions as ``(I, 2)`` integers: sensor, velocity."""
@@ -293,6 +305,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             agent: Observation(
                 step=np.array([step]),
                 position=position[uav].copy(),
+                progress=self.fleet.progress_m[uav : uav + 1].copy(),
                 sensor_position=self.sensors.positions.copy(),
                 queue=self._queue[uav].copy(),
                 battery=self._battery[uav].copy(),
@@ -314,10 +327,11 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         }
 
 
-def _observation_space(scenario: Scenario, centre: tuple[float, float]) -> spaces.Dict:
+def _observation_space(scenario: Scenario, path: Trajectory) -> spaces.Dict:
     count = scenario.sensors
     quietest, loudest = _gain_bounds(scenario)
-    middle = np.array(centre)
+    farthest = path.length_m + scenario.steps * scenario.max_velocity * scenario.step_s
+    lowest, highest = path.bounds
 
     def column(low: float, high: float) -> spaces.Box:
         return spaces.Box(low, high, (count,), np.float64)
@@ -325,7 +339,9 @@ def _observation_space(scenario: Scenario, centre: tuple[float, float]) -> space
     return spaces.Dict(
         {
             "step": spaces.Box(0, scenario.steps, (1,), np.int64),
-            "position": spaces.Box(middle - scenario.lap_radius_m, middle + scenario.lap_radius_m, dtype=np.float64),
+            # Rounding may put a circle's point past its bounds by a hair.
+            "position": spaces.Box(lowest - 1e-6, highest + 1e-6, dtype=np.float64),
+            "progress": spaces.Box(0.0, farthest, (1,), np.float64),
             "sensor_position": spaces.Box(0.0, scenario.area_m, (count, 2), np.float64),
             "queue": column(0.0, float(scenario.queue_capacity)),
             "battery": column(0.0, scenario.battery_j),
@@ -344,27 +360,3 @@ def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
     free_space = scenario.model_copy(update={"los_excess_db": 0.0, "nlos_excess_db": 0.0})
     nearest, farthest = path_loss_db([0.0, scenario.radio_radius_m], free_space)
     return min(0.0, -farthest - max(excess) - 1e-6), max(0.0, -nearest - min(excess) + 1e-6)
-
-
-def _drawn(world: PipelineWorld) -> NDArray[np.uint8]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Circle
-
-    scenario, sensors, laps = world.scenario, world.sensors, world.laps
-    # Not made by pyplot, hence nothing holds the figure once this function returns.
-    figure = Figure(figsize=(6, 6), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_subplot(xlabel="x, m", ylabel="y, m", title=f"{scenario.name}, step {len(world.tally)}")
-    for uav, (centre, place) in enumerate(zip(laps.centres, laps.positions, strict=True)):
-        colour = f"C{uav % 10}"
-        axes.add_patch(Circle((centre[0], centre[1]), laps.radius_m, fill=False, ls="--", color=colour, alpha=0.6))
-        axes.plot(place[0], place[1], marker="^", ms=11, color=colour)
-    x, y = sensors.positions.T
-    axes.scatter(x, y, c=sensors.queue, s=90, cmap="Reds", edgecolors="k", vmin=0, vmax=scenario.queue_capacity)
-    if scenario.layout == "pipeline":
-        axes.plot(*np.array(scenario.pipeline).T, color="0.7", lw=3, zorder=0)
-    margin = max(0.0, scenario.lap_offset_m + scenario.lap_radius_m - scenario.area_m / 2) + 0.05 * scenario.area_m
-    axes.set(xlim=(-margin, scenario.area_m + margin), ylim=(-margin, scenario.area_m + margin), aspect="equal")
-    canvas.draw()  # type: ignore[no-untyped-call]
-    return np.array(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]

@@ -1,15 +1,15 @@
 import math
 
-import numpy as np
 import pytest
 
 from service.features import State
 from service.policy import decide_without_llm
 from shared.channel import link_holds
-from shared.lap import on_lap, positions_after
+from shared.trajectory import trajectories
 from tests.service.making import PAPER, attended, mission, uav
 
 X, Y = PAPER.lap_centres[0]
+PATH = trajectories(PAPER)[0]
 ON_LAP = (X + PAPER.lap_radius_m, Y)
 
 
@@ -17,21 +17,13 @@ def state(**kwargs: object) -> State:
     return attended(mission(), uav(**kwargs)).state  # type: ignore[arg-type]
 
 
-def test_a_lap_is_flown_counter_clockwise() -> None:
-    quarter = PAPER.lap_radius_m * math.pi / 2
-    points = positions_after(PAPER, 0, ON_LAP, [0.0, quarter])
-    np.testing.assert_allclose(points, [ON_LAP, (X, Y + PAPER.lap_radius_m)], atol=1e-9)
-    assert on_lap(PAPER, 0, ON_LAP)
-    assert not on_lap(PAPER, 1, ON_LAP)
-
-
 def test_the_sensor_is_in_reach_after_the_move() -> None:
     """Far ahead on the lap: out of reach at full speed's opposite, in reach where the policy flies."""
-    ahead = positions_after(PAPER, 0, ON_LAP, [480.0])[0]
+    ahead = PATH.at(480.0)
     view = attended(mission(), uav(position=ON_LAP, x=[float(ahead[0])], queue=[60.0]))
     view.state.places[0] = ahead
     sensor, velocity = decide_without_llm(view.state, 0, PAPER, frozenset())
-    arrived = positions_after(PAPER, 0, ON_LAP, [velocity * PAPER.step_s])[0]
+    arrived = PATH.at(velocity * PAPER.step_s)
     assert sensor == 0
     assert velocity > 0
     assert link_holds(math.dist(arrived, ahead), PAPER)
@@ -39,11 +31,11 @@ def test_the_sensor_is_in_reach_after_the_move() -> None:
 
 
 def test_it_slows_down_for_a_full_queue_that_it_would_leave_behind() -> None:
-    behind = positions_after(PAPER, 0, ON_LAP, [-300.0])[0]
+    behind = PATH.at(-300.0)
     s = state(position=ON_LAP, x=[float(behind[0])], queue=[60.0])
     s.places[0] = behind
     _, velocity = decide_without_llm(s, 0, PAPER, frozenset())
-    arrived = positions_after(PAPER, 0, ON_LAP, [velocity * PAPER.step_s])[0]
+    arrived = PATH.at(velocity * PAPER.step_s)
     assert velocity < PAPER.max_velocity
     assert link_holds(math.dist(arrived, behind), PAPER)
 

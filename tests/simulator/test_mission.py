@@ -14,6 +14,7 @@ from simulator.mission import BASELINES, Choice, EdgePilot, Flight, LocalPilot, 
 from simulator.policies import policy_named
 from simulator.record import DecisionLog, Flown, Summary, read_decisions, summarise
 from simulator.rollout import rollout
+from simulator.site import Site
 from simulator.world import PipelineWorld
 from tests.simulator.edge_stub import EdgeStub, free_port, stub_edge, stub_edge_at
 
@@ -40,7 +41,7 @@ def facts(flight: Flight, deadline_ms: int | None = None) -> Flown:
 
 def test_every_uav_asks_at_every_step_and_every_outcome_arrives(stub: EdgeStub, client: EdgeClient) -> None:
     pilot = EdgePilot(client, "m", SHORT, seed=0)
-    flight = fly(SHORT, pilot, seed=0)
+    flight = fly(Site(SHORT), pilot, seed=0)
     assert [(d.step, d.uav_id) for d in flight.decisions] == [(t, i) for t in range(4) for i in range(3)]
     assert [(d.step, d.uav_id) for d in stub.decides] == [(t, i) for t in range(4) for i in range(3)]
     assert pilot.answered == 12 and pilot.last_error is None
@@ -52,13 +53,13 @@ def test_every_uav_asks_at_every_step_and_every_outcome_arrives(stub: EdgeStub, 
 
 
 def test_the_position_recorded_is_where_the_uav_asked(stub: EdgeStub, client: EdgeClient) -> None:
-    flight = fly(SHORT, EdgePilot(client, "m", SHORT, seed=0), seed=0)
+    flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
     assert [list(d.position) for d in flight.decisions] == [d.position for d in stub.decides]
 
 
 def test_a_local_policy_flies_what_rollout_flies() -> None:
     paper = SCENARIOS["paper"]
-    flight = fly(paper, LocalPilot("wqcs", paper, 5), seed=5)
+    flight = fly(Site(paper), LocalPilot("wqcs", paper, 5), seed=5)
     expected = rollout(PipelineWorld(paper), policy_named("wqcs"), 5)
     assert [(t.lost_packets, t.events) for t in flight.tally] == [(t.lost_packets, t.events) for t in expected]
     assert {d.source for d in flight.decisions} == {"onboard"}
@@ -68,8 +69,8 @@ def test_a_local_policy_flies_what_rollout_flies() -> None:
 def test_without_an_edge_the_uavs_fly_eof() -> None:
     with EdgeClient("http://127.0.0.1:1", timeout_s=1, attempts=2) as nobody:
         pilot = EdgePilot(nobody, "m", SHORT, seed=2)
-        flight = fly(SHORT, pilot, seed=2)
-    eof = fly(SHORT, LocalPilot("eof", SHORT, 2), seed=2)
+        flight = fly(Site(SHORT), pilot, seed=2)
+    eof = fly(Site(SHORT), LocalPilot("eof", SHORT, 2), seed=2)
     assert [(d.sensor_id, d.velocity) for d in flight.decisions] == [(d.sensor_id, d.velocity) for d in eof.decisions]
     assert {(d.source, d.reason) for d in flight.decisions} == {("onboard", "edge_unreachable")}
     assert pilot.answered == 0 and "127.0.0.1:1/decide" in str(pilot.last_error)
@@ -77,7 +78,7 @@ def test_without_an_edge_the_uavs_fly_eof() -> None:
 
 def test_an_edge_that_fails_for_a_while(stub: EdgeStub, client: EdgeClient) -> None:
     stub.script = ["ok", "ok", "ok", "busy", "busy", "garbage", "invalid"]
-    flight = fly(SHORT, EdgePilot(client, "m", SHORT, seed=0), seed=0)
+    flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
     assert [d.reason for d in flight.decisions[3:6]] == ["edge_unreachable", "edge_protocol", "edge_refused"]
     assert all(d.source != "onboard" for d in flight.decisions[6:])
     # Nothing that the edge decided is left without its outcome, later though it comes.
@@ -87,7 +88,7 @@ def test_an_edge_that_fails_for_a_while(stub: EdgeStub, client: EdgeClient) -> N
 
 def test_an_edge_that_restarted_gets_the_mission_again(stub: EdgeStub, client: EdgeClient) -> None:
     stub.script = ["ok", "ok", "ok", "forgot"]
-    flight = fly(SHORT, EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
+    flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
     assert all(d.source != "onboard" for d in flight.decisions)
     assert stub.missions["m-7"].scenario == SHORT and stub.missions["m-7"].seed == 9
 
@@ -106,7 +107,7 @@ def test_an_edge_that_comes_back_in_time_rejoins() -> None:
                 back.start()
 
         pilot = EdgePilot(client, "m", SHORT, seed=9, reconnect_s=20, on_wait=waits.append)
-        flight = fly(SHORT, pilot, 9, on_step=goes_away)
+        flight = fly(Site(SHORT), pilot, 9, on_step=goes_away)
         back.join()
         assert [d.source == "onboard" for d in flight.decisions] == [False] * 3 + [True] * 3 + [False] * 6
         assert waits and again[0].missions["m"] == pilot.spec
@@ -115,7 +116,7 @@ def test_an_edge_that_comes_back_in_time_rejoins() -> None:
 def test_an_edge_that_stays_away_costs_one_pause() -> None:
     with EdgeClient(f"http://127.0.0.1:{free_port()}", timeout_s=1, attempts=1) as nobody:
         began = time.monotonic()
-        flight = fly(SHORT, EdgePilot(nobody, "m", SHORT, seed=0, reconnect_s=3), seed=0)
+        flight = fly(Site(SHORT), EdgePilot(nobody, "m", SHORT, seed=0, reconnect_s=3), seed=0)
     # A pause a step would be 12 s.
     assert 3 <= time.monotonic() - began < 11
     assert {d.source for d in flight.decisions} == {"onboard"} and flight.steps_flown == 4
@@ -127,18 +128,18 @@ def test_an_interrupt_keeps_the_whole_steps(stub: EdgeStub, client: EdgeClient, 
             raise KeyboardInterrupt
 
     with DecisionLog(tmp_path / "d.jsonl") as log:
-        flight = fly(SHORT, EdgePilot(client, "m", SHORT, seed=0), 0, log, on_decision=interrupt)
+        flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), 0, log, on_decision=interrupt)
     assert flight.interrupted and flight.steps_flown == 2
     assert read_decisions(tmp_path / "d.jsonl") == flight.decisions and len(flight.decisions) == 6
-    others = baselines(SHORT, 0, flight.steps_flown)
+    others = baselines(Site(SHORT), 0, flight.steps_flown)
     assert {name: len(tally) for name, tally in others.items()} == {"eof": 2, "wqcs": 2}
 
 
 def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient) -> None:
     stub.script = ["slow"]
-    flight = fly(SHORT, EdgePilot(client, "m", SHORT, seed=0, deadline_ms=200), seed=0)
+    flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0, deadline_ms=200), seed=0)
     summary = summarise(
-        facts(flight, deadline_ms=200), flight.decisions, {"aic_vds": flight.tally, **baselines(SHORT, 0, 4)}
+        facts(flight, deadline_ms=200), flight.decisions, {"aic_vds": flight.tally, **baselines(Site(SHORT), 0, 4)}
     )
     told = summary.model_dump()
     assert set(told) == {

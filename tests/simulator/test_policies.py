@@ -24,6 +24,7 @@ def seen(queue: list[float], last_heard: list[int], distance: list[float] | None
     return Observation(
         step=np.array([now]),
         position=np.zeros(2),
+        progress=np.zeros(1),
         sensor_position=np.stack((away, np.zeros(4)), axis=-1),
         queue=np.where(heard >= 0, queue, 0.0),
         battery=np.where(heard >= 0, 50.0, 0.0),

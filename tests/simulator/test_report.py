@@ -12,6 +12,7 @@ from simulator import figures
 from simulator.mission import Flight, LocalPilot, baselines, fly
 from simulator.record import Decision, DecisionLog, Summary, jain_index, read_decisions, summarise, visits_per_sensor
 from simulator.report import costliest, llm_notice, number, policy_labels, render_report, verdict, write_report
+from simulator.site import Site
 
 SHORT = Scenario(steps=5)
 EVIL = '<script>alert("$x$")</script>&amp;'
@@ -25,7 +26,7 @@ def decision(**changes: object) -> Decision:
 
 def page(flight: Flight, model: str | None = "stub-1", decisions: list[Decision] | None = None) -> str:
     seen = flight.decisions if decisions is None else decisions
-    tallies = {"aic_vds": flight.tally, **baselines(flight.scenario, 0, flight.steps_flown)}
+    tallies = {"aic_vds": flight.tally, **baselines(Site(flight.scenario), 0, flight.steps_flown)}
     return render_report(summary_of(flight, model), flight.scenario, seen, tallies, flight.sensor_xy)
 
 
@@ -40,7 +41,7 @@ def summary_of(flight: Flight, model: str | None) -> Summary:
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     """A flight of which every second decision pretends to have come from an edge."""
-    flown = fly(SHORT, LocalPilot("eof", SHORT, 0), seed=0)
+    flown = fly(Site(SHORT), LocalPilot("eof", SHORT, 0), seed=0)
     flown.decisions = [
         d.model_copy(update={"rtt_ms": 10.0 + n, "source": "llm", "attempts": 1, "request_bytes": 900}) if n % 2 else d
         for n, d in enumerate(flown.decisions)
@@ -100,7 +101,7 @@ def test_learned_values_are_told_and_cost_no_tokens(flight: Flight) -> None:
 
 
 def test_a_local_policys_page_has_nothing_of_an_edge() -> None:
-    flown = fly(SHORT, LocalPilot("eof", SHORT, 0), seed=0)
+    flown = fly(Site(SHORT), LocalPilot("eof", SHORT, 0), seed=0)
     facts = flown.facts(
         policy="eof", edge=None, mission_id="m", mode=None, model=None, deadline_ms=None, command="c"
     )  # fmt: skip
@@ -173,7 +174,7 @@ def test_a_flight_of_no_step_has_a_page() -> None:
 
 def test_a_large_fleet_fits(tmp_path: Path) -> None:
     world = SCENARIOS["dense"].model_copy(update={"steps": 3})
-    flown = fly(world, LocalPilot("random", world, 0), seed=0)
+    flown = fly(Site(world), LocalPilot("random", world, 0), seed=0)
     write_report(
         tmp_path / "r.html", summary_of(flown, None), world, flown.decisions, {"a": flown.tally}, np.zeros((100, 2))
     )

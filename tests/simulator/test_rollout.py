@@ -70,7 +70,7 @@ def test_the_same_seed_flies_the_same_mission() -> None:
 
 def drawn(world: PipelineWorld) -> list[bytes]:
     s = world.sensors
-    return [a.tobytes() for a in (s.positions, s.rates, s.initial_queue, s.arrivals, world.laps.start_angle)]
+    return [a.tobytes() for a in (s.positions, s.rates, s.initial_queue, s.arrivals, world.fleet.start_m)]
 
 
 def test_no_policy_changes_the_world() -> None:
@@ -110,7 +110,7 @@ def test_each_kind_of_draw_has_a_child_of_the_seed_to_itself() -> None:
     np.testing.assert_array_equal(sensors.positions, layout.uniform(0.0, 1000.0, (10, 2)))
     np.testing.assert_array_equal(sensors.rates, rates.uniform(2.0, 8.0, 10))
     np.testing.assert_array_equal(sensors.initial_queue, queues.integers(18, 61, 10))
-    np.testing.assert_array_equal(world.laps.start_angle, angles.uniform(0.0, 2 * np.pi, 3))
+    np.testing.assert_allclose(world.fleet.start_m, angles.uniform(0.0, 1.0, 3) * 600 * np.pi)
     np.testing.assert_array_equal(sensors.arrivals, arrivals.poisson(sensors.rates, (30, 10)))
 
 
@@ -161,6 +161,6 @@ def test_blame_falls_on_links_that_hold() -> None:
         _, _, _, _, infos = world.step({a: (0, 3) for a in world.agents})
         spilt = np.maximum(before - world.tally[-1].collected + world.sensors.arrivals[now] - 60, 0)
         for uav, info in enumerate(infos.values()):
-            distance = np.hypot(*(world.sensors.positions - world.laps.positions[uav]).T)
+            distance = np.hypot(*(world.sensors.positions - world.fleet.positions[uav]).T)
             assert info["lost_packets"] == spilt[link_holds(distance, world.scenario)].sum()
     assert sum(t.lost_packets for t in world.tally) > 0

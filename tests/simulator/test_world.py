@@ -199,11 +199,11 @@ def test_the_transfer_happens_at_the_new_position() -> None:
     scenario = Scenario(sensors=1, uavs=1, radio_radius_m=50.0, lap_radius_m=140 / np.pi, lap_offset_m=0.0)
     world = PipelineWorld(scenario)
     world.reset(seed=0)
-    start = world.laps.positions[0]
+    start = world.fleet.positions[0]
     world.sensors.positions[0] = start
     _, _, _, _, infos = step(world, (0, 14))
     # 140 m are half a lap: the UAV is now a diameter, 89 m, from where the sensor is.
-    np.testing.assert_allclose(world.laps.positions[0], 2 * world.laps.centres[0] - start)
+    np.testing.assert_allclose(world.fleet.positions[0], 2 * np.array(world.scenario.lap_centres[0]) - start)
     assert infos["uav_0"]["failed"] is True
     _, _, _, _, infos = step(world, (0, 14))
     assert infos["uav_0"]["failed"] is False
@@ -231,7 +231,7 @@ def test_a_uav_holds_the_last_beacon_that_it_heard() -> None:
         observations, *_ = world.step({a: (now % 10, 14) for a in world.agents})
         for uav in range(3):
             was, seen = before[f"uav_{uav}"], observations[f"uav_{uav}"]
-            distance = np.hypot(*(world.sensors.positions - world.laps.positions[uav]).T)
+            distance = np.hypot(*(world.sensors.positions - world.fleet.positions[uav]).T)
             heard = distance <= 360.0
             np.testing.assert_array_equal(seen["queue"], np.where(heard, world.sensors.queue, was["queue"]))
             np.testing.assert_array_equal(seen["battery"], np.where(heard, world.sensors.battery, was["battery"]))
@@ -277,7 +277,7 @@ def test_state_is_laid_out_as_documented() -> None:
     assert state.shape == (1 + 2 * 2 + 4 * 3,)
     assert state.dtype == np.float32
     np.testing.assert_allclose(state[0], 0.25)
-    np.testing.assert_allclose(state[1:5], world.laps.positions.ravel() / 1000, rtol=1e-6)
+    np.testing.assert_allclose(state[1:5], world.fleet.positions.ravel() / 1000, rtol=1e-6)
     np.testing.assert_allclose(state[5:11], [0.5, 0.5, 0.5, 0.7, 0.5, 0.9], rtol=1e-6)
     np.testing.assert_allclose(state[11:14], [0.0, 1.0, 1.0])
     np.testing.assert_allclose(state[14:], [0.98, 1.0, 1.0], rtol=1e-6)

@@ -1,0 +1,84 @@
+"""``results.json``: what an experiment found, for the figures, the tables and the results page."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal
+
+from simulator.record import Record
+
+
+class Interval(Record):
+    """A mean over seeds with its 95% bootstrap interval; ``values`` one a seed, in the order of ``Result.seeds``."""
+
+    mean: float
+    low: float
+    high: float
+    values: list[float]
+
+
+class Curve(Record):
+    """A measure by step, mean over seeds with its 95% bootstrap interval, each of length T."""
+
+    mean: list[float]
+    low: list[float]
+    high: list[float]
+
+
+class Paired(Record):
+    """Two schemes on the same worlds: ``scheme``'s measure over (or less) ``reference``'s, with a 95% interval."""
+
+    scheme: str
+    reference: str
+    measure: str
+    kind: Literal["ratio", "difference"]
+    mean: float
+    low: float
+    high: float
+
+
+class Figure(Record):
+    """One figure to draw of a result.
+
+    ``curves``: the measures by step, one panel each; ``bars``: a bar a scheme, one panel a measure;
+    ``sweep``: each measure over ``Result.sweep``.
+    """
+
+    name: str
+    kind: Literal["curves", "bars", "sweep"]
+    measures: list[str]
+    caption: str
+
+
+class Sweep(Record):
+    """The x axis of a sweep: its label, and where each scheme stands on it."""
+
+    label: str
+    at: dict[str, float]
+
+
+class Result(Record):
+    """One experiment's findings.
+
+    ``schemes`` is by scheme's name, then by measure's, in the order to show them; ``labels`` says how people
+    call schemes and measures; ``seeds_of`` names schemes that flew fewer seeds than the rest.
+    """
+
+    experiment: str
+    title: str
+    command: str
+    version: str
+    commit: str | None
+    created_at: datetime
+    quick: bool
+    scenario: str
+    seeds: list[int]
+    model: str | None = None
+    schemes: dict[str, dict[str, Interval]]
+    curves: dict[str, dict[str, Curve]] = {}
+    paired: list[Paired] = []
+    sweep: Sweep | None = None
+    figures: list[Figure] = []
+    labels: dict[str, str] = {}
+    seeds_of: dict[str, list[int]] = {}
+    notes: list[str] = []
