@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 Point = tuple[float, float]
 
@@ -42,10 +42,10 @@ class Scenario(BaseModel):
     )
     pipeline: tuple[Annotated[Point, Field(strict=False)], ...] = Field(
         ((50.0, 120.0), (350.0, 300.0), (500.0, 560.0), (720.0, 640.0), (950.0, 900.0)),
-        min_length=2,
         max_length=1000,
         strict=False,
-        description="polyline that layout `pipeline` strings the sensors along",
+        description="polyline that layout `pipeline` strings the sensors along, and that pictures of layout "
+        "`surveyed` show; none: ()",
     )
     pipeline_spread_m: float = Field(20.0, ge=0, le=1e6, description="largest offset from the polyline, each axis")
 
@@ -87,10 +87,19 @@ class Scenario(BaseModel):
     uplink_drop: float = Field(0.0, ge=0, lt=1, description="share of requests lost on the way to the edge")
     uplink_jitter_ms: float = Field(0.0, ge=0, le=10_000, description="uniform extra delay of a request")
 
+    @field_validator("pipeline")
+    @classmethod
+    def _no_lone_point(cls, pipeline: tuple[Point, ...]) -> tuple[Point, ...]:
+        if len(pipeline) == 1:
+            raise ValueError("a polyline of one point: give at least two, or none")
+        return pipeline
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.arrival_rate_min > self.arrival_rate_max:
             raise ValueError("arrival_rate_min exceeds arrival_rate_max")
+        if self.layout == "pipeline" and not self.pipeline:
+            raise ValueError("layout pipeline needs a pipeline of at least two points")
         if self.layout == "surveyed" and len(self.sites) != self.sensors:
             raise ValueError(
                 f"layout surveyed needs a site for each of {self.sensors} sensors, sites has {len(self.sites)}"

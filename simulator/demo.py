@@ -6,7 +6,7 @@ import shlex
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,8 @@ from rich.console import Console
 
 from simulator.client import EdgeError
 from simulator.record import BadUse, fresh_folder, naming_out, refuse_old_result
-from simulator.simulate import Job, check_bounds, chosen_scenario, conduct, reporting
+from simulator.simulate import Job, check_bounds, conduct, reporting
+from simulator.site import chosen_site
 
 EDGE_LOG = "edge.log"
 STOP_S = 10.0
@@ -41,8 +42,11 @@ class Demo:
     """Folder to write to, made if missing."""
     seed: int = 0
     """Of the world, 0 to 4294967295; the same seed is the same world."""
-    scenario: str = "paper"
-    """The world: paper, pipeline, stress, dense or lossy_uplink; `aicvds simulate --help` says what they are."""
+    scenario: str | None = None
+    """A ready-made world: paper (the default), pipeline, stress, dense or lossy_uplink; `aicvds simulate --help`
+    says what they are."""
+    world: Path | None = None
+    """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` says what is in it."""
     port: int = 0
     """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
     wait_s: float = 300.0
@@ -70,20 +74,19 @@ def demo(options: Demo, command: str, console: Console) -> int:
         BadUse: the options make no demo, or the folder cannot be written.
         EdgeError: the edge died at start, or never became ready.
     """
-    scenario = chosen_scenario(options.scenario)
+    site = chosen_site(options.scenario, options.world)
     check_bounds(options.seed, options.wait_s)
     if not 0 <= options.port <= 65_535:
         raise BadUse(f"--port {options.port} is not between 0 and 65535")
     refuse_old_result(options.out, overwrite=True)
-    port = _usable_port(options.port)
+    port = usable_port(options.port)
     fresh_folder(options.out)
     from simulator.mission import new_mission_id
-    from simulator.site import Site
 
     job = Job(
-        site=Site(scenario),
+        site=site,
         seed=options.seed,
-        mission_id=new_mission_id(scenario, options.seed),
+        mission_id=new_mission_id(site.scenario, options.seed),
         out=options.out,
         command=command,
         edge=f"http://{HOST}:{port}",
@@ -94,19 +97,29 @@ def demo(options: Demo, command: str, console: Console) -> int:
         console.print(
             f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
         )
-        return conduct(job, console, alive=lambda: _check_alive(process, log))
+        return conduct(job, console, alive=lambda: check_alive(process, log))
 
 
 @contextmanager
-def edge_process(port: int, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """An edge on the loopback's ``port``, its output in ``log``; stopped on leaving, whatever the reason."""
+def edge_process(
+    port: int, log: Path, environment: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
+    """An edge on the loopback's ``port``, its output in ``log``; stopped on leaving, whatever the reason.
+
+    ``environment`` has its settings; ``None``: this process's.
+    """
     command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
     with naming_out(log.parent):
         output = log.open("wb")
     with output:
         # A session of its own: Ctrl-C must reach the flight first, which still needs its edge to land.
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+            env=environment,
         )
         try:
             yield process
@@ -126,14 +139,16 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
             process.wait()
 
 
-def _check_alive(process: subprocess.Popen[bytes], log: Path) -> None:
+def check_alive(process: subprocess.Popen[bytes], log: Path) -> None:
+    """Raises :class:`EdgeDied` with the end of its log once the edge has ended."""
     code = process.poll()
     if code is not None:
         tail = log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL_LINES:]
         raise EdgeDied("\n".join([f"the edge ended with code {code}; the end of {log}:", *tail]))
 
 
-def _usable_port(port: int) -> int:
+def usable_port(port: int) -> int:
+    """A port of the loopback that is free: ``port``, or any for 0; raises ``BadUse`` if it is taken."""
     # Were the port taken, the edge would die and the mission fly against whatever listens there.
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -38,6 +38,22 @@ POLICIES = {
     "wqcs": (GREEN, ":", "^"),
     "round_robin": (PURPLE, "-.", "D"),
     "random": (SKY, (0, (5, 1, 1, 1)), "v"),
+    "eof_fast": (ORANGE, (0, (1, 1)), "p"),
+    "wqcs_fast": (GREEN, "-.", "<"),
+    "max_gain": (RED, "--", ">"),
+    "nearest": (GREY, "-.", "X"),
+    "madqn": (RED, "-", "P"),
+    "mappo": (PURPLE, "-", "*"),
+    "mpc": (INK, "-", "h"),
+    "bound": (INK, (0, (4, 2)), "|"),
+    "llm": (BLUE, "-", "o"),
+    "guided": (BLUE, "--", "d"),
+    "value": (BLUE, ":", "8"),
+    "edge_policy": (BLUE, "-.", "H"),
+    "llm_all": (SKY, "--", "s"),
+    "llm_random_start": (SKY, "-", "^"),
+    "llm_chance": (SKY, ":", "1"),
+    "value_random_start": (GREEN, "--", "D"),
 }
 OTHER_POLICY = (GREY, "-", "x")
 SOURCES = {"llm": BLUE, "guided": PURPLE, "value": GREEN, "policy": ORANGE, "onboard": RED}
@@ -47,7 +63,7 @@ MAPS = 9
 LABEL_OFFSET = 0.06
 WIDTH_IN = 9.0
 
-_RC: dict[Any, Any] = {
+RC: dict[Any, Any] = {
     "svg.fonttype": "none",
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial", "sans-serif"],
@@ -72,7 +88,7 @@ _HALO = [withStroke(linewidth=2.5, foreground="white")]
 @contextmanager
 def _drawn(name: str, height_in: float, panels: tuple[int, int], out: list[str]) -> Iterator[list[Axes]]:
     # A constant salt makes the ids, and so the whole text, the same on every run.
-    with matplotlib.style.context(["default", {**_RC, "svg.hashsalt": name}]):
+    with matplotlib.style.context(["default", {**RC, "svg.hashsalt": name}]):
         figure = Figure(figsize=(WIDTH_IN, height_in), layout="compressed")
         yield list(figure.subplots(*panels, squeeze=False).flat)
         out.append(_inline_svg(figure, name))
@@ -99,7 +115,8 @@ def _integers(axes: Axes, x: bool = True, y: bool = True) -> None:
         axes.yaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
 
 
-def _plain(axes: Axes) -> None:
+def plain(axes: Axes) -> None:
+    """Two spines, ticks outside, a faint grid across."""
     axes.minorticks_off()
     axes.tick_params(top=False, right=False, direction="out")
     axes.spines[["top", "right"]].set_visible(False)
@@ -158,6 +175,8 @@ def _map_frame(axes: Axes, scenario: Scenario, uav: int) -> None:
     axes.set_xlabel("x (m)")
     axes.minorticks_off()
     axes.locator_params(nbins=4)
+    if scenario.layout != "uniform" and scenario.pipeline:
+        axes.plot(*np.array(scenario.pipeline).T, color="#cccccc", linewidth=2.5, zorder=0.5)
 
 
 def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Decision]) -> list[np.ndarray]:
@@ -234,7 +253,7 @@ def latency_per_step(decisions: Sequence[Decision]) -> str:
             axes.set_ylim(bottom=0)
         axes.set_xlabel("step")
         axes.set_ylabel("round trip (ms)")
-        _plain(axes)
+        plain(axes)
         _integers(axes, y=False)
     return out[0]
 
@@ -259,7 +278,7 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> str
             panels[2 * row].set_ylabel(f"{title} a step")
             panels[2 * row + 1].set_ylabel(f"{title}, cumulative")
         for axes in panels:
-            _plain(axes)
+            plain(axes)
             _integers(axes)
             axes.set_ylim(bottom=0)
         for axes in panels[2:]:
@@ -292,7 +311,7 @@ def tokens_per_step(decisions: Sequence[Decision]) -> str:
             axes.set_title(title)
             axes.set_xlabel("step")
             axes.set_ylim(bottom=0)
-            _plain(axes)
+            plain(axes)
             _integers(axes)
         panels[0].set_ylabel("tokens a decision")
         handles, labels = panels[0].get_legend_handles_labels()
@@ -323,7 +342,7 @@ def visits(decisions: Sequence[Decision], sensors: int) -> str:
             axes.set_xticks(at)
         axes.set_xlabel("sensor")
         axes.set_ylabel("visits")
-        _plain(axes)
+        plain(axes)
         _integers(axes, x=False)
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=3)
     return out[0]
@@ -342,7 +361,7 @@ def deciders(decisions: Sequence[Decision]) -> str:
                 below = below + counts
         axes.set_xlabel("step")
         axes.set_ylabel("decisions")
-        _plain(axes)
+        plain(axes)
         _integers(axes)
         if steps:
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=len(SOURCES))

@@ -29,7 +29,7 @@ def picture(world: PipelineWorld) -> NDArray[np.uint8]:
         high.append(path.bounds[1])
     x, y = sensors.positions.T
     axes.scatter(x, y, c=sensors.queue, s=90, cmap="Reds", edgecolors="k", vmin=0, vmax=scenario.queue_capacity)
-    if scenario.layout == "pipeline":
+    if scenario.layout != "uniform" and scenario.pipeline:
         axes.plot(*np.array(scenario.pipeline).T, color="0.7", lw=3, zorder=0)
     (left, bottom), (right, top) = np.min(low, axis=0), np.max(high, axis=0)
     margin = 0.05 * scenario.area_m

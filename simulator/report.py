@@ -19,7 +19,15 @@ from simulator.record import Decision, Summary, Tally, told_sources
 COSTLIEST_DECISIONS = 15
 # Of the decisions, that the LLM must have taken for the mission to count as the LLM's.
 LLM_SHARE = 0.9
-NAMES = {"aic_vds": "AIC-VDS", "eof": "EOF", "wqcs": "WQCS", "round_robin": "round robin", "random": "random"}
+NAMES = {
+    "aic_vds": "AIC-VDS",
+    "eof": "EOF",
+    "wqcs": "WQCS",
+    "round_robin": "round robin",
+    "random": "random",
+    "max_gain": "maximum channel gain",
+    "nearest": "nearest neighbour",
+}
 
 
 def policy_labels(summary: Summary) -> dict[str, str]:

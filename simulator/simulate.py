@@ -21,7 +21,6 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from tyro.conf import FlagCreatePairsOff, arg
 
-from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient, EdgeError, edge_url
 from simulator.record import (
@@ -37,12 +36,12 @@ from simulator.record import (
     summarise,
     told_sources,
 )
+from simulator.site import Site, chosen_site
 from simulator.uplink import LossyTransport
 
 # The world and matplotlib take a second to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
     from simulator.mission import Choice, Flight, Pilot
-    from simulator.site import Site
 
 API_KEY = "AICVDS_API_KEY"
 # Without a deadline of our own the edge's applies, and it may be as long as the paper's step.
@@ -71,6 +70,10 @@ class Simulate:
 
       aicvds simulate --policy eof
 
+    Your own pipeline:
+
+      aicvds simulate --policy eof --world examples/pipeline_world
+
     An edge lost on the way: the UAVs decide on board with EOF, and before the next step wait up to --reconnect-s
     seconds for the edge to come back. Steps are not real time, so without a pause the mission would be over first.
 
@@ -80,16 +83,20 @@ class Simulate:
 
     edge: Annotated[str | None, arg(metavar="URL")] = None
     """The edge's address, such as http://127.0.0.1:8000. Needed, unless --policy is a local one: that asks no edge."""
-    scenario: Annotated[str, arg(metavar="NAME")] = "paper"
-    """The world: paper (10 sensors, 3 UAVs, 30 steps), pipeline (sensors in a line), stress (weak link),
-    dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost)."""
+    scenario: Annotated[str | None, arg(metavar="NAME")] = None
+    """A ready-made world: paper (10 sensors, 3 UAVs, 30 steps; the default), pipeline (sensors in a line), stress
+    (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost)."""
+    world: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """A world of your own, instead of --scenario: a folder with world.geojson (sensors, trajectories) and, if you
+    like, scenario.toml (other numbers) and arrivals.csv (recorded traffic). examples/pipeline_world is one."""
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Of the world: sensors, arrivals and start angles. 0 to 4294967295; the same seed is the same world."""
+    """Of the world: sensors, queues, arrivals and starts, as far as they are not given. 0 to 4294967295; the same
+    seed is the same world."""
     steps: Annotated[int | None, arg(metavar="N")] = None
-    """Waypoints to fly, 1 to 10000. Default: the scenario's (30)."""
+    """Waypoints to fly, 1 to 10000. Default: the world's (30 in every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """Who decides: edge, or with no edge at all eof (earliest overflow first), wqcs (weighted queue and
-    channel), round_robin or random."""
+    channel), max_gain (highest channel gain), nearest (nearest neighbour), round_robin or random."""
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
     """How the edge decides: llm (the paper's method) or value (what its modules learned). Default: the edge's."""
     deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
@@ -121,14 +128,13 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         BadUse: the options make no mission, or the folder cannot be written.
         EdgeError: no edge answers as one.
     """
-    scenario = chosen_scenario(options.scenario, options.steps)
+    site = chosen_site(options.scenario, options.world, options.steps)
     check(options)
     from simulator.mission import new_mission_id
-    from simulator.site import Site
 
-    mission_id = new_mission_id(scenario, options.seed)
+    mission_id = new_mission_id(site.scenario, options.seed)
     job = Job(
-        site=Site(scenario),
+        site=site,
         seed=options.seed,
         mission_id=mission_id,
         out=options.out or Path("runs") / mission_id,
@@ -142,16 +148,6 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     )
     refuse_old_result(job.out, options.overwrite)
     return conduct(job, console)
-
-
-def chosen_scenario(name: str, steps: int | None = None) -> Scenario:
-    """The preset, with other ``steps`` if given; raises ``BadUse``."""
-    try:
-        scenario = scenario_named(name)
-        return scenario if steps is None else Scenario.model_validate({**scenario.model_dump(), "steps": steps})
-    except ValueError as error:
-        known = not str(error).startswith("unknown scenario")
-        raise BadUse(f"--steps {steps} is not between 1 and 10000" if known else f"--scenario: {error}") from None
 
 
 def check(options: Simulate) -> None:

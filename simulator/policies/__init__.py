@@ -7,6 +7,8 @@ from typing import Protocol
 
 from shared.scenario import Scenario
 from simulator.policies.eof import EarliestOverflowFirst
+from simulator.policies.max_gain import MaximumGain
+from simulator.policies.nearest import NearestNeighbour
 from simulator.policies.random_choice import RandomChoice
 from simulator.policies.round_robin import RoundRobin
 from simulator.policies.wqcs import WeightedQueueChannel
@@ -38,6 +40,8 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "round_robin": RoundRobin,
     "eof": EarliestOverflowFirst,
     "wqcs": WeightedQueueChannel,
+    "max_gain": MaximumGain,
+    "nearest": NearestNeighbour,
 }
 
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)

@@ -57,6 +57,12 @@ def test_a_field_out_of_bounds_is_named(field: str, value: Any) -> None:
     assert [error["loc"][0] for error in caught.value.errors()] == [field]
 
 
+def test_only_layout_pipeline_needs_a_pipeline() -> None:
+    assert Scenario(pipeline=()).pipeline == ()
+    with pytest.raises(ValidationError, match="layout pipeline needs a pipeline of at least two points"):
+        Scenario(layout="pipeline", pipeline=())
+
+
 def test_rates_that_contradict_each_other() -> None:
     with pytest.raises(ValidationError, match="arrival_rate_min exceeds arrival_rate_max"):
         Scenario(arrival_rate_min=9.0)

@@ -40,8 +40,10 @@ def ready(name: str, scenario: Scenario = FOUR, seed: int = 0) -> Policy:
 
 
 def test_an_unknown_policy_lists_the_known_ones() -> None:
-    assert POLICY_NAMES == ("random", "round_robin", "eof", "wqcs")
-    with pytest.raises(ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs"):
+    assert POLICY_NAMES == ("random", "round_robin", "eof", "wqcs", "max_gain", "nearest")
+    with pytest.raises(
+        ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs, max_gain"
+    ):
         policy_named("best")
 
 
@@ -54,7 +56,7 @@ def test_eof_leaves_what_is_taken() -> None:
     assert ready("eof").decide(1, seen([30, 60, 50, 40], [5, 4, 5, 5]), frozenset({2})) == (3, 7)
 
 
-@pytest.mark.parametrize("name", ["eof", "wqcs"])
+@pytest.mark.parametrize("name", ["eof", "wqcs", "max_gain"])
 def test_with_nothing_in_range_the_longest_silent_sensor(name: str) -> None:
     policy = ready(name)
     assert policy.decide(0, seen([60, 1, 60, 60], [4, 2, 3, 4]), NONE)[0] == 1
@@ -74,6 +76,48 @@ def test_wqcs_weighs_queue_against_channel() -> None:
 
 def test_wqcs_ignores_a_better_sensor_out_of_range() -> None:
     assert ready("wqcs").decide(0, seen([60, 10, 10, 10], [4, 5, 5, 5], [0, 300, 200, 350]), NONE)[0] == 2
+
+
+def test_max_gain_takes_the_best_channel_in_range_however_empty_its_queue() -> None:
+    policy = ready("max_gain")
+    # Sensor 0 had the best channel a step ago: it is out of range now.
+    observation = seen([60, 60, 0, 60], [4, 5, 5, 5], [20, 300, 100, 200])
+    assert [policy.decide(0, observation, NONE) for _ in range(2)] == [(2, 7)] * 2
+    assert policy.decide(0, observation, frozenset({2})) == (3, 7)
+
+
+def test_nearest_neighbour_goes_through_what_is_in_range_and_starts_again() -> None:
+    policy = ready("nearest")
+    in_range = seen([60, 0, 60, 60], [5, 5, 5, 4], [300, 100, 200, 50])
+    assert [policy.decide(0, in_range, NONE) for _ in range(7)] == [(s, 7) for s in (1, 2, 0, 1, 2, 0, 1)]
+
+
+def test_each_uav_goes_by_its_own_rounds() -> None:
+    policy = ready("nearest")
+    in_range = seen([60] * 4, [5] * 4, [300, 100, 200, 350])
+    assert policy.decide(0, in_range, NONE)[0] == policy.decide(1, in_range, NONE)[0] == 1
+    assert policy.decide(1, in_range, frozenset({2}))[0] == 0
+
+
+def test_a_sensor_that_comes_into_range_is_part_of_the_round() -> None:
+    policy = ready("nearest")
+    assert policy.decide(0, seen([60] * 4, [5, 5, 4, 4], [200, 100, 300, 300]), NONE)[0] == 1
+    assert policy.decide(0, seen([60] * 4, [5, 5, 5, 4], [200, 100, 150, 300]), NONE)[0] == 2
+    assert policy.decide(0, seen([60] * 4, [5, 5, 5, 4], [200, 100, 150, 300]), NONE)[0] == 0
+
+
+def test_with_nothing_in_range_the_nearest_neighbour_is_the_nearest_free() -> None:
+    policy = ready("nearest")
+    out_of_range = seen([60, 1, 60, 60], [4, 2, -1, 4], [900, 700, 400, 800])
+    assert [policy.decide(0, out_of_range, NONE)[0] for _ in range(2)] == [2, 2]
+    assert policy.decide(0, out_of_range, frozenset({2}))[0] == 1
+
+
+def test_a_reset_begins_a_new_round() -> None:
+    policy, in_range = ready("nearest"), seen([60] * 4, [5] * 4, [300, 100, 200, 350])
+    assert policy.decide(0, in_range, NONE)[0] == 1
+    policy.reset(FOUR, 1)
+    assert policy.decide(0, in_range, NONE)[0] == 1
 
 
 def test_round_robin_visits_every_sensor_in_turn() -> None:

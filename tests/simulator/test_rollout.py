@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import random
+from dataclasses import dataclass, field
 from typing import Any
 
+import httpx
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.channel import link_holds
 from shared.scenario import SCENARIOS, Scenario
+from simulator.client import EdgeClient
+from simulator.mission import EdgePilot, LocalPilot, fly
 from simulator.policies import POLICY_NAMES, policy_named
 from simulator.rollout import rollout
-from simulator.world import Observation, PipelineWorld, StepTally
+from simulator.site import Site
+from simulator.uplink import LossyTransport
+from simulator.world import Cost, Observation, PipelineWorld, StepTally
+from tests.simulator.edge_stub import stub_edge
 
 
 class Recorder:
@@ -80,6 +89,81 @@ def test_no_policy_changes_the_world() -> None:
         rollout(world, policy_named(name), seed=5)
         worlds.add(tuple(drawn(world)))
     assert len(worlds) == 1
+
+
+class Reckless:
+    """Draws from, and reseeds, every generator that a program shares."""
+
+    def reset(self, scenario: Scenario, seed: int) -> None:
+        self._count = scenario.sensors
+        random.seed(seed)
+        np.random.seed(seed)
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+        np.random.seed(int(np.random.randint(2**31)))
+        return random.randrange(self._count), int(np.random.randint(15))
+
+
+@dataclass(frozen=True, eq=False)
+class Watched(Site):
+    """A site that keeps the worlds made on it."""
+
+    made: list[PipelineWorld] = field(default_factory=list)
+
+    def world(self, cost: Cost = "default", render_mode: str | None = None) -> PipelineWorld:
+        self.made.append(super().world(cost, render_mode))
+        return self.made[-1]
+
+
+ROUTES = Scenario(
+    name="routes",
+    layout="surveyed",
+    steps=4,
+    sites=tuple((100.0 * j, 50.0 * (j % 3)) for j in range(10)),
+    routes=(
+        ((0.0, 0.0), (900.0, 0.0)),
+        ((0.0, 500.0), (900.0, 500.0), (900.0, 0.0), (0.0, 500.0)),
+        ((900.0, 0.0), (500.0, 100.0), (100.0, 0.0)),
+    ),
+)
+TRACE = np.arange(50).reshape(5, 10)
+SITES = {
+    "paper": Site(SCENARIOS["paper"].model_copy(update={"steps": 4})),
+    "lossy": Site(SCENARIOS["lossy_uplink"].model_copy(update={"steps": 4, "uplink_jitter_ms": 1.0})),
+    "routes": Site(ROUTES),
+    "traced": Site(ROUTES, TRACE),
+}
+
+
+@pytest.mark.parametrize("site", SITES)
+def test_whoever_flies_and_however_the_world_is_the_same(site: str) -> None:
+    """Every policy, the edge over a sound or a lossy uplink, no edge at all, and a policy that shares its dice."""
+    watched = Watched(SITES[site].scenario, SITES[site].arrivals)
+    scenario = watched.scenario
+    for name in POLICY_NAMES:
+        fly(watched, LocalPilot(name, scenario, 5), seed=5)
+    rollout(watched.world(), Reckless(), seed=5)
+    with stub_edge() as stub:
+        for behaviour, transport in (
+            ("ok", None),
+            ("garbage", None),
+            ("ok", LossyTransport(httpx.HTTPTransport(), drop=0.3, jitter_ms=1.0, seed=5)),
+        ):
+            stub.otherwise = behaviour  # type: ignore[assignment]
+            with EdgeClient(stub.url, timeout_s=5, attempts=1, seed=5, transport=transport) as client:
+                fly(watched, EdgePilot(client, "m", scenario, seed=5), seed=5)
+    assert len({tuple(drawn(world)) for world in watched.made}) == 1
+    assert len(watched.made) == len(POLICY_NAMES) + 4
+    assert all(len(world.tally) == scenario.steps for world in watched.made)
+
+
+def test_a_trace_replaces_the_arrivals_and_nothing_else() -> None:
+    drawn_world, traced = SITES["routes"].world(), SITES["traced"].world()
+    drawn_world.reset(seed=5)
+    traced.reset(seed=5)
+    np.testing.assert_array_equal(traced.sensors.arrivals, TRACE[:4])
+    before, after = drawn(drawn_world), drawn(traced)
+    assert [a == b for a, b in zip(before, after, strict=True)] == [True, True, True, False, True]
 
 
 def test_another_seed_is_another_world_in_everything() -> None:
