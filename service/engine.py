@@ -20,7 +20,7 @@ from service.metrics import Metrics
 from service.mission import Mission
 from service.missions import Missions
 from service.policy import decide_without_llm
-from service.prompt import Prompt, build_prompt
+from service.prompt import Prompt
 from service.settings import Settings
 from service.tokens import TokenCounter, price_usd
 from service.view import View
@@ -141,7 +141,7 @@ class Engine:
         watch.lap("augment")
         view.attend(mission)
         watch.lap("attend")
-        prompt = build_prompt(mission.scenario, view.state, view.rows, mission.experiences)
+        prompt = mission.template.prompt(view.state, view.shown(mission), mission.experiences)
         tokens = self._count(prompt)
         watch.lap("prompt")
         deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.reach import Reach, distances_ahead
 from shared.channel import FloatArray, channel_gain_db
 from shared.scenario import Point, Scenario
 from shared.urgency import urgency
-from shared.wire import UavState
+from shared.wire import Features, UavState
 
-FEATURES = 5
+# Numbers a sensor in each preset.
+FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +23,8 @@ class State:
     """One UAV's view at one step; arrays have shape ``(J,)``, ``places`` ``(J, 2)``, in the request's order.
 
     ``progress_m`` along the trajectory, if the UAV told it; ``queue`` packets, ``battery`` J, ``gain`` dB,
-    ``since_visit`` steps, ``urgency`` 0..1, ``distance`` m from the UAV now. Sensors
-    never heard (``heard`` false) hold zeros in what only a beacon tells.
+    ``rate`` packets a step, ``since_visit`` steps, ``urgency`` 0..1, ``distance`` m from the UAV now. Sensors
+    never heard (``heard`` false) hold zeros in what only a beacon tells. ``reach`` only in preset ``reach``.
     """
 
     position: Point
@@ -34,12 +36,23 @@ class State:
     queue: FloatArray
     battery: FloatArray
     gain: FloatArray
+    rate: FloatArray
     since_visit: FloatArray
     urgency: FloatArray
     distance: FloatArray
+    reach: Reach | None = None
+
+    @property
+    def able(self) -> NDArray[np.bool_]:
+        """Whether each sensor was heard and has a battery."""
+        return self.heard & (self.battery > 0)
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
-        """Preset ``paper``, d = 5, admissible sensors only: ``[b/E0, q/W, h normalised, delta/T, U]``, each 0..1."""
+        """What attention sees of the admissible sensors, ``(n, d)``, each number 0..1.
+
+        Preset ``paper``, d = 5: ``[b/E0, q/W, h normalised, delta/T, U]``. Preset ``reach``, d = 12: these and
+        :meth:`Reach.sensor_features`.
+        """
         best = float(channel_gain_db(0.0, scenario))
         worst = -scenario.path_loss_limit_db
         columns = (
@@ -50,7 +63,22 @@ class State:
             self.urgency,
         )
         stacked = np.stack([np.clip(c[self.admissible], 0.0, 1.0) for c in columns], axis=1)
+        if self.reach is not None:
+            room = scenario.queue_capacity - self.queue
+            # A sensor that nothing arrives at never overflows.
+            overflow_in = np.divide(room, self.rate, out=np.full_like(room, np.inf), where=self.rate > 0)
+            added = self.reach.sensor_features(self.urgency, overflow_in, scenario)
+            stacked = np.concatenate((stacked, added[self.admissible]), axis=1)
         return np.ascontiguousarray(stacked, dtype=np.float32)
+
+    def approach(self, row: int, scenario: Scenario) -> NDArray[np.float32]:
+        """What the velocity scorer is told of the sensor in that row beside its context.
+
+        Preset ``paper``: the normalised distance, ``(1,)``. Preset ``reach``: :meth:`Reach.level_features`, ``(V, 4)``.
+        """
+        if self.reach is not None:
+            return self.reach.level_features(row, float(self.urgency[row]), scenario)
+        return np.array([self.normalised_distance(row, scenario)], dtype=np.float32)
 
     def normalised_distance(self, row: int, scenario: Scenario) -> float:
         """Distance of the sensor in that row in radio radii, at most 2."""
@@ -65,6 +93,7 @@ def augment(
     visits: NDArray[np.int64],
     rates: FloatArray,
     reserved: Collection[int],
+    preset: Features = "paper",
 ) -> State:
     """Complete a UAV's report with visiting records, urgency, and the channel from where it is now.
 
@@ -76,6 +105,7 @@ def augment(
         visits: step of each sensor's last visit (TVR_j), by sensor ID; one never visited counts from step 0.
         rates: observed arrival rates, packets a step, by sensor ID.
         reserved: sensors that other UAVs were given this step.
+        preset: ``reach`` looks ahead along the UAV's trajectory too.
     """
     sensors = uav.sensors
     ids = np.asarray(sensors.id, dtype=np.int64)
@@ -85,6 +115,11 @@ def augment(
     places = np.stack((sensors.x, sensors.y), axis=1)
     distance = np.linalg.norm(places - position, axis=1)
     queue, battery = filled(sensors.queue), filled(sensors.battery)
+    urgencies = urgency(queue, rates[ids], scenario)
+    reach = None
+    if preset == "reach":
+        ahead = distances_ahead(uav.uav_id, position, uav.progress_m, places, scenario)
+        reach = Reach.of(ahead, np.where(heard & (battery > 0), queue, 0.0), urgencies, scenario)
     return State(
         position=position,
         progress_m=uav.progress_m,
@@ -95,9 +130,11 @@ def augment(
         queue=queue,
         battery=battery,
         gain=np.where(fresh, filled(sensors.channel_gain), channel_gain_db(distance, scenario)),
+        rate=rates[ids],
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
-        urgency=urgency(queue, rates[ids], scenario),
+        urgency=urgencies,
         distance=distance,
+        reach=reach,
     )
 
 

@@ -11,37 +11,41 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from service.attention import Attention
-from service.velocity import VelocityScorer
+from service.features import FEATURES
+from service.reach import LEVEL_FEATURES
+from service.velocity import ReachVelocityScorer, VelocityScorer
+from shared.wire import Features
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
     """One decision as the modules saw it.
 
-    ``features`` are the admissible sensors' ``(n, d)``, ``chosen`` the row that was decided for,
-    ``distance`` that sensor's normalised distance, ``velocity`` the level flown.
+    ``features`` are the admissible sensors' ``(n, d)``, ``chosen`` the row that was decided for, ``approach``
+    what the velocity scorer was told of that sensor (see :meth:`State.approach`), ``velocity`` the level flown.
     """
 
     features: NDArray[np.float32]
     chosen: int
-    distance: float
+    approach: NDArray[np.float32]
     velocity: int
 
 
 class Modules(nn.Module):
-    """The attention and velocity modules, which learn jointly."""
+    """The attention and velocity modules of one feature preset, which learn jointly."""
 
-    def __init__(self, features: int, levels: int, seed: int) -> None:
+    def __init__(self, preset: Features, levels: int, seed: int) -> None:
         super().__init__()
+        self.preset: Features = preset
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.attention = Attention(features)
-            self.velocity = VelocityScorer(levels)
+            self.attention = Attention(FEATURES[preset])
+            self.velocity = VelocityScorer(levels) if preset == "paper" else ReachVelocityScorer(LEVEL_FEATURES)
 
     def evaluate(self, sample: Sample) -> tuple[Tensor, Tensor]:
         """Scores ``(n,)`` of the sensors, and values ``(levels,)`` of the velocities for the sensor decided."""
         scores, z = self.attention(torch.from_numpy(sample.features))
-        return scores, self.velocity(z[sample.chosen], torch.tensor(sample.distance, dtype=z.dtype))
+        return scores, self.velocity(z[sample.chosen], torch.from_numpy(sample.approach).to(z.dtype))
 
     def loss(self, sample: Sample, reward: float) -> Tensor:
         """``(s_j - r)^2 + (u_v - r)^2`` for the sensor j and velocity v decided, r = -c."""
@@ -56,9 +60,9 @@ class Modules(nn.Module):
         return scores, z
 
     @torch.inference_mode()
-    def velocities(self, z: Tensor, distance: float) -> Tensor:
+    def velocities(self, z: Tensor, approach: NDArray[np.float32]) -> Tensor:
         """Values ``(levels,)`` of the velocities for one sensor, without gradients."""
-        values: Tensor = self.velocity(z, torch.tensor(distance, dtype=z.dtype))
+        values: Tensor = self.velocity(z, torch.from_numpy(approach))
         return values
 
 
@@ -90,6 +94,7 @@ class Learner:
 
 def rehearse() -> None:
     """Update once on nothing: at its first update torch imports a second's worth of modules."""
-    learner = Learner(Modules(1, 1, seed=0), learning_rate=1e-3)
-    learner.update(Sample(np.zeros((2, 1), np.float32), 0, 0.0, 0), 0.0)
-    learner.current.score(np.zeros((2, 1), np.float32))
+    features = np.zeros((2, FEATURES["paper"]), np.float32)
+    learner = Learner(Modules("paper", 1, seed=0), learning_rate=1e-3)
+    learner.update(Sample(features, 0, np.zeros(1, np.float32), 0), 0.0)
+    learner.current.score(features)

@@ -12,8 +12,9 @@ from service.checkpoint import initial_modules
 from service.features import filled
 from service.learner import Learner, Sample
 from service.problems import Conflict, NotFound, Refused
-from service.prompt import experience_text
-from service.settings import Settings
+from service.prompt import Template
+from service.rows import Cells
+from service.settings import Settings, prompt_tokens
 from shared.channel import FloatArray
 from shared.scenario import Scenario, scenario_named
 from shared.wire import MissionSpec, MissionStatus, Mode, Outcome, UavState
@@ -30,14 +31,17 @@ _NEVER = -1
 
 @dataclass(frozen=True, slots=True)
 class Pending:
-    """A decision whose outcome is still to come. ``sample`` is None where the modules had no part in it."""
+    """A decision whose outcome is still to come.
+
+    ``seen`` is the sensor's row as it was then; ``sample`` is None where the modules had no part in the decision.
+    """
 
     decision_id: str
     uav_id: int
     step: int
     sensor_id: int
     velocity: int
-    row: str
+    seen: Cells
     sample: Sample | None
 
 
@@ -54,7 +58,7 @@ class Mission:
     """One fleet's state. Only the event loop touches it, apart from the learner's own thread.
 
     Raises:
-        Refused: the spec names an unknown scenario.
+        Refused: the spec names an unknown scenario, or its prompt cannot fit the LLM's context.
     """
 
     def __init__(self, mission_id: str, spec: MissionSpec, settings: Settings) -> None:
@@ -67,11 +71,21 @@ class Mission:
         self.spec = spec
         self.mode: Mode = spec.mode or settings.mode
         self.top_k = spec.top_k or settings.top_k
+        told = spec.prompt.experiences
+        self._experience_limit = settings.experiences if told is None else told
+        # Mode `value` has nothing else to decide by.
+        self.attends = spec.attention == "on" or self.mode == "value"
+        self._check_prompt(settings)
+        ranked = self.attends and spec.prompt.order == "score"
+        self.template = Template(
+            self.scenario, spec.prompt, spec.features, experiences=self._experience_limit, ranked=ranked
+        )
         self.experiences: list[str] = []
         self.decisions = 0
         self.feedback = 0
         levels = self.scenario.max_velocity + 1
-        self.learner = Learner(initial_modules(spec.init, levels, spec.seed), learning_rate=settings.learning_rate)
+        modules = initial_modules(spec.init, spec.features, levels, spec.seed)
+        self.learner = Learner(modules, learning_rate=settings.learning_rate)
         sensors = self.scenario.sensors
         self.visits = np.full(sensors, _NEVER, dtype=np.int64)
         self._confirmed = np.full(sensors, _NEVER, dtype=np.int64)
@@ -84,7 +98,6 @@ class Mission:
         self._attempts: dict[int, dict[int, int]] = {}
         self._pending: dict[str, Pending] = {}
         self._applied: OrderedDict[str, None] = OrderedDict()
-        self._experience_limit = settings.experiences
 
     @property
     def rates(self) -> FloatArray:
@@ -114,6 +127,19 @@ class Mission:
             raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if uav.outcome is not None:
             self.find(uav.outcome.decision_id, f"{at}outcome.decision_id")
+
+    def _check_prompt(self, settings: Settings) -> None:
+        """Refuse a prompt that the LLM's context cannot hold; without an LLM nobody reads it."""
+        style, rows = self.spec.prompt, self.scenario.sensors
+        if self.attends:
+            rows = min(rows, self.top_k)
+        needed = prompt_tokens(style.format, rows, self._experience_limit, self.spec.features)
+        if self.mode != "value" and needed > settings.llm_context:
+            raise Refused(
+                "prompt",
+                f"{self._experience_limit} experiences and {rows} sensors as {style.format} need up to {needed} tokens "
+                f"and AICVDS_LLM_CONTEXT is {settings.llm_context}: raise it, or lower prompt.experiences or top_k",
+            )
 
     def find(self, decision_id: str, field: str = "decision_id") -> Literal["pending", "applied"]:
         """Where a decision stands; raises :class:`NotFound` for one that this mission does not know."""
@@ -189,7 +215,8 @@ class Mission:
             self._close_visit(decision.sensor_id, decision.decision_id)
         else:
             self._confirm_visit(decision)
-        self._remember(experience_text(decision.row, decision.sensor_id, decision.velocity, outcome.cost))
+        line = self.template.experience(decision.seen, decision.sensor_id, decision.velocity, outcome.cost)
+        self._remember(line)
         return decision.sample
 
     def _confirm_visit(self, decision: Pending) -> None:
@@ -220,6 +247,9 @@ class Mission:
             scenario=self.scenario,
             mode=self.mode,
             top_k=self.top_k,
+            attention=self.spec.attention,
+            features=self.spec.features,
+            prompt=self.spec.prompt.model_copy(update={"experiences": self._experience_limit}),
             init=self.spec.init,
             seed=self.spec.seed,
             decisions=self.decisions,

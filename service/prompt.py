@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.features import State
+from service.rows import FORMATS, UNKNOWN, Cells, cells, columns, full_cells, meanings
 from shared.scenario import Scenario
+from shared.wire import Features, PromptStyle
 
 _STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
 At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.
@@ -19,9 +21,8 @@ At each waypoint you choose one sensor to collect from and the velocity for the 
 Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost. \
 A transmission fails beyond {radius:g} m, or at a channel gain of {limit:g} dB or below.
 
-Each row is one sensor, the most promising first, with five numbers:
-sensor_id,queue,gain,age,distance
-queue: packets waiting. gain: channel gain in dB. age: steps since its last visit. distance: metres from this UAV.
+{introduction}
+{meanings}
 
 Rules:
 1. Prefer a full queue, then a long age.
@@ -29,9 +30,7 @@ Rules:
 3. Velocity is a whole number from 0 to {max_velocity} m/s. Fly slowly to stay near a far sensor with a full queue, \
 fast when the sensor is near or there is little to collect.
 
-Past decisions are rows without their first number, then > sensor_id velocity: cost, where 0 is best.
-
-Answer with two whole numbers and nothing else: sensor_id velocity"""
+{experiences}Answer with two whole numbers and nothing else: sensor_id velocity"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,51 +48,58 @@ class Prompt:
         return f"{self.experiences}{self.state}"
 
 
-def static_block(scenario: Scenario) -> str:
-    """Task, rules, velocity strategy and output format; the same bytes for the same scenario."""
-    return _STATIC.format(
-        step_s=scenario.step_s,
-        capacity=scenario.queue_capacity,
-        radius=scenario.radio_radius_m,
-        limit=-scenario.path_loss_limit_db,
-        max_velocity=scenario.max_velocity,
-    )
+class Template:
+    """One mission's way of putting a decision to the LLM.
 
-
-def row_text(state: State, row: int) -> str:
-    """One sensor of those kept: ``sensor_id,queue,gain,age,distance``.
-
-    No battery: a sensor that cannot send is masked before, so that the LLM need not judge it.
+    Args:
+        scenario: the mission's world.
+        style: the rows' format. Their order is the caller's; ``ranked`` says whether it is best first.
+        features: preset that decides on a row's columns.
+        experiences: the most that a prompt may hold; with 0 the static block does not speak of them.
+        ranked: whether the rows come best first.
     """
-    return f"{state.ids[row]},{_judged(state, row)}"
 
+    def __init__(
+        self,
+        scenario: Scenario,
+        style: PromptStyle | None = None,
+        features: Features = "paper",
+        *,
+        experiences: int = 8,
+        ranked: bool = True,
+    ) -> None:
+        self._format = FORMATS[(style or PromptStyle()).format]
+        self._columns = columns(features)
+        order = "the most promising first" if ranked else "in no particular order"
+        self.static = _STATIC.format(
+            step_s=scenario.step_s,
+            capacity=scenario.queue_capacity,
+            radius=scenario.radio_radius_m,
+            limit=-scenario.path_loss_limit_db,
+            max_velocity=scenario.max_velocity,
+            introduction=self._format.introduction(self._columns, order),
+            meanings=meanings(features),
+            experiences=f"{self._format.experience_note}\n\n" if experiences else "",
+        )
 
-def full_row_text(state: State, row: int) -> str:
-    """One sensor as an LLM would have to see it if nothing were pruned or masked for it.
+    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
+        """One line of the experiences: the chosen sensor's row, the decision, and its cost."""
+        return self._format.experience(seen, f"{sensor_id} {velocity}", f"{cost:.1f}")
 
-    ``sensor_id,queue,battery,gain,age,distance``, with question marks for what was never heard.
-    """
-    if not state.heard[row]:
-        return f"{state.ids[row]},?,?,?,{state.since_visit[row]:.0f},{state.distance[row]:.0f}"
-    queue, rest = _judged(state, row).split(",", 1)
-    return f"{state.ids[row]},{queue},{state.battery[row]:.0f},{rest}"
+    def unknown(self, sensor_id: int) -> Cells:
+        """The row of a sensor that was not reported."""
+        return {**dict.fromkeys(self._columns, UNKNOWN), "sensor_id": str(sensor_id)}
 
+    def prompt(self, state: State, kept_rows: Sequence[int], experiences: Sequence[str]) -> Prompt:
+        """The prompt for one decision; ``kept_rows`` index the state's rows, in the order to show them."""
+        above = self._format.experience_header(self._columns) if experiences else ""
+        gap = self._format.gap if experiences else ""
+        return Prompt(
+            static=self.static,
+            experiences=above + "".join(experiences),
+            state=gap + self._table([cells(state, row) for row in kept_rows]),
+            state_uncompressed=gap + self._table([full_cells(state, row) for row in range(len(state.ids))]),
+        )
 
-def _judged(state: State, row: int) -> str:
-    numbers = (state.queue[row], state.gain[row], state.since_visit[row], state.distance[row])
-    return ",".join(f"{number:.0f}" for number in numbers)
-
-
-def experience_text(row: str, sensor_id: int, velocity: int, cost: float) -> str:
-    """One line of the experiences: the chosen sensor's row, the decision, and its cost."""
-    return f"{row.split(',', 1)[1]} > {sensor_id} {velocity}: {cost:.1f}\n"
-
-
-def build_prompt(scenario: Scenario, state: State, kept_rows: Sequence[int], experiences: Sequence[str]) -> Prompt:
-    """The prompt for one decision; ``kept_rows`` index the state's rows, best first."""
-    return Prompt(
-        static=static_block(scenario),
-        experiences="".join(experiences),
-        state="".join(f"{row_text(state, row)}\n" for row in kept_rows),
-        state_uncompressed="".join(f"{full_row_text(state, row)}\n" for row in range(len(state.ids))),
-    )
+    def _table(self, rows: Sequence[Cells]) -> str:
+        return "".join((self._format.header(rows[0]), *map(self._format.row, rows))) if rows else ""

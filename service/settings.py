@@ -10,10 +10,22 @@ import httpx
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from shared.wire import Mode
+from shared.wire import Features, Mode
 
-# Upper bounds in the embedded model's tokens, which has one for each digit.
-_STATIC_TOKENS, _ROW_TOKENS = 400, 32
+# Upper bounds in the embedded model's tokens, which has one for each digit: of the static block, and of a row or an
+# experience in each format.
+_STATIC_TOKENS = 400
+_ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56}
+# The two more columns of feature preset `reach`.
+_REACH_TOKENS = 16
+
+
+def prompt_tokens(
+    row_format: Literal["csv", "json", "markdown"], rows: int, experiences: int, features: Features = "paper"
+) -> int:
+    """Upper bound of a prompt's length in the embedded model's tokens."""
+    row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
+    return _STATIC_TOKENS + row * (rows + experiences)
 
 
 def _default_cache() -> Path:
@@ -116,7 +128,7 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _prompt_fits(self) -> Self:
-        needed = _STATIC_TOKENS + _ROW_TOKENS * (self.experiences + self.top_k)
+        needed = prompt_tokens("csv", self.top_k, self.experiences)
         if needed > self.llm_context:
             raise ValueError(
                 f"{self.experiences} experiences and {self.top_k} sensors need up to {needed} tokens: "

@@ -1,4 +1,4 @@
-"""u_phi: a value for every velocity level, given the chosen sensor's context and its distance."""
+"""u_phi: a value for every velocity level, given the chosen sensor's context and how the UAV would approach it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from service.attention import WIDTH
 
 
 class VelocityScorer(nn.Module):
-    """``u = W_2 relu(W_1 [z_j, distance] + b_1) + b_2``, one value a velocity level."""
+    """``u = W_2 relu(W_1 [z_j, distance] + b_1) + b_2``, one value a velocity level: the paper's."""
 
     def __init__(self, levels: int, width: int = WIDTH) -> None:
         super().__init__()
@@ -17,6 +17,24 @@ class VelocityScorer(nn.Module):
         self.out = nn.Linear(width, levels)
 
     def forward(self, z: Tensor, distance: Tensor) -> Tensor:
-        """Values ``(levels,)`` from the context ``(d',)`` and the normalised distance, a scalar tensor."""
-        u: Tensor = self.out(torch.relu(self.hidden(torch.cat([z, distance.reshape(1)]))))
+        """Values ``(..., levels)`` from the context ``(..., d')`` and the normalised distance ``(..., 1)``."""
+        u: Tensor = self.out(torch.relu(self.hidden(torch.cat([z, distance], dim=-1))))
+        return u
+
+
+class ReachVelocityScorer(nn.Module):
+    """``u_v = w_2 relu(W_1 [z_j, a_v] + b_1) + b_2``: the same weights for every level v, told what it would bring.
+
+    ``a_v`` is a row of :meth:`Reach.level_features`; so a scenario may have any number of levels.
+    """
+
+    def __init__(self, level_features: int, width: int = WIDTH) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(width + level_features, width)
+        self.out = nn.Linear(width, 1)
+
+    def forward(self, z: Tensor, levels: Tensor) -> Tensor:
+        """Values ``(..., levels)`` from the context ``(..., d')`` and the levels' features ``(..., levels, 4)``."""
+        context = z[..., None, :].expand(*levels.shape[:-1], z.shape[-1])
+        u: Tensor = self.out(torch.relu(self.hidden(torch.cat([context, levels], dim=-1))))[..., 0]
         return u

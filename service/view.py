@@ -11,16 +11,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from service.attention import top_k
-from service.features import FEATURES, State, augment
+from service.features import State, augment
 from service.learner import Sample
 from service.mission import Mission, Pending
-from service.prompt import row_text
+from service.rows import cells
 from shared.wire import Candidate, UavState
 
 
 @dataclass(slots=True)
 class View:
-    """A UAV's view at one step. ``rows`` index the state's arrays: the k sensors kept, best first."""
+    """A UAV's view at one step. ``rows`` index the state's arrays: the k sensors kept, best first.
+
+    Without attention ``rows`` are all that is admissible, in the request's order.
+    """
 
     uav_id: int
     step: int
@@ -28,7 +31,7 @@ class View:
     rows: list[int] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     _admissible: list[int] = field(default_factory=list)
-    _features: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, FEATURES), np.float32))
+    _features: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0), np.float32))
     _contexts: Tensor = field(default_factory=lambda: torch.empty(0))
 
     @classmethod
@@ -41,33 +44,41 @@ class View:
             visits=mission.visits,
             rates=mission.rates,
             reserved=mission.reserved(step, uav.uav_id),
+            preset=mission.spec.features,
         )
         return cls(uav_id=uav.uav_id, step=step, state=state)
 
     @property
     def offered(self) -> list[int]:
-        """IDs of the sensors kept, best first."""
+        """IDs of the sensors kept, in the order of ``rows``."""
         return [candidate.sensor_id for candidate in self.candidates]
 
     def attend(self, mission: Mission) -> None:
-        """Score the admissible sensors and keep the mission's top k."""
+        """Score the admissible sensors and keep the mission's top k, or all of them where it goes without attention."""
         self._admissible = np.flatnonzero(self.state.admissible).tolist()
         self._features = self.state.features(mission.scenario)
         if not self._admissible:
             return
         scores, self._contexts = mission.learner.current.score(self._features)
-        kept = top_k(scores, mission.top_k)
+        kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(self._admissible)))
         self.rows = [self._admissible[i] for i in kept]
         self.candidates = [
             Candidate(sensor_id=int(self.state.ids[self._admissible[i]]), score=round(float(scores[i]), 6))
             for i in kept
         ]
 
+    def shown(self, mission: Mission) -> list[int]:
+        """``rows`` in the order of the prompt: as they are, or shuffled by the mission's seed, the step and the UAV."""
+        if mission.spec.prompt.order == "score":
+            return self.rows
+        shuffle = np.random.default_rng([mission.spec.seed, self.step, self.uav_id])
+        return [self.rows[i] for i in shuffle.permutation(len(self.rows))]
+
     def by_value(self, mission: Mission) -> tuple[int, int]:
         """The best-scored sensor and the best velocity for it, by the learned values."""
         row = self.rows[0]
-        distance = self.state.normalised_distance(row, mission.scenario)
-        values = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], distance)
+        approach = self.state.approach(row, mission.scenario)
+        values = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], approach)
         return int(self.state.ids[row]), int(values.argmax())
 
     def pending(self, mission: Mission, decision_id: str, sensor_id: int, velocity: int) -> Pending:
@@ -79,7 +90,7 @@ class View:
             sample = Sample(
                 features=self._features,
                 chosen=self._admissible.index(row),
-                distance=self.state.normalised_distance(row, mission.scenario),
+                approach=self.state.approach(row, mission.scenario),
                 velocity=velocity,
             )
         return Pending(
@@ -88,6 +99,6 @@ class View:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            row=f"{sensor_id},?,?,?,?" if row is None else row_text(self.state, row),
+            seen=mission.template.unknown(sensor_id) if row is None else cells(self.state, row),
             sample=sample,
         )

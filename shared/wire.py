@@ -25,6 +25,7 @@ DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within t
 
 Mode = Literal["llm", "value"]
 Init = Literal["pretrained", "random"]
+Features = Literal["paper", "reach"]
 Source = Literal["llm", "value", "policy"]
 Reason = Literal[
     "mode_value",
@@ -205,25 +206,50 @@ class FeedbackResponse(Wire):
     result: Literal["applied", "duplicate"]
 
 
+class PromptStyle(Wire):
+    """How the prompt shows the sensors: JSON is one object a line, Markdown a table with its header.
+
+    ``shuffled`` draws the rows' order anew for every step and UAV, from the mission's seed.
+    """
+
+    format: Literal["csv", "json", "markdown"] = "csv"
+    order: Literal["score", "shuffled"] = Field("score", description="of the rows; `score`: best first")
+    experiences: int | None = Field(
+        None, ge=0, le=100, description="kept before the older half is dropped; default: the service's"
+    )
+
+
 class MissionSpec(Wire):
-    """``PUT /missions/{id}``: the world that a fleet flies in and how it decides."""
+    """``PUT /missions/{id}``: the world that a fleet flies in and how it decides.
+
+    ``attention`` off is the paper's baseline: every admissible sensor stands in the prompt, in the request's
+    order. It is the LLM's prompt that changes: mode ``value`` has nothing to decide by but attention, and keeps it.
+    """
 
     scenario: Annotated[str, Field(max_length=32)] | Scenario = Field(
         "paper", description="a preset's name or a whole scenario"
     )
     mode: Mode | None = Field(None, description="default: the service's")
     top_k: int | None = Field(None, ge=1, le=100, description="default: the service's")
+    attention: Literal["on", "off"] = Field("on", description="`off`: no pruning, every admissible sensor is offered")
+    features: Features = Field(
+        "paper", description="what the modules see; `reach`: also what the trajectory brings in reach"
+    )
+    prompt: PromptStyle = PromptStyle()
     init: Init = Field("pretrained", description="the modules' start; `random` is the paper's")
-    seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights")
+    seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights and of shuffled rows")
 
 
 class MissionStatus(Wire):
-    """``GET /missions/{id}``."""
+    """``GET /missions/{id}``; ``experiences`` is how many there are, ``prompt.experiences`` how many there can be."""
 
     mission_id: MissionId
     scenario: Scenario
     mode: Mode
     top_k: int
+    attention: Literal["on", "off"] = "on"
+    features: Features = "paper"
+    prompt: PromptStyle = PromptStyle()
     init: Init
     seed: int
     decisions: int

@@ -11,7 +11,7 @@ from service.llm.answer import Constraint, NoDecision
 from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
-from service.prompt import static_block
+from service.prompt import Template
 from service.settings import Settings
 from shared.scenario import SCENARIOS
 from shared.wire import Readiness
@@ -132,8 +132,8 @@ class Upstream:
             if self.model is None:
                 self.model = next(iter(await self._client.models()), None)
             self.constraint = await self._probe(self._client)
-            paper = SCENARIOS["paper"]
-            first = chat_body(self.model, static_block(paper), "0,50,-90,1,100\n", self.constraint, [0], 15)
+            template = Template(SCENARIOS["paper"], experiences=settings.experiences)
+            first = chat_body(self.model, template.static, "0,50,-90,1,100\n", self.constraint, [0], 15)
             await self._client.complete(first)
         return self._client
 

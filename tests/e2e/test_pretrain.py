@@ -3,11 +3,16 @@
 from pathlib import Path
 
 import pytest
+import torch
 
-from service.checkpoint import initial_modules
-from service.pretrain import Example, recall, replay
+from service import checkpoint as checkpoints
+from service.checkpoint import initial_modules, save
+from service.examples import Batch, Example, replay
+from service.learner import Modules
+from service.pretrain import losses, recall
 from shared.rollouts import Header, read_rollouts
 from shared.scenario import SCENARIOS
+from shared.wire import Features
 from simulator.explore import explore
 from tests.e2e.processes import run
 
@@ -16,23 +21,48 @@ PAPER = SCENARIOS["paper"]
 HELD_OUT = range(50_000, 50_006)
 
 
-def held_out() -> list[Example]:
+def held_out(features: Features = "paper") -> list[Example]:
     header = Header(scenario=PAPER, missions=len(HELD_OUT), behaviour="test")
     steps = (step for mission in HELD_OUT for step in explore(PAPER, mission))
-    return [example for mission in replay(header, steps, horizon=1, discount=1.0) for example in mission]
+    return [example for mission in replay(header, steps, 1, 1.0, features) for example in mission]
 
 
-@pytest.mark.parametrize(("k", "least"), [(5, 0.85), (3, 0.75)])
-def test_the_shipped_checkpoint_keeps_the_sensor_that_matters(k: int, least: float) -> None:
-    examples = held_out()
-    shipped = recall(initial_modules("pretrained", 15, seed=0), examples, k)
-    random = recall(initial_modules("random", 15, seed=0), examples, k)
+@pytest.mark.parametrize(
+    ("features", "k", "least"), [("paper", 5, 0.85), ("paper", 3, 0.75), ("reach", 5, 0.95), ("reach", 3, 0.9)]
+)
+def test_the_shipped_checkpoint_keeps_the_sensor_that_matters(features: Features, k: int, least: float) -> None:
+    examples = held_out(features)
+    shipped = recall(initial_modules("pretrained", features, 15, seed=0), examples, k)
+    random = recall(initial_modules("random", features, 15, seed=0), examples, k)
     assert shipped >= least
     assert shipped > random + 0.1
 
 
-def test_a_scenario_with_a_lower_speed_limit_takes_the_levels_that_it_has() -> None:
-    assert initial_modules("pretrained", 8, seed=0).velocity.out.weight.shape[0] == 8
+@pytest.mark.parametrize("features", ["paper", "reach"])
+def test_a_scenario_with_a_lower_speed_limit_takes_the_levels_that_it_has(features: Features) -> None:
+    slow = PAPER.model_copy(update={"max_velocity": 8})
+    header = Header(scenario=slow, missions=1, behaviour="test")
+    sample = next(replay(header, explore(slow, 50_000), 1, 1.0, features))[0].sample
+    scores, values = initial_modules("pretrained", features, 9, seed=0).evaluate(sample)
+    assert scores.shape == (len(sample.features),)
+    assert values.shape == (9,)
+
+
+@pytest.mark.parametrize("features", ["paper", "reach"])
+def test_a_batch_loses_what_its_examples_lose_one_by_one(features: Features) -> None:
+    examples, modules = held_out(features)[:40], Modules(features, 15, seed=0)
+    regression, _ = losses(modules, Batch.of(examples))
+    alone = [modules.loss(example.sample, example.reward).item() for example in examples]
+    assert len({len(example.sample.features) for example in examples}) > 1
+    assert regression.item() == pytest.approx(sum(alone) / len(alone), rel=1e-4)
+
+
+def test_a_checkpoint_of_another_preset_is_not_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    save(Modules("paper", 15, seed=0), tmp_path / "checkpoints" / "reach.pt")
+    monkeypatch.setattr(checkpoints, "files", lambda package: tmp_path)
+    with pytest.raises(ValueError, match=r"reach\.pt holds modules of the feature preset paper"):
+        checkpoints._packaged.__wrapped__("reach")
 
 
 def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
@@ -40,10 +70,12 @@ def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
     assert run("explore", "--out", str(recorded), "--missions", "4").returncode == 0
     header, steps = read_rollouts(recorded)
     assert (header.missions, len(list(steps))) == (4, 360)
-    trained = run("pretrain", str(recorded), "--out", str(checkpoint), "--epochs", "1")
-    assert trained.returncode == 0, trained.stderr
-    assert "held-out loss" in trained.stdout
-    assert checkpoint.stat().st_size > 1000
+    for features in ("paper", "reach"):
+        options = ("--out", str(checkpoint), "--epochs", "1", "--features", features)
+        trained = run("pretrain", str(recorded), *options)
+        assert trained.returncode == 0, trained.stderr
+        assert "held-out loss" in trained.stdout
+        assert torch.load(checkpoint, weights_only=True)["features"] == features
 
 
 @pytest.mark.parametrize("content", [b"", b"not gzip"])

@@ -13,8 +13,8 @@ from shared.wire import MissionSpec, SensorColumns, UavState
 PAPER = SCENARIOS["paper"]
 
 
-def mission(**settings: Any) -> Mission:
-    return Mission("test", MissionSpec(), Settings(**{"mode": "value", **settings}))
+def mission(spec: MissionSpec | None = None, **settings: Any) -> Mission:
+    return Mission("test", spec or MissionSpec(), Settings(**{"mode": "value", **settings}))
 
 
 def uav(

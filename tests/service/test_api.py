@@ -270,6 +270,41 @@ def test_missions(edge: Edge, report: Report) -> None:
     assert client.post("/decide", json=report(mission_id="c")).status_code == 200
 
 
+def test_a_mission_says_how_it_shows_the_sensors(edge: Edge, report: Report) -> None:
+    client = edge(mode="llm", llm_gguf="none")
+    plain = client.put("/missions/plain", json={}).json()
+    assert plain["prompt"] == {"format": "csv", "order": "score", "experiences": 8}
+    assert (plain["attention"], plain["features"]) == ("on", "paper")
+    tokens = {}
+    for name in ("csv", "json", "markdown"):
+        spec = {"prompt": {"format": name, "order": "shuffled", "experiences": 0}, "attention": "off", "top_k": 1}
+        made = client.put(f"/missions/{name}", json=spec).json()
+        assert (made["prompt"], made["attention"]) == (spec["prompt"], "off")
+        answer = client.post("/decide", json=report(mission_id=name)).json()
+        assert [c["sensor_id"] for c in answer["top_k"]] == [0, 1, 2, 3]
+        tokens[name] = (answer["tokens"]["state"], answer["tokens"]["state_uncompressed"])
+    assert tokens["csv"][0] < tokens["markdown"][0] < tokens["json"][0]
+    assert tokens["csv"][1] < tokens["markdown"][1] < tokens["json"][1]
+    for wrong in ({"format": "xml"}, {"order": "best"}, {"experiences": 101}, {"experiences": -1}, {"rows": 1}):
+        refused = client.put("/missions/wrong", json={"prompt": wrong})
+        assert (refused.status_code, fields(refused)) == (422, [f"prompt.{next(iter(wrong))}"]), refused.text
+    long = client.put("/missions/long", json={"prompt": {"format": "json", "experiences": 100}})
+    assert (long.status_code, fields(long)) == (422, ["prompt"])
+    assert "AICVDS_LLM_CONTEXT" in long.text
+    assert client.get("/missions/long").status_code == 404
+
+
+def test_a_mission_may_look_ahead(edge: Edge, report: Report) -> None:
+    client = edge()
+    assert client.put("/missions/ahead", json={"features": "reach"}).json()["features"] == "reach"
+    told, off = report(mission_id="ahead", step=0, progress_m=0.0), report(mission_id="ahead", step=1)
+    for body in (told, off):
+        answer = client.post("/decide", json=body)
+        assert (answer.status_code, answer.json()["source"]) == (200, "value"), answer.text
+    outcome = {"decision_id": answer.json()["decision_id"], "cost": 1.0}
+    assert client.post("/feedback", json={"mission_id": "ahead", **outcome}).json()["result"] == "applied"
+
+
 def test_metrics_tell_what_happened_and_name_no_one(edge: Edge, report: Report) -> None:
     client = edge()
     decision = client.post("/decide", json=report(mission_id="secret")).json()["decision_id"]

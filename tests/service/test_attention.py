@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from service.attention import Attention, top_k
 
@@ -30,6 +31,25 @@ def test_equals_a_numpy_reference_with_masked_rows(seed: int) -> None:
     expected_scores, expected_z = reference(x, mask, attention)
     np.testing.assert_allclose(scores.detach().numpy(), expected_scores[mask], atol=1e-5)
     np.testing.assert_allclose(z.detach().numpy(), expected_z[mask], atol=1e-5)
+
+
+def test_a_batch_with_padding_gives_what_each_gives_alone() -> None:
+    torch.manual_seed(0)
+    attention, sizes = Attention(5), [4, 1, 6]
+    alone = [torch.rand(n, 5) for n in sizes]
+    padded = torch.nn.utils.rnn.pad_sequence(alone, batch_first=True, padding_value=9.0)
+    scores, z = attention(padded, torch.arange(6) < torch.tensor(sizes)[:, None])
+    for row, x in enumerate(alone):
+        expected, contexts = attention(x)
+        torch.testing.assert_close(scores[row, : len(x)], expected)
+        torch.testing.assert_close(z[row, : len(x)], contexts)
+
+
+def test_torchs_kernel_that_keeps_no_square_of_the_sensors_takes_it() -> None:
+    attention = Attention(5)
+    with torch.inference_mode(), sdpa_kernel(SDPBackend.FLASH_ATTENTION):
+        scores, z = attention(torch.rand(10, 5))
+    assert (scores.shape, z.shape) == ((10,), (10, 32))
 
 
 def test_a_masked_sensor_changes_nothing() -> None:

@@ -11,7 +11,7 @@ def test_features_are_the_papers_five_between_zero_and_one() -> None:
     m.visits[2] = 3
     view = attended(m, uav(step=9), step=9)
     state, features = view.state, view.state.features(PAPER)
-    assert features.shape == (6, FEATURES)
+    assert features.shape == (6, FEATURES["paper"])
     best, worst = float(channel_gain_db(0, PAPER)), -PAPER.path_loss_limit_db
     expected = [1.0, 30 / 60, (-90 - worst) / (best - worst), 6 / 30, urgency([30], [5.0], PAPER)[0]]
     np.testing.assert_allclose(features[2], expected, rtol=1e-6)

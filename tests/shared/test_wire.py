@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from shared.scenario import SCENARIOS
-from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Outcome
+from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Outcome, PromptStyle
 
 DECISION = "0123456789abcdef0123456789abcdef"
 
@@ -128,3 +128,34 @@ def test_a_mission_takes_a_presets_name_or_a_whole_scenario() -> None:
     assert MissionSpec.model_validate({"scenario": "stress"}).scenario == "stress"
     whole = SCENARIOS["stress"].model_dump_json()
     assert MissionSpec.model_validate_json(f'{{"scenario": {whole}}}').scenario == SCENARIOS["stress"]
+
+
+def test_a_mission_is_the_papers_unless_told_otherwise() -> None:
+    spec = MissionSpec()
+    assert (spec.attention, spec.features) == ("on", "paper")
+    assert spec.prompt == PromptStyle(format="csv", order="score", experiences=None)
+
+
+def test_a_mission_with_its_own_prompt_survives_json() -> None:
+    style = PromptStyle(format="json", order="shuffled", experiences=30)
+    spec = MissionSpec(attention="off", features="reach", prompt=style)
+    assert MissionSpec.model_validate_json(spec.model_dump_json()) == spec
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"attention": "maybe"}, "attention"),
+        ({"features": "all"}, "features"),
+        ({"prompt": {"format": "xml"}}, "prompt.format"),
+        ({"prompt": {"order": "random"}}, "prompt.order"),
+        ({"prompt": {"experiences": 101}}, "prompt.experiences"),
+        ({"prompt": {"experiences": -1}}, "prompt.experiences"),
+        ({"prompt": {"experiences": True}}, "prompt.experiences"),
+        ({"prompt": {"rows": 3}}, "prompt.rows"),
+    ],
+)
+def test_a_mission_that_is_none_is_refused_by_field(change: dict[str, Any], field: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        MissionSpec.model_validate_json(json.dumps(change))
+    assert field in str(caught.value)

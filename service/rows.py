@@ -1,0 +1,207 @@
+"""How a sensor stands in the prompt: its columns, and a row as CSV, as JSON or in a Markdown table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Literal, Protocol
+
+from service.features import State
+from shared.wire import Features
+
+# A column's name and the text of a whole number, or UNKNOWN.
+Cells = Mapping[str, str]
+
+UNKNOWN = "?"
+
+_MEANINGS = {
+    "queue": "packets waiting",
+    "gain": "channel gain in dB",
+    "age": "steps since its last visit",
+    "distance": "metres from this UAV",
+}
+_REACH_MEANINGS = {
+    "best": "the best velocity for it",
+    "movable": "packets that can be collected at that velocity",
+}
+_NUMERALS = {5: "five", 7: "seven"}
+
+
+def columns(features: Features) -> tuple[str, ...]:
+    """Names of a row's columns, the sensor's ID first."""
+    return ("sensor_id", *_meanings(features))
+
+
+def meanings(features: Features) -> str:
+    """What each column means, in one line."""
+    return " ".join(f"{name}: {meaning}." for name, meaning in _meanings(features).items())
+
+
+def cells(state: State, row: int) -> dict[str, str]:
+    """One sensor of those kept.
+
+    No battery: a sensor that cannot send is masked before, so that the LLM need not judge it.
+    """
+    numbers = {
+        "sensor_id": state.ids[row],
+        "queue": state.queue[row],
+        "gain": state.gain[row],
+        "age": state.since_visit[row],
+        "distance": state.distance[row],
+    }
+    if state.reach is not None:
+        numbers |= {"best": state.reach.best[row], "movable": state.reach.best_packets[row]}
+    return {name: f"{number:.0f}" for name, number in numbers.items()}
+
+
+def full_cells(state: State, row: int) -> dict[str, str]:
+    """One sensor as an LLM would have to see it if nothing were pruned or masked for it.
+
+    With the battery, and unknown where only a beacon could tell.
+    """
+    known = cells(state, row)
+    full = {"sensor_id": known["sensor_id"], "queue": known["queue"], "battery": f"{state.battery[row]:.0f}", **known}
+    if state.heard[row]:
+        return full
+    return {name: text if name in ("sensor_id", "age", "distance") else UNKNOWN for name, text in full.items()}
+
+
+class Format(Protocol):
+    """One way of writing rows."""
+
+    # What divides the experiences from the rows after them.
+    gap: str
+    # How the static block says what an experience is.
+    experience_note: str
+
+    def introduction(self, names: tuple[str, ...], order: str) -> str:
+        """How the static block says what a row is."""
+        ...
+
+    def header(self, names: Iterable[str]) -> str:
+        """What must stand above the rows each time; empty where the static block has said it."""
+        ...
+
+    def row(self, cells: Cells) -> str:
+        """One sensor's line."""
+        ...
+
+    def experience_header(self, names: tuple[str, ...]) -> str:
+        """What must stand above the experiences."""
+        ...
+
+    def experience(self, cells: Cells, answer: str, cost: str) -> str:
+        """One past decision's line: the chosen sensor's row without its ID, the answer, and its cost."""
+        ...
+
+
+class Csv:
+    """Comma-separated numbers; the header stands in the static block, where it costs nothing after the first time."""
+
+    gap = ""
+    experience_note = (
+        "Past decisions are rows without their first number, then > sensor_id velocity: cost, where 0 is best."
+    )
+
+    def introduction(self, names: tuple[str, ...], order: str) -> str:
+        """With the header."""
+        return f"Each row is one sensor, {order}, with {_NUMERALS[len(names)]} numbers:\n{','.join(names)}"
+
+    def header(self, names: Iterable[str]) -> str:
+        """None."""
+        return ""
+
+    def row(self, cells: Cells) -> str:
+        """Such as ``3,52,-90,2,140``."""
+        return ",".join(cells.values()) + "\n"
+
+    def experience_header(self, names: tuple[str, ...]) -> str:
+        """None."""
+        return ""
+
+    def experience(self, cells: Cells, answer: str, cost: str) -> str:
+        """Such as ``52,-90,2,140 > 3 7: 0.0``."""
+        return f"{','.join(_without_id(cells).values())} > {answer}: {cost}\n"
+
+
+class Json:
+    """JSON Lines: an object a line, so that experiences can grow by appending."""
+
+    gap = ""
+    experience_note = (
+        "Past decisions are objects without sensor_id, but with the answer (sensor_id velocity) and its cost, "
+        "where 0 is best."
+    )
+
+    def introduction(self, names: tuple[str, ...], order: str) -> str:
+        """With the keys."""
+        listed = ", ".join(names)
+        return f"Each line is one sensor, {order}, a JSON object with {_NUMERALS[len(names)]} numbers:\n{listed}"
+
+    def header(self, names: Iterable[str]) -> str:
+        """None."""
+        return ""
+
+    def row(self, cells: Cells) -> str:
+        """Such as ``{"sensor_id":3,"queue":52,"gain":-90,"age":2,"distance":140}``."""
+        return f"{_json(cells)}\n"
+
+    def experience_header(self, names: tuple[str, ...]) -> str:
+        """None."""
+        return ""
+
+    def experience(self, cells: Cells, answer: str, cost: str) -> str:
+        """Such as ``{"queue":52,"gain":-90,"age":2,"distance":140,"answer":"3 7","cost":0.0}``."""
+        return f'{_json(_without_id(cells))[:-1]},"answer":"{answer}","cost":{cost}}}\n'
+
+
+class Markdown:
+    """A table; it is none without its header, so that stands above the rows each time."""
+
+    gap = "\n"
+    experience_note = (
+        "Past decisions are a table without sensor_id, but with the answer (sensor_id velocity) and its cost, "
+        "where 0 is best."
+    )
+
+    def introduction(self, names: tuple[str, ...], order: str) -> str:
+        """With the columns."""
+        listed = ", ".join(names)
+        return f"Each row of the table is one sensor, {order}, with {_NUMERALS[len(names)]} numbers:\n{listed}"
+
+    def header(self, names: Iterable[str]) -> str:
+        """Two lines."""
+        listed = list(names)
+        return f"{_piped(listed)}{_piped(['---'] * len(listed))}"
+
+    def row(self, cells: Cells) -> str:
+        """Such as ``| 3 | 52 | -90 | 2 | 140 |``."""
+        return _piped(cells.values())
+
+    def experience_header(self, names: tuple[str, ...]) -> str:
+        """Two lines."""
+        return self.header((*names[1:], "answer", "cost"))
+
+    def experience(self, cells: Cells, answer: str, cost: str) -> str:
+        """Such as ``| 52 | -90 | 2 | 140 | 3 7 | 0.0 |``."""
+        return _piped((*_without_id(cells).values(), answer, cost))
+
+
+FORMATS: dict[Literal["csv", "json", "markdown"], Format] = {"csv": Csv(), "json": Json(), "markdown": Markdown()}
+
+
+def _meanings(features: Features) -> dict[str, str]:
+    return _MEANINGS if features == "paper" else _MEANINGS | _REACH_MEANINGS
+
+
+def _without_id(cells: Cells) -> dict[str, str]:
+    return {name: text for name, text in cells.items() if name != "sensor_id"}
+
+
+def _json(cells: Cells) -> str:
+    numbers = {name: None if text == UNKNOWN else int(text) for name, text in cells.items()}
+    return json.dumps(numbers, separators=(",", ":"))
+
+
+def _piped(texts: Iterable[str]) -> str:
+    return f"| {' | '.join(texts)} |\n"
