@@ -61,7 +61,8 @@ class Result(Record):
     """One experiment's findings.
 
     ``schemes`` is by scheme's name, then by measure's, in the order to show them; ``labels`` says how people
-    call schemes and measures; ``seeds_of`` names schemes that flew fewer seeds than the rest.
+    call schemes and measures; ``seeds_of`` names schemes that flew fewer seeds than the rest. ``bound`` is, by
+    measure, the proven least that any fleet could have reached: a line of its own, never a scheme that flies.
     """
 
     experiment: str
@@ -75,6 +76,7 @@ class Result(Record):
     seeds: list[int]
     model: str | None = None
     schemes: dict[str, dict[str, Interval]]
+    bound: dict[str, Interval] = {}
     curves: dict[str, dict[str, Curve]] = {}
     paired: list[Paired] = []
     sweep: Sweep | None = None

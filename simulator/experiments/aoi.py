@@ -1,0 +1,33 @@
+"""Age of information, FRSICL's objective, with its nearest-neighbour baseline."""
+
+from __future__ import annotations
+
+from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.schemes import Scheme, at_full_speed, edge_policy, llm, locals_there_are, value
+
+_AGES = ("aoi_mean", "aoi_peak", "aoi_worst")
+
+
+def _schemes(setup: Setup) -> list[Scheme]:
+    return [llm(), value(), edge_policy(), *locals_there_are(), at_full_speed("eof"), at_full_speed("wqcs")]
+
+
+EXPERIMENT = Experiment(
+    name="aoi",
+    title="Age of information",
+    summary="mean and peak age of information a sensor, with the nearest-neighbour baseline",
+    schemes=_schemes,
+    measures=(*_AGES, "lost_packets", "events"),
+    drawings=(
+        Drawing("aoi", "curves", ("aoi_per_step",), "Age of information, mean over the sensors."),
+        Drawing("aoi_totals", "bars", ("aoi_mean", "aoi_peak"), "Mean and peak age of information of a mission."),
+    ),
+    reference="nearest",
+    paired_measures=("aoi_mean", "aoi_peak", "lost_packets"),
+    when_quick="no_llm",
+    notes=(
+        "Age of sensor j at the end of step t, in steps: A_j(t) = 1 if it was served (f = 0) in step t, else "
+        "A_j(t-1) + 1, with A_j(-1) = 0. Mean: over all sensors and steps. Peak: a sensor's largest, mean "
+        "over the sensors; worst: of the sensor with the largest. No scheme here was made to keep ages low.",
+    ),
+)

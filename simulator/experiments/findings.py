@@ -1,0 +1,283 @@
+"""From an experiment's flights to its ``results.json`` and ``results.csv``."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from io import StringIO
+
+from simulator.experiments.flight import Flown
+from simulator.experiments.intervals import METHOD, curve, interval, paired
+from simulator.experiments.measures import MEASURES, STEP_MEASURES, policys_instead
+from simulator.experiments.plan import Drawing, Experiment, Plan, Setup
+from simulator.experiments.result import Curve, Figure, Interval, Paired, Result
+from simulator.experiments.schemes import BOUND, OverEdge, Scheme
+from simulator.record import BadUse
+
+# Of one flight's decisions: a few late answers are the LLM's own weather, more are another method's result.
+_FEW_PCT = 3.0
+
+
+@dataclass(frozen=True)
+class Group:
+    """The flights of one scheme on one site, in order of their seeds; ``suffix`` tells sites apart in names."""
+
+    scheme: Scheme
+    site: str
+    suffix: str
+    flights: list[Flown]
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds flown."""
+        return [flight.seed for flight in self.flights]
+
+
+def findings(
+    plan: Plan, setup: Setup, command: str, commit: str | None, load: Callable[[str], Flown | None], said: Sequence[str]
+) -> Result:
+    """The result of an experiment whose flights are all there, but for schemes that cannot fly.
+
+    Args:
+        load: a flight by its key; ``None`` where the scheme could not fly.
+        said: notes of the run, such as why a scheme could not fly.
+
+    Raises:
+        BadUse: no scheme flew at all.
+    """
+    groups = _groups(plan, load)
+    flying = [group for group in groups if group.scheme.name != BOUND.name]
+    if not flying:
+        raise BadUse(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(said)}")
+    experiment, seeds = plan.experiment, max((group.seeds for group in flying), key=len)
+    schemes, curves, lacking = _scores(experiment, flying)
+    return Result(
+        experiment=experiment.name,
+        title=experiment.title,
+        command=command,
+        version=version("aic-vds"),
+        commit=commit,
+        created_at=max(flight.flown_at for group in groups for flight in group.flights),
+        quick=setup.quick,
+        scenario=", ".join(dict.fromkeys(group.flights[0].scenario for group in flying)),
+        seeds=seeds,
+        model=_model(flying),
+        schemes=schemes,
+        bound=_bound(groups),
+        curves=curves,
+        paired=_paired(plan, flying, groups),
+        sweep=experiment.sweep,
+        figures=[_figure(drawing, flying, seeds, command) for drawing in experiment.drawings],
+        labels=_labels(flying, experiment.measures, experiment.drawings),
+        seeds_of={group.scheme.name: group.seeds for group in flying if group.seeds != seeds},
+        notes=[*experiment.notes, *_notes(plan, setup, groups), *said, *lacking],
+    )
+
+
+def tidy(result: Result) -> str:
+    """``results.csv``: one line a scheme, seed and measure, and one a seed for the bound."""
+    text = StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["experiment", "scheme", "seed", "measure", "value"])
+    for scheme, measures in {**result.schemes, BOUND.name: _once(result.bound)}.items():
+        for measure, found in measures.items():
+            seeds = result.seeds_of.get(scheme, result.seeds)
+            for seed, value in zip(seeds, found.values, strict=True):
+                rows.writerow([result.experiment, scheme, seed, measure, f"{value:g}"])
+    return text.getvalue()
+
+
+def _once(bound: dict[str, Interval]) -> dict[str, Interval]:
+    """The bound of a mission's losses; the same number also bounds the last step of a curve."""
+    return {name: found for name, found in bound.items() if name in MEASURES}
+
+
+def _groups(plan: Plan, load: Callable[[str], Flown | None]) -> list[Group]:
+    sites = list(dict.fromkeys(planned.site_name for planned in plan.flights))
+    flights: dict[tuple[str, str], list[Flown]] = {}
+    schemes = {planned.scheme.name: planned.scheme for planned in plan.flights}
+    broken = set()
+    for planned in plan.flights:
+        at = (planned.scheme.name, planned.site_name)
+        flight = load(planned.key)
+        if flight is None:
+            broken.add(at)
+        else:
+            flights.setdefault(at, []).append(flight)
+    return [
+        Group(schemes[name], site, f"@{site}" if len(sites) > 1 else "", found)
+        for (name, site), found in flights.items()
+        if (name, site) not in broken
+    ]
+
+
+def _scores(
+    experiment: Experiment, flying: Sequence[Group]
+) -> tuple[dict[str, dict[str, Interval]], dict[str, dict[str, Curve]], list[str]]:
+    """Measures and curves by scheme, and notes on what is lacking."""
+    schemes: dict[str, dict[str, Interval]] = {}
+    curves: dict[str, dict[str, Curve]] = {}
+    lacking: list[str] = []
+    for group in flying:
+        found, missing = _measured(group, experiment.measures)
+        schemes.setdefault(group.scheme.name, {}).update(found)
+        lacking += missing
+        if drawn := _curves(group, experiment.drawings):
+            curves.setdefault(group.scheme.name, {}).update(drawn)
+    return schemes, curves, lacking
+
+
+def _measured(group: Group, measures: Sequence[str]) -> tuple[dict[str, Interval], list[str]]:
+    found, missing = {}, []
+    for name in measures:
+        values = [MEASURES[name].of(flight) for flight in group.flights]
+        there = [value for value in values if value is not None]
+        if len(there) == len(values):
+            found[name + group.suffix] = interval(there)
+        elif there:
+            missing.append(
+                f"{group.scheme.label}: {MEASURES[name].label} is left out, for it has none on "
+                f"{len(values) - len(there)} of {len(values)} seeds."
+            )
+    return found, missing
+
+
+def _curves(group: Group, drawings: Sequence[Drawing]) -> dict[str, Curve]:
+    names = [m for drawing in drawings if drawing.kind == "curves" for m in drawing.measures]
+    found = {}
+    for name in names:
+        rows = [STEP_MEASURES[name].of(flight) for flight in group.flights]
+        there = [row for row in rows if row is not None]
+        if len(there) == len(rows):
+            found[name + group.suffix] = curve(there)
+    return found
+
+
+def _bound(groups: Sequence[Group]) -> dict[str, Interval]:
+    bounds = [f.bound.lower_bound for g in groups if g.scheme.name == BOUND.name for f in g.flights if f.bound]
+    return {"lost_packets": interval(bounds), "lost_packets_cumulative": interval(bounds)} if bounds else {}
+
+
+def _paired(plan: Plan, flying: Sequence[Group], groups: Sequence[Group]) -> list[Paired]:
+    by_place = {(group.scheme.name, group.site): group for group in flying}
+    reference = plan.experiment.reference
+    pairs = [(g.scheme.name, reference) for g in flying if reference and g.scheme.name != reference]
+    found: list[Paired] = []
+    for name, other in dict.fromkeys([*pairs, *plan.experiment.pairs]):
+        for site in dict.fromkeys(group.site for group in flying):
+            if (name, site) in by_place and (other, site) in by_place:
+                found += _pair(by_place[name, site], by_place[other, site], plan.experiment.paired_measures)
+    for bound in (group for group in groups if group.scheme.name == BOUND.name):
+        for group in flying:
+            found += _over_bound(group, bound)
+    return found
+
+
+def _pair(group: Group, other: Group, measures: Sequence[str]) -> list[Paired]:
+    theirs = {flight.seed: flight for flight in other.flights}
+    both = [(flight, theirs[flight.seed]) for flight in group.flights if flight.seed in theirs]
+    found: list[Paired] = []
+    for name in measures:
+        values = [(MEASURES[name].of(a), MEASURES[name].of(b)) for a, b in both]
+        there = [(a, b) for a, b in values if a is not None and b is not None]
+        if there and len(there) == len(values):
+            ours, its = zip(*there, strict=True)
+            found += paired(group.scheme.name, other.scheme.name, name + group.suffix, ours, its)
+    return found
+
+
+def _over_bound(group: Group, bound: Group) -> list[Paired]:
+    least = {flight.seed: flight.bound.lower_bound for flight in bound.flights if flight.bound}
+    ours = [(float(sum(f.lost_packets)), least[f.seed]) for f in group.flights if f.seed in least]
+    if not ours:
+        return []
+    return paired(group.scheme.name, BOUND.name, "lost_packets" + group.suffix, *zip(*ours, strict=True))
+
+
+def _figure(drawing: Drawing, flying: Sequence[Group], seeds: Sequence[int], command: str) -> Figure:
+    suffixes = list(dict.fromkeys(group.suffix for group in flying))
+    flown = {len(group.seeds) for group in flying if group.scheme.asks_llm}
+    fewer = f" ({', '.join(str(n) for n in sorted(flown))} for those that ask an LLM)" if flown - {len(seeds)} else ""
+    return Figure(
+        name=drawing.name,
+        kind=drawing.kind,
+        measures=[measure + suffix for measure in drawing.measures for suffix in suffixes],
+        caption=f"{drawing.caption} Mean over {len(seeds)} seeds{fewer}, {flying[0].flights[0].steps} steps, with "
+        f"its {METHOD}. Made by `{command}`.",
+    )
+
+
+def _labels(flying: Sequence[Group], measures: Sequence[str], drawings: Sequence[Drawing]) -> dict[str, str]:
+    labels = {group.scheme.name: group.scheme.label for group in flying}
+    shown = dict.fromkeys([*measures, *(m for drawing in drawings for m in drawing.measures)])
+    for group in flying:
+        place = f", {group.site}" if group.suffix else ""
+        for name in shown:
+            known = MEASURES.get(name) or STEP_MEASURES[name]
+            labels[name + group.suffix] = known.label + place
+    return labels
+
+
+def _model(flying: Sequence[Group]) -> str | None:
+    asked = [f.model for group in flying if group.scheme.asks_llm for f in group.flights if f.model]
+    return ", ".join(dict.fromkeys(asked)) or None
+
+
+def _notes(plan: Plan, setup: Setup, groups: Sequence[Group]) -> list[str]:
+    notes = [f"Intervals: {METHOD} over seeds; a curve's likewise, at each step. Comparisons are paired by seed."]
+    if setup.quick:
+        steps = next((group.flights[0].steps for group in groups), 0)
+        notes.append(
+            f"Quick run: missions of {steps} steps, few seeds. It shows that the figure can be made, not what it says."
+        )
+    if plan.left_out:
+        told = ", ".join(scheme.label for scheme in plan.left_out)
+        why = "by --quick, whose missions with an LLM would be too short for it" if setup.llm.there else "by --llm none"
+        notes.append(f"Left out {why}: {told}.")
+    for group in groups:
+        notes += _doubts(group)
+    notes += _below_bound(groups)
+    if any(isinstance(group.scheme.decides, OverEdge) for group in groups):
+        notes.append("The edge's modules learn beside its decisions: a mission flown anew may differ a little.")
+    commits = {flight.commit for group in groups for flight in group.flights}
+    if len(commits) > 1:
+        notes.append(
+            f"Flights of several commits: {', '.join(sorted(str(c) for c in commits))}. "
+            "Delete the folder flights/ to fly all of them with one."
+        )
+    return notes
+
+
+def _below_bound(groups: Sequence[Group]) -> list[str]:
+    least = {(g.site, f.seed): f.bound.lower_bound for g in groups for f in g.flights if f.bound}
+    below = [
+        f"{group.scheme.label}, seed {flight.seed}"
+        for group in groups
+        for flight in group.flights
+        if not flight.bound and sum(flight.lost_packets) < least.get((group.site, flight.seed), 0)
+    ]
+    return [f"The bound is wrong: less than it was lost by {'; '.join(below)}."] if below else []
+
+
+def _doubts(group: Group) -> list[str]:
+    notes = []
+    decisions = sum(len(flight.decisions) for flight in group.flights)
+    instead = sum(policys_instead(flight) for flight in group.flights)
+    if group.scheme.is_answered and 100 * instead > _FEW_PCT * decisions:
+        reasons = sorted(
+            {d.reason for f in group.flights for d in f.decisions if d.reason and d.reason != "no_candidate"}
+        )
+        notes.append(
+            f"{group.scheme.label}{group.suffix}: {instead} of {decisions} decisions are not the LLM's but were taken "
+            f"in its place ({', '.join(reasons)}). Its row does not measure the LLM."
+        )
+    unproven = [f.bound for f in group.flights if f.bound and not f.bound.optimal]
+    if unproven:
+        gap = max(b.lost_packets - b.lower_bound for b in unproven)
+        notes.append(
+            f"{group.scheme.label}: proven optimal on {len(group.flights) - len(unproven)} of {len(group.flights)} "
+            f"seeds; on the others the best plan found loses up to {gap:g} packets more than the proven bound."
+        )
+    return notes

@@ -1,0 +1,308 @@
+"""The results page: the paper's numbers beside ours with a verdict each, then every experiment that was run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from pydantic import ValidationError
+from rich.console import Console
+from tyro.conf import arg
+
+from shared.scenario import Scenario
+from simulator.experiments import claims, jain
+from simulator.experiments.catalogue import EXPERIMENTS
+from simulator.experiments.evidence import ZERO, seeds_flown
+from simulator.experiments.plots import BOUND_LABEL, draw, label_of, measured
+from simulator.experiments.result import Figure, Interval, Paired, Result
+from simulator.record import BadUse, naming_out
+from simulator.simulate import reporting
+
+RESULT = "results.json"
+FIGURES = "figures"
+COLUMNS = 6
+NONE, FEW = "–", " †"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write the results page: the paper's numbers beside ours, and every experiment's figures and tables.
+
+    Experiments that were not run are listed as such. Run again, it replaces the page and its figures.
+
+    Try it:  aicvds experiment page --runs runs/experiments --out docs/results.md
+
+    Exit code: 0 written, 2 bad use.
+    """
+
+    runs: Annotated[Path, arg(metavar="DIR")] = Path("runs/experiments")
+    """Folder that experiments wrote to (their --out)."""
+    out: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/results.md")
+    """The page; its figures go to the folder figures beside it."""
+
+
+def main(argv: list[str]) -> int:
+    """Write the page that the command line asks for; returns the exit code."""
+    try:
+        options = tyro.cli(Options, prog="aicvds experiment page", args=argv)
+    except SystemExit as done:
+        return done.code if isinstance(done.code, int) else 2
+    return reporting("aicvds experiment page", lambda console: _page(options, console))
+
+
+def _page(options: Options, console: Console) -> int:
+    write_page(options.runs, options.out)
+    console.print(f"Wrote {options.out}", markup=False, highlight=False)
+    return 0
+
+
+def write_page(runs: Path, out: Path) -> None:
+    """Write the Markdown page ``out``, and the figures that it shows into the folder ``figures`` beside it.
+
+    Args:
+        runs: the folder that ``aicvds experiment`` wrote to. An experiment that it lacks is on the page as not run.
+
+    Raises:
+        BadUse: there is no result in it, one cannot be read, or the page cannot be written.
+    """
+    found = results_in(runs)
+    with naming_out(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        drawn = {name: _figures(result, out.parent / FIGURES / name) for name, result in found.items()}
+        out.write_text(render_page(found, drawn, out.parent), encoding="utf-8")
+
+
+def results_in(runs: Path) -> dict[str, Result]:
+    """The results in ``runs`` and its folders, by experiment; a full run before a quick one, then the latest.
+
+    Raises:
+        BadUse: there is none, or one cannot be read.
+    """
+    paths = sorted([*runs.glob(RESULT), *runs.glob(f"*/{RESULT}")])
+    if not paths:
+        raise BadUse(f"--runs {runs} has no {RESULT}; make some with: aicvds experiment all --out {runs}")
+    results = sorted((_read(path) for path in paths), key=lambda result: (not result.quick, result.created_at))
+    return {result.experiment: result for result in results}
+
+
+def _read(path: Path) -> Result:
+    try:
+        return Result.model_validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        told = error.errors(include_url=False)[0] if isinstance(error, ValidationError) else None
+        why = f"{'.'.join(map(str, told['loc']))}: {told['msg']}" if told else str(error)
+        raise BadUse(f"{path}: {why}; run that experiment again") from None
+
+
+def _figures(result: Result, folder: Path) -> list[tuple[Figure, Path]]:
+    for stale in folder.glob("*.svg"):
+        stale.unlink()
+    paths = {path.stem: path for path in draw(result, folder, ("svg",))}
+    return [(figure, paths[figure.name]) for figure in result.figures if figure.name in paths]
+
+
+def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tuple[Figure, Path]]], folder: Path) -> str:
+    """The page's text; links to figures are relative to ``folder``."""
+    environment = Environment(
+        loader=PackageLoader("simulator.experiments", "."), undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True, keep_trailing_newline=True,
+    )  # fmt: skip
+    environment.filters.update(cell=cell, told=told, seeds=told_seeds)
+    full = {name: result for name, result in results.items() if not (result.quick or claims.elsewhere(result))}
+    findings = claims.judge(results)
+    return environment.get_template("results.md.j2").render(
+        findings=findings,
+        verdicts={v: sum(f.verdict is v for f in findings) for v in claims.Verdict},
+        experiments=[*EXPERIMENTS, *sorted(results.keys() - set(EXPERIMENTS))],
+        results=results,
+        figures={
+            name: [(figure, Path(os.path.relpath(path, folder)).as_posix()) for figure, path in pictures]
+            for name, pictures in drawn.items()
+        },
+        tables=_tables,
+        pairs=_pairs,
+        label_of=label_of,
+        fairness=Fairness.of(results.get("fairness")),
+        claims=claims,
+        zero=ZERO,
+        paper=Scenario(),
+        by_time=swap(late_and_whole(full.get("scheduler"))),
+        by_measure=swap(packets_and_events(full.get("scheduler"))),
+        bound=full["scheduler"].bound.get("lost_packets") if "scheduler" in full else None,
+        learned=_learned(full.get("attention")),
+    )
+
+
+@dataclass(frozen=True)
+class Evenness:
+    """One scheme's Jain's index of visits served and of visits scheduled, and its lost packets."""
+
+    label: str
+    served: Interval
+    scheduled: Interval | None
+    lost: Interval | None
+
+
+@dataclass(frozen=True)
+class Fairness:
+    """What Jain's index is worth: by chance, by need, and as measured, the most even first."""
+
+    visits: int
+    sensors: int
+    uavs: int
+    by_chance: float
+    by_chance_apart: float
+    reached_by_chance_pct: float
+    by_need: float
+    rows: list[Evenness]
+    random: Evenness | None
+    quick: bool
+
+    @classmethod
+    def of(cls, result: Result | None) -> Fairness:
+        """Of the fairness experiment's result; without one, only what can be computed."""
+        paper = Scenario()
+        visits = paper.uavs * paper.steps
+        by_name = {
+            name: Evenness(
+                _row_label(result, name),
+                served,
+                measured(result, name, "jain_scheduled"),
+                measured(result, name, "lost_packets"),
+            )
+            for name in (result.schemes if result else ())
+            if result and (served := measured(result, name, "jain"))
+        }
+        return cls(
+            visits=visits,
+            sensors=paper.sensors,
+            uavs=paper.uavs,
+            by_chance_apart=jain.expected_by_chance(visits, paper.sensors, paper.uavs),
+            by_chance=jain.expected_by_chance(visits, paper.sensors),
+            reached_by_chance_pct=100 * jain.reached_by_chance(claims.JAIN, visits, paper.sensors, paper.uavs),
+            by_need=jain.of_proportional_visits(paper.arrival_rate_min, paper.arrival_rate_max, paper.sensors),
+            rows=sorted(by_name.values(), key=lambda row: -row.served.mean),
+            random=by_name.get("random"),
+            quick=result is not None and result.quick,
+        )
+
+    @property
+    def least_lossy(self) -> Evenness | None:
+        """The scheme that lost the fewest packets; ``None`` where losses were not measured."""
+        known = [(row.lost.mean, position) for position, row in enumerate(self.rows) if row.lost]
+        return self.rows[min(known)[1]] if known else None
+
+
+@dataclass(frozen=True)
+class Swap:
+    """Two schemes of which ``a`` has less of one thing than ``b`` and more of another; values are ``(a's, b's)``."""
+
+    a: str
+    b: str
+    less: tuple[float, float]
+    more: tuple[float, float]
+
+
+def swap(values: Mapping[str, tuple[float, float]]) -> Swap | None:
+    """The pair that the first and the second of their values rank most differently; ``None`` when both agree."""
+    pairs = [
+        Swap(a, b, (values[a][0], values[b][0]), (values[a][1], values[b][1]))
+        for a in values
+        for b in values
+        if values[a][0] < values[b][0] and values[a][1] > values[b][1]
+    ]
+    return max(pairs, key=lambda p: (1 - p.less[0] / p.less[1]) * (1 - p.more[1] / p.more[0]), default=None)
+
+
+def late_and_whole(result: Result | None) -> dict[str, tuple[float, float]]:
+    """By scheme's label, lost packets in the last third of a mission and in all of it."""
+    curves = {
+        label_of(result, name): found["lost_packets_per_step"].mean
+        for name, found in (result.curves if result else {}).items()
+        if result and "lost_packets_per_step" in found
+    }
+    return {label: (sum(mean[-(len(mean) // 3) :]), sum(mean)) for label, mean in curves.items()}
+
+
+def packets_and_events(result: Result | None) -> dict[str, tuple[float, float]]:
+    """By scheme's label, lost packets and loss events of a mission."""
+    return {
+        label_of(result, name): (packets.mean, events.mean)
+        for name in (result.schemes if result else ())
+        if result
+        and (packets := measured(result, name, "lost_packets"))
+        and (events := measured(result, name, "events"))
+    }
+
+
+def _learned(result: Result | None) -> tuple[Interval, Interval] | None:
+    """Lost packets by the modules' own decisions, from a random start and from the shipped one."""
+    if result is None:
+        return None
+    found = [measured(result, name, "lost_packets") for name in ("value_random_start", "value")]
+    return (found[0], found[1]) if found[0] and found[1] else None
+
+
+def _tables(result: Result) -> Iterable[tuple[list[str], list[tuple[str, list[str]]]]]:
+    """Columns of measures, a few a table, and a row a scheme: its label, marked where its seeds are few, and cells."""
+    measures = iter(dict.fromkeys(m for found in result.schemes.values() for m in found))
+    while some := list(islice(measures, COLUMNS)):
+        rows = {_row_label(result, name): [measured(result, name, m) for m in some] for name in result.schemes}
+        if result.bound.keys() & set(some):
+            rows[BOUND_LABEL] = [result.bound.get(m) for m in some]
+        # A measure of at most 1 is a share or an index.
+        digits = [
+            3 if 0 < max((found.mean for found in column if found), default=0.0) <= 1 else 1
+            for column in zip(*rows.values(), strict=True)
+        ]
+        told_rows = [(label, list(map(cell, cells, digits))) for label, cells in rows.items()]
+        yield [label_of(result, m) for m in some], told_rows
+
+
+def _row_label(result: Result, name: str) -> str:
+    return label_of(result, name) + (FEW if seeds_flown(result, name) < claims.CLAIM_SEEDS else "")
+
+
+def _pairs(result: Result) -> list[tuple[str, str, str, str, str]]:
+    """Of each pair: the scheme, the other, the measure, and their difference and ratio."""
+    both: dict[tuple[str, str, str], dict[str, str]] = {}
+    for found in result.paired:
+        at = both.setdefault((found.scheme, found.reference, found.measure), {})
+        at[found.kind] = cell(found, 2 if found.kind == "ratio" or abs(found.mean) <= 1 else 1)
+    return [
+        (
+            label_of(result, a),
+            BOUND_LABEL if b == "bound" else label_of(result, b),
+            label_of(result, measure),
+            told.get("difference", NONE),
+            told.get("ratio", NONE),
+        )
+        for (a, b, measure), told in both.items()
+    ]
+
+
+def told(value: float) -> str:
+    """A number in a sentence: whole when it is large."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:,.1f}"
+
+
+def cell(found: Interval | Paired | None, digits: int = 1) -> str:
+    """A mean with its interval, to so many decimals and whole when it is large; a dash where there is none."""
+    if found is None:
+        return NONE
+    decimals = 0 if abs(found.mean) >= 100 else digits
+    mean, low, high = (f"{number:,.{decimals}f}" for number in (found.mean, found.low, found.high))
+    return mean if found.low == found.high else f"{mean} [{low}, {high}]"
+
+
+def told_seeds(seeds: Sequence[int]) -> str:
+    """Seeds as people write them: ``0 to 29 (30)``."""
+    if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]} to {seeds[-1]} ({len(seeds)})"
+    return f"{', '.join(map(str, seeds))} ({len(seeds)})"

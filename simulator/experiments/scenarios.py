@@ -1,0 +1,33 @@
+"""The main schemes beyond the paper's world: a pipeline, a weak link, a dense field, a lossy uplink, one's own."""
+
+from __future__ import annotations
+
+from simulator.experiments.measures import LOSSES
+from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.schemes import Scheme, at_full_speed, edge_policy, llm, locals_there_are, value
+
+_POLICIES = ("madqn", "mappo", "eof", "wqcs", "max_gain", "nearest", "random")
+
+
+def _schemes(setup: Setup) -> list[Scheme]:
+    return [llm(), value(), edge_policy(), *locals_there_are(*_POLICIES), at_full_speed("eof")]
+
+
+EXPERIMENT = Experiment(
+    name="scenarios",
+    title="Beyond the paper's world",
+    summary="the main schemes on paper, pipeline, stress, dense, lossy_uplink, and on --world's",
+    schemes=_schemes,
+    measures=(*LOSSES, "failures", "jain", "llm_decided_pct"),
+    drawings=(
+        Drawing("scenarios_packets", "bars", ("lost_packets",), "Lost packets of a mission by scenario."),
+        Drawing("scenarios_events", "bars", ("events",), "Loss events (Eq. 5) of a mission by scenario."),
+    ),
+    reference="eof",
+    where="everywhere",
+    notes=(
+        "The modules' start, MADQN and MAPPO were trained on the scenario `paper` alone; elsewhere they are out of it. "
+        "A network made for other numbers of sensors and UAVs cannot fly there and is left out.",
+        "In lossy_uplink a request that was lost three times is decided on board by EOF, and counts as the scheme's.",
+    ),
+)

@@ -1,0 +1,72 @@
+"""The edges that an experiment starts: what they are told, and what a flight's key says of their LLM."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import httpx
+import pytest
+
+from simulator.experiments.edges import Llm, environment_for
+from simulator.experiments.schemes import ASKED, CHANCE, OFF
+
+SERVER = "http://127.0.0.1:8080/v1"
+
+
+@pytest.fixture(autouse=True)
+def exported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a user may have exported for other purposes."""
+    for name, setting in {
+        "AICVDS_TOP_K": "1",
+        "AICVDS_EXPERIENCES": "0",
+        "AICVDS_LLM_URL": "http://elsewhere/v1",
+        "AICVDS_LLM_GGUF": "/another.gguf",
+        "AICVDS_LLM_MODEL": "big",
+        "AICVDS_LLM_API_KEY": "secret",
+        "AICVDS_LLM_THREADS": "2",
+    }.items():
+        monkeypatch.setenv(name, setting)
+
+
+def settings(backing: str, llm: Llm) -> dict[str, str]:
+    with environment_for(backing, llm) as environment:
+        own = {"AICVDS_MAX_MISSIONS", "AICVDS_LOG_LEVEL"}
+        return {k: v for k, v in environment.items() if k.startswith("AICVDS_") and k not in own}
+
+
+def test_only_what_cannot_change_a_decision_is_inherited() -> None:
+    assert settings(ASKED, Llm()) == {"AICVDS_LLM_THREADS": "2"}
+    assert settings(OFF, Llm()) == {"AICVDS_LLM_THREADS": "2", "AICVDS_MODE": "value"}
+
+
+def test_a_server_gets_its_model_and_key() -> None:
+    asked = settings(ASKED, Llm(SERVER))
+    assert asked.pop("AICVDS_LLM_THREADS")
+    assert asked == {"AICVDS_LLM_URL": SERVER, "AICVDS_LLM_MODEL": "big", "AICVDS_LLM_API_KEY": "secret"}
+
+
+def test_a_model_file_is_embedded_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert settings("m.gguf", Llm())["AICVDS_LLM_GGUF"] == str(tmp_path / "m.gguf")
+
+
+def test_draws_at_random_come_from_a_server_of_our_own() -> None:
+    with environment_for(CHANCE, Llm()) as environment:
+        assert httpx.get(f"{environment['AICVDS_LLM_URL']}/models").status_code == 200
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(f"{environment['AICVDS_LLM_URL']}/models")
+
+
+def test_llms_that_may_answer_differently_have_different_identities(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "m.gguf").write_bytes(b"one")
+    (tmp_path / "m.gguf").write_bytes(b"two")
+    files = [Llm().identity(str(path)) for path in (tmp_path / "m.gguf", tmp_path / "a" / "m.gguf")]
+    asked = [llm.identity(ASKED) for llm in (Llm(), Llm(SERVER), Llm(edge="http://e:8000"))]
+    assert asked[0] == "embedded" and asked[1] == f"{SERVER} big"
+    assert len({*files, *asked, Llm().identity(OFF), Llm().identity(CHANCE)}) == 7
+
+
+def test_whether_there_is_an_llm_to_ask() -> None:
+    assert Llm().there and Llm(SERVER).there and not Llm("none").there
+    assert Llm("none", edge="http://e:8000").there

@@ -1,0 +1,147 @@
+"""Flights: flown once, kept whole, shared between experiments, flown again when their file is broken."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.scenario import Scenario
+from simulator.experiments.flight import FlightStore, flight_key
+from simulator.experiments.plan import weights_of
+from simulator.experiments.schemes import OFF, Scheme, at_full_speed, llm, local, over_edge
+from simulator.policies import policy_named
+from simulator.rollout import rollout
+from simulator.site import Site
+from tests.simulator.experiments.flying_tiny import TINY, declared, flown, run_in
+
+
+def flights_in(out: Path) -> dict[str, int]:
+    """Every flight's file, and when it was written."""
+    return {path.name: path.stat().st_mtime_ns for path in (out / "flights").glob("*.json.gz")}
+
+
+def test_a_flight_comes_back_as_it_was_kept(tmp_path: Path) -> None:
+    store, flight = FlightStore(tmp_path), flown(failures=[1, 2, 0], lost_packets=[0, 3, 9])
+    assert store.load("key") is None
+    store.save("key", flight)
+    assert store.load("key") == flight
+
+
+@pytest.mark.parametrize("content", [b"", b"not gzip", gzip.compress(b'{"seed": 1}'), gzip.compress(b"{}" * 500)[:30]])
+def test_a_broken_file_is_no_flight(tmp_path: Path, content: bytes) -> None:
+    store = FlightStore(tmp_path)
+    store.path("key").write_bytes(content)
+    assert store.load("key") is None
+
+
+def test_what_a_scheme_is_called_does_not_make_another_flight() -> None:
+    site = Site(TINY)
+    renamed = llm().model_copy(update={"name": "k5", "label": "k = 5"})
+    assert flight_key(llm(), "embedded", site, 0) == flight_key(renamed, "embedded", site, 0)
+
+
+def test_what_decides_where_and_when_makes_another_flight() -> None:
+    traced = Site(TINY, np.zeros((3, 10), dtype=np.int64))
+    keys = {
+        flight_key(llm(), "embedded", Site(TINY), 0),
+        flight_key(llm(), "embedded", Site(TINY), 1),
+        flight_key(llm(), "another model", Site(TINY), 0),
+        flight_key(over_edge("llm", "", top_k=3), "embedded", Site(TINY), 0),
+        flight_key(over_edge("llm", "", deadline_ms=None), "embedded", Site(TINY), 0),
+        flight_key(llm(), "embedded", Site(Scenario(steps=4)), 0),
+        flight_key(llm(), "embedded", traced, 0),
+        flight_key(local("eof"), None, Site(TINY), 0),
+        flight_key(at_full_speed("eof"), None, Site(TINY), 0),
+    }
+    assert len(keys) == 9
+
+
+def test_a_kept_flight_is_the_rollout_of_its_policy(tmp_path: Path) -> None:
+    [result] = run_in(tmp_path).make([declared()])
+    tallies = [rollout(Site(TINY).world(), policy_named("eof"), seed) for seed in range(3)]
+    assert result.schemes["eof"]["lost_packets"].values == [sum(t.lost_packets for t in ts) for ts in tallies]
+    assert result.schemes["eof"]["events"].values == [sum(t.events for t in ts) for ts in tallies]
+
+
+def test_experiments_share_flights_and_a_second_run_flies_nothing(tmp_path: Path) -> None:
+    run_in(tmp_path).make([declared(name="one")])
+    before = flights_in(tmp_path)
+    assert len(before) == 6
+    run_in(tmp_path).make([declared(local("random"), local("wqcs"), name="two", reference="random")])
+    after = flights_in(tmp_path)
+    assert len(after) == 9
+    assert before.items() <= after.items()
+
+
+def test_only_a_broken_flight_is_flown_again(tmp_path: Path) -> None:
+    first = run_in(tmp_path).make([declared()])
+    before = flights_in(tmp_path)
+    broken = sorted(before)[2]
+    (tmp_path / "flights" / broken).write_bytes(b"\x1f\x8b torn")
+    again = run_in(tmp_path).make([declared()])
+    after = flights_in(tmp_path)
+    assert {name for name in after if after[name] != before[name]} == {broken}
+    assert [r.schemes for r in again] == [r.schemes for r in first]
+
+
+def test_the_same_flights_give_the_same_files(tmp_path: Path) -> None:
+    run_in(tmp_path).make([declared()])
+    files = ["tiny/results.json", "tiny/results.csv"]
+    before = [(tmp_path / name).read_bytes() for name in files]
+    run_in(tmp_path).make([declared()])
+    assert [(tmp_path / name).read_bytes() for name in files] == before
+
+
+def test_two_processes_give_what_one_gives(tmp_path: Path) -> None:
+    alone = run_in(tmp_path / "one").make([declared()])
+    pair = run_in(tmp_path / "two")
+    pair.workers = 2
+    together = pair.make([declared()])
+    assert [r.schemes for r in together] == [r.schemes for r in alone]
+
+
+def test_a_scheme_that_cannot_fly_is_left_out_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Untrained:
+        def reset(self, scenario: Scenario, seed: int) -> None:
+            raise ValueError("trained for 4 sensors, this world has 10")
+
+    monkeypatch.setitem(policy_named.__globals__["_POLICIES"], "madqn", Untrained)
+    [result] = run_in(tmp_path).make([declared(local("eof"), local("madqn"))])
+    assert list(result.schemes) == ["eof"]
+    assert any("MADQN on paper cannot fly: trained for 4 sensors" in note for note in result.notes)
+
+
+def test_full_speed_changes_the_velocity_alone(tmp_path: Path) -> None:
+    run = run_in(tmp_path, seeds=1)
+    run.make([declared(local("eof"), at_full_speed("eof"), measures=("velocity", "lost_packets", "events"))])
+    store = FlightStore(tmp_path / "flights")
+    own, full = (store.load(flight_key(s, None, Site(TINY), 0)) for s in (local("eof"), at_full_speed("eof")))
+    assert own is not None and full is not None
+    assert {d.velocity for d in own.decisions} == {7} and {d.velocity for d in full.decisions} == {14}
+    assert [d.sensor for d in own.decisions[:3]] == [d.sensor for d in full.decisions[:3]]
+
+
+def test_a_scheme_that_asks_no_llm_says_so() -> None:
+    schemes: list[tuple[Scheme, bool]] = [
+        (llm(), True),
+        (over_edge("x", "", mode="value", backing=OFF), False),
+        (local("eof"), False),
+    ]
+    assert [scheme.asks_llm for scheme, _ in schemes] == [asks for _, asks in schemes]
+
+
+def test_a_network_trained_anew_is_another_scheme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights_of.cache_clear()
+    monkeypatch.setattr("simulator.experiments.plan.files", lambda package: tmp_path)
+    assert weights_of("eof") is None
+    (tmp_path / "checkpoints").mkdir()
+    hashes = set()
+    for content in (b"first", b"second"):
+        (tmp_path / "checkpoints" / "madqn.pt").write_bytes(content)
+        weights_of.cache_clear()
+        hashes.add(weights_of("madqn"))
+    weights_of.cache_clear()
+    assert len(hashes) == 2 and None not in hashes
