@@ -17,6 +17,11 @@ _SUMMARIES = {
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 
+# Of the simulator's commands, those that need more than the extra `simulator`.
+_EXTRAS = {"train": "marl"}
+# What only some of a command's options need, and import when they do.
+_EXTRA_OF_MODULE = {"ortools": "planner"}
+
 _USAGE = """usage: aicvds COMMAND [OPTIONS]
 
 {commands}
@@ -49,15 +54,15 @@ def main() -> int:
         print(f"aicvds: there is no command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
-        command = found[0].load()
+        return int(found[0].load()(rest) or 0)
     except ModuleNotFoundError as missing:
-        extra = "service" if found[0].value.startswith("service") else "simulator"
+        extra = "service" if found[0].value.startswith("service") else _EXTRAS.get(name, "simulator")
+        extra = _EXTRA_OF_MODULE.get(str(missing.name).partition(".")[0], extra)
         print(
             f"aicvds {name}: {missing.name} is not installed. Install the extra: pip install 'aic-vds[{extra}]'",
             file=sys.stderr,
         )
         return 2
-    return int(command(rest) or 0)
 
 
 if __name__ == "__main__":

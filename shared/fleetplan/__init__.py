@@ -1,0 +1,21 @@
+"""The fleet's planner: what all UAVs do over a horizon so that the fewest packets are lost (extra ``planner``)."""
+
+from __future__ import annotations
+
+from shared.fleetplan.problem import Course, FleetProblem, IntArray, fly, price
+from shared.fleetplan.risk import neglect
+from shared.fleetplan.solver import Budget, News, Plan, least_loss, plan
+
+__all__ = [
+    "Budget",
+    "Course",
+    "FleetProblem",
+    "IntArray",
+    "News",
+    "Plan",
+    "fly",
+    "least_loss",
+    "neglect",
+    "plan",
+    "price",
+]

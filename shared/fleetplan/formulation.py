@@ -1,0 +1,278 @@
+"""The exact time-expanded formulation of a fleet's plan, for OR-Tools CP-SAT.
+
+Of UAV i the integer ``c_it`` is the sum of its velocities up to step t, so that it is ``c_it x step_s`` metres on along
+its trajectory, whatever its shape. The Boolean ``x_ijtk`` says that it collects from sensor j in step t over a link
+of at least ``p_k`` packets; it confines ``c_it`` to the values from which that link holds. Of sensor j, ``q_jt`` is
+the queue before step t and ``l_jt`` what it loses in it:
+
+    q_j(t+1) + l_jt >= q_jt + a_jt - sum_ik p_k x_ijtk,   q_j(t+1) + l_jt >= a_jt,   q_jt <= W
+
+with at most one x a UAV and step, and at most one a sensor and step. Smaller queues are never worse, so that
+minimising the sum of ``l`` makes these the world's recursion. What makes the search quick are redundant constraints,
+one for every sensor and every run of steps s..e in which more than W packets come together:
+
+    sum_t l_jt + excess x sum_t x_jt >= excess,   excess = what came at its start and since, less W
+
+that is, unless the sensor is visited within them, the excess is lost.
+
+Batteries enter only as the packets that each can pay for over its best link, all steps together. That leaves out
+that a weak link costs more, and so keeps every plan that the world allows: the bound proven stays valid.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from ortools.sat.python import cp_model
+
+from shared.channel import packets_per_step, rate_bps
+from shared.fleetplan.problem import Course, FleetProblem, IntArray, fly
+
+# Booleans that serve a sensor in a step, and the packets that each moves.
+Visits = list[tuple[Any, int]]
+Links = Literal["exact", "cautious", "hopeful"]
+
+# CP-SAT's objective has integer coefficients: a lost packet costs this much, so that a risk may be a fraction.
+SCALE = 100
+
+
+class Serve(NamedTuple):
+    """A UAV collects from a sensor in a step: over a link of at least ``needed`` packets, and so moves ``packets``."""
+
+    uav: int
+    sensor: int
+    step: int
+    packets: int
+    needed: int
+
+
+class Formulation:
+    """The model of one problem.
+
+    ``links`` says how exactly it takes what links can move. ``exact``: level by level, as it is, which needs several
+    times the Booleans. ``cautious``: every link moves no more than the weakest that holds, so that its plans lose at
+    most their objective. ``hopeful``: as much as the strongest, so that its bound holds in the world. Often all three
+    agree, and then the last two have proven an exact plan quickly.
+
+    Attributes:
+        model: to be solved.
+        flown: ``c_it`` by UAV and step.
+        serves: ``x`` by what it says.
+    """
+
+    def __init__(self, problem: FleetProblem, links: Links = "exact") -> None:
+        self.problem = problem
+        self._links = links
+        self.model = cp_model.CpModel()
+        self.flown: list[list[Any]] = []
+        self.serves: dict[Serve, Any] = {}
+        self._queue: list[list[Any]] = []
+        self._lost: list[list[Any]] = []
+        self._costs: list[Any] = []
+        for uav in range(problem.uavs):
+            self._fly(uav)
+        self._exclude()
+        visits = self._visits()
+        for sensor, affordable in enumerate(self._affordable().tolist()):
+            self._store(sensor, affordable, visits[sensor])
+        self.model.minimize(_total(self._costs))
+
+    @cached_property
+    def _most(self) -> IntArray:
+        """The largest queue a sensor can have before each step, shape ``(H, J)``: no transfer moves more."""
+        problem, capacity = self.problem, self.problem.scenario.queue_capacity
+        most = [problem.queue]
+        for arrivals in problem.arrivals[:-1]:
+            most.append(np.minimum(most[-1] + arrivals, capacity))
+        return np.array(most)
+
+    @cached_property
+    def _overflow(self) -> IntArray:
+        """The most that a sensor can lose in each step, and nothing after the last, shape ``(H + 1, J)``."""
+        most = np.maximum(self._most + self.problem.arrivals - self.problem.scenario.queue_capacity, 0)
+        return np.concatenate((most, np.zeros_like(most[:1])))
+
+    def _affordable(self) -> IntArray:
+        """Packets that each battery pays for over the best link of all, that from right above, shape ``(J,)``."""
+        world = self.problem.scenario
+        joules = world.transmit_power_w * world.packet_bits / float(rate_bps(0.0, world))
+        return np.asarray(np.floor(np.minimum(self.problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
+
+    def _fly(self, uav: int) -> None:
+        """The variables of one UAV: velocities within 0..max, fixed ones as they are, and where it can serve."""
+        problem, model = self.problem, self.model
+        fastest = problem.scenario.max_velocity
+        fixed = problem.fixed.get(uav, np.empty((0, 2), dtype=np.int64))
+        row: list[Any] = np.cumsum(fixed[:, 1]).tolist()
+        start = row[-1] if row else 0
+        farthest = start + (problem.horizon - len(row)) * fastest
+        links = packets_per_step(problem.distance(uav, np.arange(farthest + 1)), problem.scenario)
+        for step, (sensor, _) in enumerate(fixed.tolist()):
+            packets = min(int(links[row[step], sensor]), int(self._most[step, sensor]))
+            if packets and not any((s.sensor, s.step) == (sensor, step) for s in self.serves):
+                self.serves[Serve(uav, sensor, step, packets, packets)] = model.new_constant(1)
+        for step in range(len(row), problem.horizon):
+            reached = links[start : start + (step + 1 - len(fixed)) * fastest + 1]
+            now = model.new_int_var(start, start + len(reached) - 1, f"c_{uav}_{step}")
+            model.add_linear_constraint(now - (row[-1] if row else 0), 0, fastest)
+            row.append(now)
+            self._serve_within(uav, step, now, np.minimum(reached, self._most[step]), start)
+        self.flown.append(row)
+
+    def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray, start: int) -> None:
+        """A Boolean for every sensor that the UAV can serve in this step, one a level of packets."""
+        servable = packets.any(axis=0)
+        if self.problem.usable is not None:
+            servable &= self.problem.usable[step]
+        for sensor in np.flatnonzero(servable).tolist():
+            for level, needed in self._levels(packets[:, sensor]):
+                literal = self.model.new_bool_var(f"x_{uav}_{sensor}_{step}_{needed}")
+                values = (start + np.flatnonzero(packets[:, sensor] >= needed)).tolist()
+                within = cp_model.Domain.from_values(values)
+                self.model.add_linear_expression_in_domain(now, within).only_enforce_if(literal)
+                self.serves[Serve(uav, sensor, step, level, needed)] = literal
+
+    def _levels(self, packets: IntArray) -> list[tuple[int, int]]:
+        """The packets that a transfer is taken to move, and those that its link must be able to, level by level."""
+        levels = np.unique(packets[packets > 0]).tolist()
+        match self._links:
+            case "exact":
+                return [(level, level) for level in levels]
+            case "cautious":
+                return [(levels[0], levels[0])]
+            case "hopeful":
+                return [(levels[-1], levels[0])]
+
+    def _exclude(self) -> None:
+        """A UAV serves at most one sensor in a step, a sensor at most one UAV."""
+        rivals: dict[tuple[str, int, int], list[Any]] = defaultdict(list)
+        for serve, literal in self.serves.items():
+            rivals["uav", serve.uav, serve.step].append(literal)
+            rivals["sensor", serve.sensor, serve.step].append(literal)
+        for literals in rivals.values():
+            if len(literals) > 1:
+                self.model.add_at_most_one(literals)
+
+    def _visits(self) -> list[list[Visits]]:
+        """The Booleans that serve a sensor in a step and the packets that each moves, ``[j][t]``."""
+        problem = self.problem
+        visits: list[list[Visits]] = [[[] for _ in range(problem.horizon)] for _ in range(problem.sensors)]
+        for serve, literal in self.serves.items():
+            visits[serve.sensor][serve.step].append((literal, serve.packets))
+        return visits
+
+    def _store(self, sensor: int, affordable: int, visits: list[Visits]) -> None:
+        """The queue of one sensor, what overflows."""
+        problem, model, capacity = self.problem, self.model, self.problem.scenario.queue_capacity
+        came = [int(problem.queue[sensor]), *problem.arrivals[:, sensor].tolist()]
+        queue: list[Any] = [came[0]]
+        lost: list[Any] = []
+        for step, arrived in enumerate(came[1:]):
+            filled = int(self._most[step, sensor]) + arrived
+            after = model.new_int_var(min(arrived, capacity), min(filled, capacity), "")
+            over = model.new_int_var(max(0, arrived - capacity), int(self._overflow[step, sensor]), "")
+            drained = _total(packets * literal for literal, packets in visits[step])
+            model.add(after + over >= queue[-1] + arrived - drained)
+            if arrived > capacity:
+                model.add(after + over >= arrived)
+            queue.append(after)
+            lost.append(over)
+        if sum(came) > affordable:
+            # What was there and what came is lost, left or paid for.
+            model.add(_total(lost) + queue[-1] >= sum(came) - affordable)
+        self._must_visit(came, lost, visits, capacity)
+        self._queue.append(queue[1:])
+        self._lost.append(lost)
+        self._expect(sensor, lost, visits)
+
+    def _must_visit(self, came: list[int], costs: list[Any], visits: list[Visits], room: int) -> None:
+        """What comes in a run of steps without a visit and has no room is paid for.
+
+        ``costs[t]`` is what is paid in step t, and ``came[0]`` what was there before step 0.
+        """
+        for start in range(len(came)):
+            excess = came[start] - room
+            for end in range(start + 1, len(came)):
+                excess += came[end]
+                if excess > room:
+                    break
+                if excess > 0:
+                    within = _total(literal for step in visits[start:end] for literal, _ in step)
+                    self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
+
+    def _expect(self, sensor: int, lost: list[Any], visits: list[Visits]) -> None:
+        """The cost of one sensor: what it loses, or what it is expected to if that is more."""
+        risk = self.problem.risk
+        if risk is None:
+            self._costs += [SCALE * over for over in lost]
+            return
+        steps = np.rint(SCALE * risk[:, :, sensor]).astype(int)
+        for step, column in enumerate(steps.T):
+            cost = self.model.new_int_var(0, int(column.max(initial=0)) + SCALE * int(self._overflow[step, sensor]), "")
+            if step < len(lost):
+                self.model.add(cost >= SCALE * lost[step])
+            for since, expected in enumerate(column[: step + 1].tolist()):
+                if expected > (column[since + 1] if since < step else 0):
+                    within = _total(literal for now in visits[since : step + 1] for literal, _ in now)
+                    self.model.add(cost + expected * within >= expected)
+            self._costs.append(cost)
+
+    def hint(self, actions: IntArray) -> None:
+        """Start from these actions ``(H, I, 2)``, which begin with the fixed ones."""
+        course = fly(self.problem, actions)
+        flown = np.cumsum(actions[:, :, 1], axis=0)
+        for uav, row in enumerate(self.flown):
+            for step, variable in enumerate(row):
+                if not isinstance(variable, int):
+                    self.model.add_hint(variable, int(flown[step, uav]))
+        served = self._served(actions, course)
+        for serve, literal in self.serves.items():
+            if not isinstance(self.flown[serve.uav][serve.step], int):
+                self.model.add_hint(literal, int(serve in served))
+        for sensor, row in enumerate(self._queue):
+            for step, variable in enumerate(row):
+                self.model.add_hint(variable, int(course.queue[step + 1, sensor]))
+                self.model.add_hint(self._lost[sensor][step], int(course.lost[step, sensor]))
+
+    def _served(self, actions: IntArray, course: Course) -> set[Serve]:
+        """The best level of every transfer that these actions made."""
+        best: dict[tuple[int, int], Serve] = {}
+        for serve in self.serves:
+            made = (serve.step, serve.uav)
+            if actions[made][0] == serve.sensor and course.link[made] >= serve.needed:
+                best[made] = max(serve, best.get(made, serve))
+        return set(best.values())
+
+    def actions(self, value: Any) -> IntArray:
+        """The actions ``(H, I, 2)`` of a solution, ``value`` giving the value of a variable."""
+        problem = self.problem
+        flown = np.array([[c if isinstance(c, int) else value(c) for c in row] for row in self.flown], dtype=np.int64)
+        velocity = np.diff(flown, axis=1, prepend=0)
+        sensor = np.full((problem.horizon, problem.uavs), -1)
+        for serve, literal in self.serves.items():
+            if value(literal):
+                sensor[serve.step, serve.uav] = serve.sensor
+        for uav, fixed in problem.fixed.items():
+            sensor[: len(fixed), uav] = fixed[:, 0]
+        for step, row in enumerate(sensor):
+            for uav in np.flatnonzero(row < 0).tolist():
+                row[uav] = self._spare(row, uav, int(flown[uav, step]), problem.queue)
+        return np.stack([sensor, velocity.T], axis=-1)
+
+    def _spare(self, chosen: IntArray, uav: int, flown: int, queue: IntArray) -> int:
+        """A sensor for a UAV that needs none, so that it takes no other UAV's transfer."""
+        free = ~np.isin(np.arange(self.problem.sensors), chosen)
+        distance = self.problem.distance(uav, np.array(flown))
+        if free.any():
+            return int(np.argmin(np.where(free, distance, np.inf)))
+        # With fewer sensors than UAVs: one that an earlier UAV has served by then, else the farthest.
+        earlier = chosen[:uav]
+        return int(earlier[0]) if len(earlier) else int(np.argmax(distance))
+
+
+def _total(terms: Iterable[Any]) -> Any:
+    return cp_model.LinearExpr.sum(list(terms))

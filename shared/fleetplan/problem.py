@@ -1,0 +1,174 @@
+"""What a fleet's plan is made for, what a plan is, and what becomes of the sensors when it is flown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import FloatArray, link_holds, packets_per_step, rate_bps
+from shared.scenario import Scenario
+from shared.trajectory import Trajectory
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class FleetProblem:
+    """A fleet, its sensors, and what arrives over a horizon of H steps.
+
+    Attributes:
+        scenario: the physics: channel, velocities, step, queue capacity W, transmit power.
+        trajectories: one a UAV, I of them.
+        progress_m: shape ``(I,)``, how far along each UAV is.
+        places: shape ``(J, 2)``, metres.
+        queue: shape ``(J,)``, whole packets, 0..W.
+        battery: shape ``(J,)``, joules.
+        arrivals: shape ``(H, J)``, whole packets that arrive in each step, after the transfers.
+        fixed: by UAV, its first actions ``(n, 2)`` (sensor, velocity), n at most H, which the plan must begin with.
+        usable: shape ``(H, J)``, where a plan may serve a sensor in a step; ``None``: everywhere.
+            Fixed actions are not held to it.
+        risk: shape ``(H + 1, H + 1, J)``, for arrivals that are only expected: ``risk[s, e]`` are the packets that a
+            sensor is expected to lose in step e (H stands for all later steps) if nobody has visited it since step s
+            began. Its last visit was then in step s - 1 and emptied it; s = 0 means before the plan. Only s <= e
+            counts. ``None``: arrivals are certain.
+
+    Raises:
+        ValueError: a shape or a value is wrong; the message names the field.
+    """
+
+    scenario: Scenario
+    trajectories: Sequence[Trajectory]
+    progress_m: FloatArray
+    places: FloatArray
+    queue: IntArray
+    battery: FloatArray
+    arrivals: IntArray
+    fixed: Mapping[int, IntArray] = field(default_factory=dict)
+    usable: NDArray[np.bool_] | None = None
+    risk: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.places)
+        if self.arrivals.ndim != 2 or not len(self.arrivals):
+            raise ValueError(f"arrivals has shape {self.arrivals.shape}, must be (H, {count}) with H at least 1")
+        shapes = {
+            "progress_m": (len(self.trajectories),),
+            "places": (count, 2),
+            "queue": (count,),
+            "battery": (count,),
+            "arrivals": (self.horizon, count),
+        }
+        if self.usable is not None:
+            shapes["usable"] = (self.horizon, count)
+        if self.risk is not None:
+            shapes["risk"] = (self.horizon + 1, self.horizon + 1, count)
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, must be {shape}")
+        for name in ("queue", "arrivals"):
+            if getattr(self, name).dtype.kind not in "iu" or getattr(self, name).min(initial=0) < 0:
+                raise ValueError(f"{name} must be whole packets, at least 0")
+        if self.queue.max(initial=0) > self.scenario.queue_capacity:
+            raise ValueError(f"queue has {self.queue.max()} packets, the capacity is {self.scenario.queue_capacity}")
+        for uav, actions in self.fixed.items():
+            if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
+                shape = actions.shape
+                raise ValueError(f"fixed[{uav}] has shape {shape}, must be (at most {self.horizon}, 2) of a UAV")
+
+    @property
+    def horizon(self) -> int:
+        """Steps H."""
+        return len(self.arrivals)
+
+    @property
+    def uavs(self) -> int:
+        """UAVs I."""
+        return len(self.trajectories)
+
+    @property
+    def sensors(self) -> int:
+        """Sensors J."""
+        return len(self.places)
+
+    def distance(self, uav: int, velocity: IntArray) -> FloatArray:
+        """Horizontal distances to all sensors, ``(..., J)`` metres, after steps at velocities that sum to ``(...)``."""
+        progress = self.progress_m[uav] + np.asarray(velocity) * self.scenario.step_s
+        offset = self.trajectories[uav].at(progress)[..., None, :] - self.places
+        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What becomes of the sensors when actions are flown.
+
+    Attributes:
+        queue: shape ``(H + 1, J)``, packets before each step and after the last.
+        lost: shape ``(H, J)``, packets.
+        link: shape ``(H, I)``, packets that the link could move; 0 where the transmission failed.
+    """
+
+    queue: IntArray
+    lost: IntArray
+    link: IntArray
+
+
+def fly(problem: FleetProblem, actions: IntArray) -> Course:
+    """Fly actions ``(H, I, 2)`` as the simulated world does: move, transfer, arrive, overflow.
+
+    The transfers go by UAV index; one fails where the link does not hold, where the sensor has served in this step,
+    or where its battery cannot pay for one packet.
+    """
+    capacity = problem.scenario.queue_capacity
+    queue, lost = [problem.queue], []
+    battery = problem.battery.copy()
+    link = np.zeros(actions.shape[:2], dtype=np.int64)
+    for step, transfers in enumerate(_transfers(problem, actions)):
+        left, served = queue[-1].copy(), set[int]()
+        for uav, (sensor, budget, joules) in enumerate(transfers):
+            affordable = int(battery[sensor] / joules + 1e-9)
+            if budget is None or sensor in served or affordable < 1:
+                continue
+            served.add(sensor)
+            link[step, uav] = budget
+            moved = min(int(left[sensor]), budget, affordable)
+            left[sensor] -= moved
+            battery[sensor] = max(0.0, float(battery[sensor]) - moved * joules)
+        filled = left + problem.arrivals[step]
+        queue.append(np.minimum(filled, capacity))
+        lost.append(filled - queue[-1])
+    return Course(np.array(queue), np.array(lost), link)
+
+
+def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
+    """The packets that actions lose, and what a plan minimises: those and what is expected above them."""
+    course = fly(problem, actions)
+    lost = int(course.lost.sum())
+    if problem.risk is None:
+        return lost, float(lost)
+    since = np.zeros(problem.sensors, dtype=np.int64)
+    cost, every = 0.0, np.arange(problem.sensors)
+    for step in range(problem.horizon):
+        since[actions[step, course.link[step] > 0, 0]] = step + 1
+        # A sensor visited in this very step has its risk from the next one on.
+        expected = np.where(since <= step, problem.risk[np.minimum(since, step), step, every], 0.0)
+        cost += float(np.maximum(expected, course.lost[step]).sum())
+    return lost, cost + float(problem.risk[since, problem.horizon, every].sum())
+
+
+def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float]]]:
+    """By step, each UAV's sensor, the packets its link can move (``None``: it does not hold), and joules a packet."""
+    world = problem.scenario
+    flown, sensor = np.cumsum(actions[:, :, 1], axis=0), actions[:, :, 0]
+    columns = []
+    for uav in range(problem.uavs):
+        distance = problem.distance(uav, flown[:, uav])
+        columns.append(np.take_along_axis(distance, sensor[:, uav, None], axis=1)[:, 0])
+    reach = np.stack(columns, axis=1)
+    holds, budget = link_holds(reach, world), packets_per_step(reach, world)
+    joules = world.transmit_power_w * (world.packet_bits / np.maximum(rate_bps(reach, world), 1e-12))
+    for step in range(len(actions)):
+        rows = zip(*(a[step].tolist() for a in (sensor, holds, budget, joules)), strict=True)
+        yield [(j, packets if held else None, joule) for j, held, packets, joule in rows]

@@ -1,0 +1,263 @@
+"""Plans of a fleet: the least packets lost over a horizon, found and bounded by CP-SAT."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from shared.fleetplan.problem import FleetProblem, IntArray, fly, price
+
+# OR-Tools takes a second to import, and only planning needs it.
+if TYPE_CHECKING:
+    from shared.fleetplan.formulation import Formulation, Links
+
+_QUICK_WORK = 3.0
+# Steps that a start is planned by.
+_NEAR = 8
+# One worker first raises the bound by cores, which ends soonest where most sensors lose nothing; where losses are many
+# that finds no plan, and the rest of the work goes to the usual search. Without a limit of work the first never ends.
+_STRATEGIES: tuple[tuple[Mapping[str, Any], float], ...] = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
+_PORTFOLIO: tuple[tuple[Mapping[str, Any], float], ...] = (({}, 1.0),)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long to search.
+
+    Attributes:
+        work: limit of the solver's deterministic time: about seconds on an idle core, but counted in operations, so
+            that with one worker the same problem gives the same plan whatever the machine is doing.
+        seconds: limit of the wall clock; the plan then depends on the machine.
+        workers: threads.
+        seed: of the solver's randomness.
+    """
+
+    work: float = math.inf
+    seconds: float = math.inf
+    workers: int = 1
+    seed: int = 0
+
+
+class News(NamedTuple):
+    """How far a search is: the best plan's objective and the bound proven so far, both in lost packets."""
+
+    objective: float
+    lower_bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a fleet does.
+
+    Attributes:
+        actions: shape ``(H, I, 2)``: sensor, velocity. A UAV with nothing to collect names a sensor that no other
+            one's transfer needs.
+        lost_packets: what flying the actions loses over the horizon, batteries and links as they are.
+        objective: that and what is expected above it; without a ``risk``, the same.
+        lower_bound: proven: no actions have a lower objective, whatever the batteries. With ``cautious`` links it
+            holds only if every link were as weak as those.
+        status: the solver's, such as OPTIMAL, FEASIBLE or UNKNOWN.
+        seconds: wall clock, building included.
+        work: deterministic time used.
+    """
+
+    actions: IntArray
+    lost_packets: int
+    objective: float
+    lower_bound: float
+    status: str
+    seconds: float
+    work: float
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the plan is proven to be the best (with ``cautious`` links: if every link were that weak)."""
+        return self.objective <= self.lower_bound + 1e-9
+
+
+def plan(
+    problem: FleetProblem,
+    budget: Budget,
+    links: Links = "exact",
+    hint: IntArray | None = None,
+    on_news: Callable[[News], None] | None = None,
+) -> Plan:
+    """Search once.
+
+    Args:
+        problem: to solve.
+        budget: when to stop; without limits, when the optimum is proven.
+        links: how exactly to take what links can move; see :class:`~shared.fleetplan.formulation.Formulation`.
+        hint: actions ``(H, I, 2)`` to start from, such as an earlier plan's shifted by a step. They are the plan
+            unless the search finds better ones.
+        on_news: called with each better plan or bound, from a thread of the solver.
+
+    Returns:
+        The best plan found; if there is none, the hint, else everyone at full speed.
+
+    Raises:
+        ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
+    """
+    from shared.fleetplan.formulation import Formulation
+
+    begun = time.perf_counter()
+    best = _priced(problem, _begun_as_fixed(problem, hint))
+    found = _Search(None, 0.0, "UNKNOWN", 0.0)
+    for strategy, share in _STRATEGIES if budget.workers == 1 else _PORTFOLIO:
+        formulation = Formulation(problem, links)
+        if hint is not None or best.found:
+            formulation.hint(best.actions)
+        left = budget.seconds - (time.perf_counter() - begun)
+        now = replace(budget, work=budget.work * share, seconds=max(left, 0.0))
+        search = _search(formulation, now, strategy, on_news)
+        found = search._replace(lower_bound=max(search.lower_bound, found.lower_bound), work=found.work + search.work)
+        if search.actions is not None:
+            best = min(best, _priced(problem, search.actions)._replace(found=True), key=lambda p: p.objective)
+        if search.status == "OPTIMAL":
+            break
+    seconds = time.perf_counter() - begun
+    return Plan(best.actions, best.lost_packets, best.objective, found.lower_bound, found.status, seconds, found.work)
+
+
+def least_loss(
+    problem: FleetProblem, seconds: float, workers: int = 8, on_news: Callable[[News], None] | None = None
+) -> Plan:
+    """The plan of least cost and the best bound that can be proven in about so many seconds.
+
+    First quickly with links taken as all alike, too strong for the bound and too weak for the plan; where the two do
+    not meet, with all ``workers``, and then with links as they are.
+    """
+    begun = time.perf_counter()
+    quick = Budget(work=_QUICK_WORK, seconds=seconds)
+    searches: list[tuple[Links, Budget, float]] = [
+        ("hopeful", quick, 0.3),
+        ("cautious", quick, 0.3),
+        ("hopeful", Budget(workers=workers), 0.5),
+        ("exact", Budget(workers=workers), 1.0),
+    ]
+    best: Plan | None = None
+    work = 0.0
+    for links, budget, share in searches:
+        left = seconds - (time.perf_counter() - begun)
+        if best is not None and (best.optimal or left <= 0):
+            break
+        if links == "cautious":
+            start = _receding(problem, left * share)
+        elif best is not None:
+            start = best.actions
+        else:
+            start = None
+        now = replace(budget, seconds=max(left * share, 0.01))
+        found = plan(problem, now, links, start, _told(on_news, best))
+        work += found.work
+        best = _better(best, found, links)
+    assert best is not None
+    status = "OPTIMAL" if best.optimal else "FEASIBLE"
+    return replace(best, seconds=time.perf_counter() - begun, work=work, status=status)
+
+
+def _receding(problem: FleetProblem, seconds: float) -> IntArray:
+    """Actions from plans of a few steps each, one after another: a start for where the whole is too large."""
+    begun, flown = time.perf_counter(), []
+    now = problem
+    while True:
+        near = replace(now, arrivals=now.arrivals[:_NEAR], fixed={}, usable=None, risk=None)
+        left = seconds - (time.perf_counter() - begun)
+        found = plan(near, Budget(work=0.3, seconds=max(left, 0.01)), "cautious")
+        kept = found.actions[: _NEAR // 2 if now.horizon > _NEAR else _NEAR]
+        flown.append(kept)
+        if len(kept) == now.horizon:
+            return np.concatenate(flown)
+        now = replace(
+            near,
+            progress_m=now.progress_m + kept[:, :, 1].sum(axis=0) * problem.scenario.step_s,
+            queue=fly(near, found.actions).queue[len(kept)],
+            arrivals=now.arrivals[len(kept) :],
+        )
+
+
+def _better(best: Plan | None, found: Plan, links: Links) -> Plan:
+    """The cheaper plan with the higher of the bounds that hold in the world."""
+    proven = 0.0 if links == "cautious" else found.lower_bound
+    if best is None:
+        return replace(found, lower_bound=proven)
+    cheaper = min(best, found, key=lambda p: p.objective)
+    return replace(cheaper, lower_bound=max(best.lower_bound, proven))
+
+
+def _told(on_news: Callable[[News], None] | None, best: Plan | None) -> Callable[[News], None] | None:
+    """News of one search made news of them all."""
+    if on_news is None or best is None:
+        return on_news
+    return lambda news: on_news(News(min(best.objective, news.objective), best.lower_bound))
+
+
+class _Search(NamedTuple):
+    """What came of one run of the solver; ``actions`` is ``None`` if it found no plan."""
+
+    actions: IntArray | None
+    lower_bound: float
+    status: str
+    work: float
+
+
+class _Priced(NamedTuple):
+    """Actions and what they cost; ``found`` by the solver, or else given."""
+
+    actions: IntArray
+    lost_packets: int
+    objective: float
+    found: bool = False
+
+
+def _priced(problem: FleetProblem, actions: IntArray) -> _Priced:
+    return _Priced(actions, *price(problem, actions))
+
+
+def _search(
+    formulation: Formulation, budget: Budget, strategy: Mapping[str, Any], on_news: Callable[[News], None] | None
+) -> _Search:
+    from ortools.sat.python import cp_model
+
+    from shared.fleetplan.formulation import SCALE
+
+    solver = cp_model.CpSolver()
+    solver.parameters.num_workers = budget.workers
+    solver.parameters.random_seed = budget.seed
+    # Probing takes longer than the search itself.
+    solver.parameters.cp_model_probing_level = 0
+    for name, value in strategy.items():
+        setattr(solver.parameters, name, value)
+    if budget.work < math.inf:
+        solver.parameters.max_deterministic_time = budget.work
+    if budget.seconds < math.inf:
+        solver.parameters.max_time_in_seconds = budget.seconds
+
+    class Listener(cp_model.CpSolverSolutionCallback):
+        def on_solution_callback(self) -> None:
+            if on_news is not None:
+                on_news(News(self.objective_value / SCALE, self.best_objective_bound / SCALE))
+
+    status = solver.solve(formulation.model, Listener() if on_news is not None else None)
+    found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
+    actions = formulation.actions(solver.value) if found else None
+    # A plan's cost is whole in the formulation's units; what is missing to that is the solver's rounding.
+    bound = max(0, math.ceil(solver.best_objective_bound - 1e-6)) / SCALE
+    return _Search(actions, bound, solver.status_name(status), solver.deterministic_time)
+
+
+def _begun_as_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
+    """The actions, or everyone at full speed at sensor 0, with the problem's fixed ones at their beginning."""
+    if actions is None:
+        begun = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
+        begun[:, :, 1] = problem.scenario.max_velocity
+    else:
+        begun = actions.copy()
+    for uav, fixed in problem.fixed.items():
+        begun[: len(fixed), uav] = fixed
+    return begun
