@@ -49,6 +49,7 @@ POLICIES = {
     "llm": (BLUE, "-", "o"),
     "guided": (BLUE, "--", "d"),
     "value": (BLUE, ":", "8"),
+    "value_reach": (SKY, "-", "8"),
     "edge_policy": (BLUE, "-.", "H"),
     "llm_all": (SKY, "--", "s"),
     "llm_random_start": (SKY, "-", "^"),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import OFF, Scheme, llm, over_edge, value
+from simulator.experiments.schemes import Scheme, llm, over_edge, value, value_reach
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
     return [
         value(),
-        over_edge("value_reach", "mode value, features reach", mode="value", features="reach", backing=OFF),
+        value_reach(),
         llm(),
         over_edge("llm_reach", "mode llm, features reach", features="reach"),
     ]

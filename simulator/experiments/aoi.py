@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, at_full_speed, edge_policy, llm, locals_there_are, value
+from simulator.experiments.schemes import Scheme, every_scheme
 
 _AGES = ("aoi_mean", "aoi_peak", "aoi_worst")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    return [llm(), value(), edge_policy(), *locals_there_are(), at_full_speed("eof"), at_full_speed("wqcs")]
+    return every_scheme()
 
 
 EXPERIMENT = Experiment(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, at_full_speed, edge_policy, llm, locals_there_are, value
+from simulator.experiments.schemes import Scheme, at_full_speed, edge_policy, llm, locals_there_are, value, value_reach
 
 _POLICIES = ("madqn", "mappo", "eof", "wqcs", "max_gain", "nearest", "random")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    return [llm(), value(), edge_policy(), *locals_there_are(*_POLICIES), at_full_speed("eof")]
+    return [llm(), value(), value_reach(), edge_policy(), *locals_there_are(*_POLICIES), at_full_speed("eof")]
 
 
 EXPERIMENT = Experiment(

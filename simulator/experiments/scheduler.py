@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import BOUND, Scheme, at_full_speed, edge_policy, llm, locals_there_are, value
+from simulator.experiments.schemes import BOUND, Scheme, every_scheme
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    fast = [at_full_speed("eof"), at_full_speed("wqcs")]
-    return [llm(), value(), edge_policy(), *locals_there_are(), *fast, BOUND]
+    return [*every_scheme(), BOUND]
 
 
 EXPERIMENT = Experiment(

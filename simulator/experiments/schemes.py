@@ -126,6 +126,17 @@ def value() -> Scheme:
     return over_edge("value", "AIC-VDS, mode value", mode="value", backing=OFF)
 
 
+def value_reach() -> Scheme:
+    """The same with features that look along the trajectory."""
+    return over_edge("value_reach", "AIC-VDS, mode value, reach", mode="value", features="reach", backing=OFF)
+
+
 def edge_policy() -> Scheme:
     """What the edge answers while its LLM is down."""
     return over_edge("edge_policy", "edge's policy (LLM down)", backing=OFF)
+
+
+def every_scheme() -> list[Scheme]:
+    """All that can fly, in the order to show them."""
+    ours = [llm(), value(), value_reach(), edge_policy()]
+    return [*ours, *locals_there_are(), at_full_speed("eof"), at_full_speed("wqcs")]

@@ -32,7 +32,8 @@ EXPERIMENT = Experiment(
     notes=(
         "Tokens are o200k_base's (GPT-4o-mini's), but for those said to be the model's own. `Without attention` is the "
         "counterfactual of the same decision: every reported sensor, battery included. It saves by masks as well as by "
-        "attention: sensors that are not heard, reserved or flat leave the prompt too.",
+        "attention: sensors that are not heard, reserved or flat leave the prompt too. What masks alone leave is "
+        "the row `mode llm, no attention`; what attention adds to them is the paired difference to it.",
         "Modes value and the edge's policy send no prompt; theirs is the one that would have been sent.",
     ),
 )

@@ -121,12 +121,12 @@ def test_an_edge_that_dies_is_told_with_its_log(tmp_path: Path) -> None:
 
 
 def test_an_edge_without_a_usable_llm_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "junk.gguf").write_bytes(b"GGUF" + b"\0" * 1000)
-    args = ["llm-models", "--model", str(tmp_path / "junk.gguf"), "--steps", "2", "--seeds", "1"]
-    ended = run("experiment", *args, "--llm", "none", "--out", str(tmp_path / "out"))
+    args = ["top-k", "--llm", "http://127.0.0.1:1/v1", "--steps", "2", "--seeds", "1"]
+    ended = run("experiment", *args, "--out", str(tmp_path))
     assert ended.returncode == 1
     assert "no LLM is ready (it is unavailable)" in ended.stderr
     assert "Traceback" not in ended.stderr
+    assert not flights_in(tmp_path)
 
 
 def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:

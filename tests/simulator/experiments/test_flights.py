@@ -11,7 +11,7 @@ import pytest
 from shared.scenario import Scenario
 from simulator.experiments.flight import FlightStore, flight_key
 from simulator.experiments.plan import weights_of
-from simulator.experiments.schemes import OFF, Scheme, at_full_speed, llm, local, over_edge
+from simulator.experiments.schemes import BOUND, OFF, Scheme, at_full_speed, llm, local, over_edge
 from simulator.policies import policy_named
 from simulator.rollout import rollout
 from simulator.site import Site
@@ -145,3 +145,12 @@ def test_a_network_trained_anew_is_another_scheme(tmp_path: Path, monkeypatch: p
         hashes.add(weights_of("madqn"))
     weights_of.cache_clear()
     assert len(hashes) == 2 and None not in hashes
+
+
+def test_planners_fly_in_a_process_of_their_own_and_none_undercuts_the_bound(tmp_path: Path) -> None:
+    [result] = run_in(tmp_path, seeds=2).make([declared(local("eof"), local("mpc"), BOUND)])
+    least = result.bound["lost_packets"].values
+    for scheme in ("eof", "mpc"):
+        lost = result.schemes[scheme]["lost_packets"].values
+        assert all(low <= value for low, value in zip(least, lost, strict=True)), scheme
+    assert not any("wrong" in note or "cannot fly" in note for note in result.notes)
