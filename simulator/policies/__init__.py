@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from shared.scenario import Scenario
 from simulator.policies.eof import EarliestOverflowFirst
+from simulator.policies.learned import Learned
 from simulator.policies.max_gain import MaximumGain
+from simulator.policies.mpc import RecedingHorizon
 from simulator.policies.nearest import NearestNeighbour
 from simulator.policies.random_choice import RandomChoice
 from simulator.policies.round_robin import RoundRobin
 from simulator.policies.wqcs import WeightedQueueChannel
 from simulator.world import Observation
 
-__all__ = ["POLICY_NAMES", "Policy", "policy_named"]
+__all__ = ["LEARNED_NAMES", "POLICY_NAMES", "Policy", "policy_named"]
 
 
 class Policy(Protocol):
@@ -42,7 +45,12 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "wqcs": WeightedQueueChannel,
     "max_gain": MaximumGain,
     "nearest": NearestNeighbour,
+    "mpc": RecedingHorizon,
 }
+
+# These need the extra `marl`, and fly only scenarios of the size that they were trained in.
+LEARNED_NAMES = ("madqn", "mappo")
+_POLICIES |= {name: partial(Learned, name) for name in LEARNED_NAMES}
 
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)
 
@@ -52,6 +60,7 @@ def policy_named(name: str) -> Policy:
 
     Raises:
         ValueError: no policy has that name; the message lists the names.
+        BadUse: the policy needs an extra that is not installed; the message names it.
     """
     try:
         return _POLICIES[name]()

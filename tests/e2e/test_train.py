@@ -1,0 +1,65 @@
+"""``aicvds train`` as a user runs it: killed, resumed, misused."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from simulator.marl.checkpoint import Checkpoint
+from simulator.marl.curve import read_csv
+from tests.e2e.processes import run, started
+
+EPISODES = ("--episodes", "120")
+
+
+def weights_of(folder: Path) -> list[list[float]]:
+    return [value.flatten().tolist() for value in Checkpoint.load(folder / "mappo.pt").weights.values()]
+
+
+def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    ended = run("train", "mappo", *EPISODES, "--out", str(whole))
+    assert ended.returncode == 0, ended.stderr
+    with started("train", "mappo", *EPISODES, "--out", str(killed), "--save-s", "0") as process:
+        ends = time.monotonic() + 60
+        while not (killed / "state.pt").exists() and time.monotonic() < ends:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    assert not (killed / "mappo.pt").exists(), "it was over before it was killed"
+    resumed = run("train", "mappo", *EPISODES, "--out", str(killed), "--resume")
+    assert resumed.returncode == 0, resumed.stderr
+    assert weights_of(killed) == weights_of(whole)
+    assert read_csv(killed / "mappo.csv") == read_csv(whole / "mappo.csv")
+    for folder in (whole, killed):
+        left = {path.suffix for path in folder.glob("mappo.*")}
+        assert left == {".pt", ".csv", ".png", ".svg"}
+        assert list((folder / "tensorboard").glob("events.*"))
+    again = run("train", "mappo", *EPISODES, "--out", str(whole))
+    assert again.returncode == 2
+    assert "holds a training: give --resume" in again.stderr
+
+
+def test_help_teaches() -> None:
+    told = run("train", "--help").stdout
+    for word in ("madqn", "mappo", "--resume", "--episodes", "tensorboard"):
+        assert word in told
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["madqn", "--episodes", "0"], "--episodes 0 is not between 1 and 1000000"),
+        (["madqn", "--seed", "-1"], "--seed -1 is not between 0 and 4294967295"),
+        (["madqn", "--threads", "0"], "--threads 0 is not between 1 and 64"),
+        (["madqn", "--save-s", "-1"], "--save-s -1 is not between 0 and 3600"),
+        (["madqn", "--scenario", "moon"], "--scenario: unknown scenario 'moon'"),
+    ],
+)
+def test_bad_use_is_one_line_that_names_the_option(options: list[str], message: str) -> None:
+    ended = run("train", *options)
+    assert ended.returncode == 2
+    assert message in ended.stderr
+    assert len(ended.stderr.strip().splitlines()) == 1
