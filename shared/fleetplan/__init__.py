@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import Course, FleetProblem, IntArray, fly, price
 from shared.fleetplan.risk import neglect
-from shared.fleetplan.solver import Budget, News, Plan, least_loss, plan
+from shared.fleetplan.solver import Budget, Interrupted, News, Plan, least_loss, plan
 
 __all__ = [
     "Budget",
     "Course",
     "FleetProblem",
     "IntArray",
+    "Interrupted",
     "News",
     "Plan",
     "fly",
     "least_loss",
+    "look_ahead",
     "neglect",
     "plan",
     "price",

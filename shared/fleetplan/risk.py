@@ -12,6 +12,11 @@ from shared.channel import FloatArray
 _erf = np.frompyfunc(math.erf, 1, 1)
 
 
+def normal_below(z: ArrayLike) -> FloatArray:
+    """``Phi(z)``, of the shape of z. By the standard library: planning is to need no more than OR-Tools."""
+    return np.asarray(0.5 * (1.0 + np.asarray(_erf(np.asarray(z) / math.sqrt(2.0)), dtype=np.float64)))
+
+
 def expected_overflow(mean: ArrayLike, variance: ArrayLike, capacity: float) -> FloatArray:
     """``E[(X - W)+]`` of a normal X, packets: what a queue without a visit has lost when X came, whatever the order.
 
@@ -20,8 +25,7 @@ def expected_overflow(mean: ArrayLike, variance: ArrayLike, capacity: float) -> 
     sd = np.sqrt(np.maximum(np.asarray(variance, dtype=np.float64), 1e-12))
     over = np.asarray(mean, dtype=np.float64) - capacity
     z = over / sd
-    below = 0.5 * (1.0 + np.asarray(_erf(z / math.sqrt(2.0)), dtype=np.float64))
-    return np.asarray(over * below + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
+    return np.asarray(over * normal_below(z) + sd * np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
 
 
 def neglect(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import FleetProblem, IntArray, fly, price
 
 # OR-Tools takes a second to import, and only planning needs it.
@@ -22,7 +24,10 @@ _NEAR = 8
 # One worker first raises the bound by cores, which ends soonest where most sensors lose nothing; where losses are many
 # that finds no plan, and the rest of the work goes to the usual search. Without a limit of work the first never ends.
 _STRATEGIES: tuple[tuple[Mapping[str, Any], float], ...] = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
-_PORTFOLIO: tuple[tuple[Mapping[str, Any], float], ...] = (({}, 1.0),)
+# Less work than this is gone before the first proves anything.
+_WORK_FOR_CORES = 0.05
+_INTERRUPTED = "INTERRUPTED"
+_USUAL: tuple[tuple[Mapping[str, Any], float], ...] = (({}, 1.0),)
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,14 @@ class Plan:
         return self.objective <= self.lower_bound + 1e-9
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended a search; ``plan`` is the best until then, and its bound holds."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__()
+        self.plan = plan
+
+
 def plan(
     problem: FleetProblem,
     budget: Budget,
@@ -102,13 +115,15 @@ def plan(
 
     Raises:
         ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
+        Interrupted: by Ctrl-C, where the budget limits seconds.
     """
     from shared.fleetplan.formulation import Formulation
 
     begun = time.perf_counter()
     best = _priced(problem, _begun_as_fixed(problem, hint))
     found = _Search(None, 0.0, "UNKNOWN", 0.0)
-    for strategy, share in _STRATEGIES if budget.workers == 1 else _PORTFOLIO:
+    cores = budget.workers == 1 and budget.work >= _WORK_FOR_CORES
+    for strategy, share in _STRATEGIES if cores else _USUAL:
         formulation = Formulation(problem, links)
         if hint is not None or best.found:
             formulation.hint(best.actions)
@@ -118,10 +133,13 @@ def plan(
         found = search._replace(lower_bound=max(search.lower_bound, found.lower_bound), work=found.work + search.work)
         if search.actions is not None:
             best = min(best, _priced(problem, search.actions)._replace(found=True), key=lambda p: p.objective)
-        if search.status == "OPTIMAL":
+        if search.status in ("OPTIMAL", _INTERRUPTED):
             break
     seconds = time.perf_counter() - begun
-    return Plan(best.actions, best.lost_packets, best.objective, found.lower_bound, found.status, seconds, found.work)
+    whole = Plan(best.actions, best.lost_packets, best.objective, found.lower_bound, found.status, seconds, found.work)
+    if found.status == _INTERRUPTED:
+        raise Interrupted(whole)
+    return whole
 
 
 def least_loss(
@@ -129,36 +147,57 @@ def least_loss(
 ) -> Plan:
     """The plan of least cost and the best bound that can be proven in about so many seconds.
 
-    First quickly with links taken as all alike, too strong for the bound and too weak for the plan; where the two do
-    not meet, with all ``workers``, and then with links as they are.
+    It starts from a greedy plan. First it searches quickly with links taken as all alike, too strong for the bound and
+    too weak for the plan; where the two do not meet, with all ``workers``, and then with links as they are.
+
+    Raises:
+        Interrupted: by Ctrl-C.
     """
     begun = time.perf_counter()
-    quick = Budget(work=_QUICK_WORK, seconds=seconds)
+    start = best = _unproven(_priced(problem, _begun_as_fixed(problem, look_ahead(problem))))
+    try:
+        for best in _improved(problem, start, seconds, workers, on_news):
+            if best.optimal:
+                break
+    except KeyboardInterrupt:
+        raise Interrupted(replace(best, seconds=time.perf_counter() - begun)) from None
+    status = "OPTIMAL" if best.optimal else "FEASIBLE"
+    return replace(best, seconds=time.perf_counter() - begun, status=status)
+
+
+def _improved(
+    problem: FleetProblem, best: Plan, seconds: float, workers: int, on_news: Callable[[News], None] | None
+) -> Iterator[Plan]:
+    """The best plan and bound after each of several searches; the last one may be cut short by Ctrl-C."""
+    begun = time.perf_counter()
+    quick = Budget(work=_QUICK_WORK)
     searches: list[tuple[Links, Budget, float]] = [
         ("hopeful", quick, 0.3),
         ("cautious", quick, 0.3),
         ("hopeful", Budget(workers=workers), 0.5),
         ("exact", Budget(workers=workers), 1.0),
     ]
-    best: Plan | None = None
-    work = 0.0
     for links, budget, share in searches:
-        left = seconds - (time.perf_counter() - begun)
-        if best is not None and (best.optimal or left <= 0):
-            break
         if links == "cautious":
-            start = _receding(problem, left * share)
-        elif best is not None:
-            start = best.actions
-        else:
-            start = None
+            left = seconds - (time.perf_counter() - begun)
+            near = _unproven(_priced(problem, _receding(problem, left * share)))
+            best = _better(best, near, links)
+            yield best
+        left = seconds - (time.perf_counter() - begun)
+        if left <= 0:
+            return
         now = replace(budget, seconds=max(left * share, 0.01))
-        found = plan(problem, now, links, start, _told(on_news, best))
-        work += found.work
+        try:
+            found = plan(problem, now, links, best.actions, _told(on_news, best, links))
+        except Interrupted as stopped:
+            yield _better(best, stopped.plan, links)
+            raise
         best = _better(best, found, links)
-    assert best is not None
-    status = "OPTIMAL" if best.optimal else "FEASIBLE"
-    return replace(best, seconds=time.perf_counter() - begun, work=work, status=status)
+        yield best
+
+
+def _unproven(priced: _Priced) -> Plan:
+    return Plan(priced.actions, priced.lost_packets, priced.objective, 0.0, "FEASIBLE", 0.0, 0.0)
 
 
 def _receding(problem: FleetProblem, seconds: float) -> IntArray:
@@ -168,33 +207,39 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
     while True:
         near = replace(now, arrivals=now.arrivals[:_NEAR], fixed={}, usable=None, risk=None)
         left = seconds - (time.perf_counter() - begun)
-        found = plan(near, Budget(work=0.3, seconds=max(left, 0.01)), "cautious")
-        kept = found.actions[: _NEAR // 2 if now.horizon > _NEAR else _NEAR]
+        actions = look_ahead(near)
+        if left > 0:
+            actions = plan(near, Budget(work=0.3, seconds=left), "cautious", actions).actions
+        kept = actions[: _NEAR // 2 if now.horizon > _NEAR else _NEAR]
         flown.append(kept)
         if len(kept) == now.horizon:
             return np.concatenate(flown)
         now = replace(
             near,
             progress_m=now.progress_m + kept[:, :, 1].sum(axis=0) * problem.scenario.step_s,
-            queue=fly(near, found.actions).queue[len(kept)],
+            queue=fly(near, actions).queue[len(kept)],
             arrivals=now.arrivals[len(kept) :],
         )
 
 
-def _better(best: Plan | None, found: Plan, links: Links) -> Plan:
+def _better(best: Plan, found: Plan, links: Links) -> Plan:
     """The cheaper plan with the higher of the bounds that hold in the world."""
     proven = 0.0 if links == "cautious" else found.lower_bound
-    if best is None:
-        return replace(found, lower_bound=proven)
     cheaper = min(best, found, key=lambda p: p.objective)
-    return replace(cheaper, lower_bound=max(best.lower_bound, proven))
+    return replace(cheaper, lower_bound=max(best.lower_bound, proven), work=best.work + found.work)
 
 
-def _told(on_news: Callable[[News], None] | None, best: Plan | None) -> Callable[[News], None] | None:
-    """News of one search made news of them all."""
-    if on_news is None or best is None:
-        return on_news
-    return lambda news: on_news(News(min(best.objective, news.objective), best.lower_bound))
+def _told(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
+    """News of one search made news of them all: what too strong or too weak links promise is left out."""
+    if on_news is None:
+        return None
+
+    def told(news: News) -> None:
+        objective = best.objective if links == "hopeful" else min(best.objective, news.objective)
+        proven = best.lower_bound if links == "cautious" else max(best.lower_bound, news.lower_bound)
+        on_news(News(objective, proven))
+
+    return told
 
 
 class _Search(NamedTuple):
@@ -243,12 +288,32 @@ def _search(
             if on_news is not None:
                 on_news(News(self.objective_value / SCALE, self.best_objective_bound / SCALE))
 
-    status = solver.solve(formulation.model, Listener() if on_news is not None else None)
+    # Ctrl-C is Python's to see, not the solver's to swallow.
+    solver.parameters.catch_sigint_signal = False
+    listener = Listener() if on_news is not None else None
+    status, stopped = _solved(solver, formulation.model, listener, budget)
     found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
     actions = formulation.actions(solver.value) if found else None
     # A plan's cost is whole in the formulation's units; what is missing to that is the solver's rounding.
     bound = max(0, math.ceil(solver.best_objective_bound - 1e-6)) / SCALE
-    return _Search(actions, bound, solver.status_name(status), solver.deterministic_time)
+    name = _INTERRUPTED if stopped else solver.status_name(status)
+    return _Search(actions, bound, name, solver.deterministic_time)
+
+
+def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any, bool]:
+    """The solver's status, and whether Ctrl-C ended the search.
+
+    Python sees Ctrl-C only between its own instructions of the main thread, so that a long search runs beside it.
+    """
+    if budget.seconds == math.inf:
+        return solver.solve(model, listener), False
+    with ThreadPoolExecutor(1) as beside:
+        search = beside.submit(solver.solve, model, listener)
+        try:
+            return search.result(), False
+        except KeyboardInterrupt:
+            solver.stop_search()
+            return search.result(), True
 
 
 def _begun_as_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:

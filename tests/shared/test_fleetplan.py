@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shared.channel import FloatArray
-from shared.fleetplan import Budget, FleetProblem, fly, least_loss, neglect, plan, price
+from shared.fleetplan import Budget, FleetProblem, Interrupted, fly, least_loss, look_ahead, neglect, plan, price
 from shared.fleetplan.risk import expected_overflow
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
@@ -133,6 +133,41 @@ def test_with_no_time_at_all_there_is_still_a_plan_and_a_bound() -> None:
     found = plan(problem, Budget(work=1e-9))
     assert found.actions.shape == (6, 2, 2)
     assert found.lower_bound <= plan(problem, ENOUGH).lost_packets <= found.lost_packets
+
+
+# ---- the greedy start
+
+
+def test_a_greedy_plan_keeps_what_is_fixed_and_leaves_it_and_what_is_barred_alone() -> None:
+    usable = np.ones((4, 3), dtype=np.bool_)
+    usable[1, 2] = False
+    told = {0: np.array([[1, 2], [0, 1]])}
+    actions = look_ahead(changed(tiny(4, horizon=4, radio_radius_m=900.0), fixed=told, usable=usable))
+    np.testing.assert_array_equal(actions[:2, 0], told[0])
+    assert actions[0, 1, 0] != 1
+    assert actions[1, 1, 0] == 1
+    assert all(len(set(step)) == 2 for step in actions[:, :, 0].tolist())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_search_without_time_ends_no_worse_than_the_greedy_plan(seed: int) -> None:
+    problem = tiny(seed, horizon=8)
+    greedy = price(problem, look_ahead(problem))[0]
+    idle = price(problem, np.tile([0, 0], (8, 2, 1)))[0]
+    found = least_loss(problem, seconds=1e-6, workers=1)
+    assert found.lower_bound <= found.lost_packets <= greedy <= idle
+
+
+def test_ctrl_c_ends_a_search_with_the_best_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shared.fleetplan.solver._search", interrupted)
+    problem = tiny(1, horizon=8)
+    with pytest.raises(Interrupted) as stopped:
+        least_loss(problem, seconds=60, workers=1)
+    assert stopped.value.plan.lost_packets == price(problem, look_ahead(problem))[0]
+    assert stopped.value.plan.lower_bound == 0
 
 
 def test_the_same_problem_gives_the_same_plan() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -19,6 +21,21 @@ from simulator.rollout import rollout
 from simulator.site import Site
 
 ROUTES = (((100.0, 100.0), (900.0, 100.0)), ((100.0, 900.0), (900.0, 900.0), (500.0, 400.0)))
+# The command in a process of its own, which sends itself Ctrl-C while the solver searches.
+INTERRUPTED_BOUND = """
+import os, signal, sys, threading
+from ortools.sat.python import cp_model
+from simulator.bound import main
+
+solve = cp_model.CpSolver.solve
+
+def solve_and_interrupt(solver, *told):
+    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    return solve(solver, *told)
+
+cp_model.CpSolver.solve = solve_and_interrupt
+sys.exit(main(["--seed", "0", "--scenario", "stress", "--time-limit-s", "600"]))
+"""
 BUSY: dict[str, Any] = {"initial_queue_min": 0.8, "arrival_rate_min": 15.0, "arrival_rate_max": 25.0}
 
 
@@ -72,6 +89,19 @@ def test_the_bound_is_what_trying_every_flight_finds(seed: int) -> None:
 def test_trying_every_flight_of_three_sensors_two_uavs_and_three_steps() -> None:
     bound = clairvoyant(small(), 1, workers=1)
     assert bound.lower_bound == bound.lost_packets == least_by_trying(small(), 1)
+
+
+FEW_SENSORS = [small(steps=4, sensors=1, uavs=2), small(steps=4, sensors=2, uavs=3)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("site", FEW_SENSORS)
+def test_with_fewer_sensors_than_uavs_the_bound_is_below_every_flight(site: Site, seed: int) -> None:
+    bound = clairvoyant(site, seed, time_limit_s=5, workers=1)
+    assert bound.lower_bound <= bound.lost_packets
+    for name in set(POLICY_NAMES) - set(LEARNED_NAMES):
+        lost = sum(tally.lost_packets for tally in rollout(site.world(), policy_named(name), seed))
+        assert bound.lower_bound <= lost, name
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -146,6 +176,14 @@ def test_the_command_prints_and_writes_the_bound(tmp_path: Path, capsys: pytest.
     shown = capsys.readouterr().out
     assert "proven optimal" in shown
     assert "bound.json" in shown
+
+
+def test_ctrl_c_prints_the_best_so_far() -> None:
+    command = [sys.executable, "-c", INTERRUPTED_BOUND]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "the best flight found" in done.stdout
+    assert "EOF" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -141,8 +141,16 @@ def test_with_nothing_in_reach_it_still_answers() -> None:
 
 
 def test_with_no_time_to_search_it_still_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simulator.policies.mpc._WORK", 1e-9)
+    monkeypatch.setattr("simulator.policies.mpc._MOST_WORK", 1e-9)
     assert len(flown(SHORT, 100)) == 10
+
+
+def test_with_no_work_saved_it_searches_briefly_and_still_loses_less_than_eof(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simulator.policies.mpc._SAVED_WORK", 0.0)
+    monkeypatch.setattr("simulator.policies.mpc._WORK", 1e-9)
+    stress = SCENARIOS["stress"].model_copy(update={"steps": 12})
+    eof = sum(t.lost_packets for t in rollout(PipelineWorld(stress), policy_named("eof"), 101))
+    assert sum(lost for lost, _ in flown(stress, 101)) < eof
 
 
 @pytest.mark.parametrize("changes", [{"sensors": 1, "uavs": 1, "steps": 1}, {"sensors": 1, "uavs": 3, "steps": 3}])
@@ -153,3 +161,9 @@ def test_the_smallest_fleets_fly(changes: Any) -> None:
 def test_a_large_fleet_plans_uav_by_uav() -> None:
     crowd = SCENARIOS["dense"].model_copy(update={"steps": 3, "uavs": 6, "sensors": 60})
     assert sum(sum(collected) for _, collected in flown(crowd, 100)) > 6 * 30
+
+
+def test_a_large_fleet_loses_less_than_half_of_eofs() -> None:
+    dense = SCENARIOS["dense"].model_copy(update={"steps": 10})
+    eof = sum(t.lost_packets for t in rollout(PipelineWorld(dense), policy_named("eof"), 100))
+    assert sum(lost for lost, _ in flown(dense, 100)) < 0.5 * eof

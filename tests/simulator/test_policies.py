@@ -172,8 +172,9 @@ def test_a_policy_leaves_the_observation_alone(name: str) -> None:
 @pytest.mark.parametrize("policy", UNTRAINED)
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_policy_flies_every_preset(scenario: str, policy: str) -> None:
-    tally = rollout(PipelineWorld(SCENARIOS[scenario]), policy_named(policy), seed=0)
-    assert [t.step for t in tally] == list(range(30))
+    short = SCENARIOS[scenario].model_copy(update={"steps": 5})
+    tally = rollout(PipelineWorld(short), policy_named(policy), seed=0)
+    assert [t.step for t in tally] == list(range(5))
     assert sum(int(t.collected.sum()) for t in tally) > 0
 
 
@@ -181,6 +182,6 @@ def test_on_paper_the_informed_policies_lose_least() -> None:
     world = PipelineWorld()
     lost = {
         name: sum(t.lost_packets for seed in range(5) for t in rollout(world, policy_named(name), seed))
-        for name in POLICY_NAMES
+        for name in ("eof", "wqcs", "round_robin", "random")
     }
     assert lost["eof"] < lost["wqcs"] < lost["round_robin"] < lost["random"]

@@ -85,7 +85,7 @@ def drawn(world: PipelineWorld) -> list[bytes]:
 def test_no_policy_changes_the_world() -> None:
     worlds = set()
     for name in POLICY_NAMES:
-        world = PipelineWorld()
+        world = PipelineWorld(SCENARIOS["paper"].model_copy(update={"steps": 8}))
         rollout(world, policy_named(name), seed=5)
         worlds.add(tuple(drawn(world)))
     assert len(worlds) == 1

@@ -1,0 +1,69 @@
+"""A quick plan to start a search from, and to fall back on: every UAV looks one step ahead, again and again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import FloatArray, packets_per_step
+from shared.fleetplan.problem import FleetProblem, IntArray
+from shared.fleetplan.risk import normal_below
+from shared.scenario import Scenario
+
+# What a metre a second is worth in urgent packets: a UAV that dwells on little lets the rest of its way overflow.
+_VELOCITY_BONUS = 0.5
+
+
+def look_ahead(problem: FleetProblem) -> IntArray:
+    """Actions ``(H, I, 2)`` that begin with the fixed ones and go on greedily.
+
+    Step by step and in the order of their indices, every UAV takes the sensor and the velocity of greatest
+    ``U_j min(q_j, packets movable from the new position) + 0.5 v``, with the urgency
+    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.urgency`, its Poisson taken as a normal of the same mean.
+    Sensors that another takes in the same step are left to it. Batteries are taken to last.
+    """
+    world = problem.scenario
+    window = max(1, math.ceil(world.overflow_horizon_steps))
+    actions = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
+    flown = np.zeros(problem.uavs, dtype=np.int64)
+    queue: FloatArray = problem.queue.astype(np.float64)
+    for step in range(problem.horizon):
+        urgent = _urgency(queue, problem.arrivals[step : step + window].mean(axis=0), world)
+        told = {uav: fixed[step] for uav, fixed in problem.fixed.items() if step < len(fixed)}
+        free = np.ones(problem.sensors, dtype=np.bool_) if problem.usable is None else problem.usable[step].copy()
+        free[[int(sensor) for sensor, _ in told.values()]] = False
+        moved = np.zeros(problem.sensors)
+        for uav in range(problem.uavs):
+            if uav in told:
+                sensor, velocity = told[uav].tolist()
+                packets = _links(problem, uav, flown[uav] + np.array([velocity]))[0]
+            else:
+                links = _links(problem, uav, flown[uav] + np.arange(world.max_velocity + 1))
+                sensor, velocity = _best(links, queue, urgent, free)
+                packets = links[velocity]
+                free[sensor] = False
+            actions[step, uav] = sensor, velocity
+            flown[uav] += velocity
+            moved[sensor] = max(moved[sensor], float(packets[sensor]))
+        queue = np.minimum(np.maximum(queue - moved, 0.0) + problem.arrivals[step], world.queue_capacity)
+    return actions
+
+
+def _urgency(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArray:
+    came = np.maximum(rate * world.overflow_horizon_steps, 1e-9)
+    room = world.queue_capacity - queue
+    return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * normal_below((came - room) / np.sqrt(came)))
+
+
+def _links(problem: FleetProblem, uav: int, velocity: IntArray) -> IntArray:
+    return packets_per_step(problem.distance(uav, velocity), problem.scenario)
+
+
+def _best(links: IntArray, queue: FloatArray, urgent: FloatArray, usable: NDArray[np.bool_]) -> tuple[int, int]:
+    """Sensor and velocity, of links ``(V, J)``."""
+    worth = np.where(usable, urgent * np.minimum(queue, links), -1.0)
+    worth += _VELOCITY_BONUS * np.arange(len(links))[:, None]
+    velocity, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
+    return int(sensor), int(velocity)
