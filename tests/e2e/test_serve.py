@@ -74,7 +74,7 @@ def test_ctrl_c_while_loading_is_quiet() -> None:
 @pytest.mark.parametrize("ask", [signal.SIGTERM, signal.SIGINT])
 def test_the_edge_stops_when_asked(ask: signal.Signals) -> None:
     with serving_edge() as (url, process):
-        assert httpx.get(f"{url}/healthz").status_code == 200
+        assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
         process.send_signal(ask)
         assert process.wait(timeout=15) in (0, 130, -ask)
 
@@ -104,4 +104,4 @@ def test_empty_variables_are_unset_ones(tmp_path: Path) -> None:
     """docker-compose passes every variable on, set or not."""
     empty = {f"AICVDS_{name}": "" for name in ("LLM_URL", "LLM_MODEL", "LLM_API_KEY", "LLM_GGUF", "MODE", "TOP_K")}
     with serving_edge(**empty) as (url, _):
-        assert httpx.get(f"{url}/readyz").json()["llm"] in ("loading", "ready")
+        assert httpx.get(f"{url}/readyz", timeout=60).json()["llm"] in ("loading", "ready")
