@@ -7,6 +7,7 @@ TORCH_INDEX ?=
 TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
+# mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
 .PHONY: help install demo test check compose clean
 .DEFAULT_GOAL := help
 
@@ -35,8 +36,8 @@ test: install
 check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/mypy benchmarks
+	PYTHONHASHSEED=0 $(BIN)/mypy
+	PYTHONHASHSEED=0 $(BIN)/mypy benchmarks
 	$(BIN)/lint-imports
 
 compose:

@@ -37,12 +37,13 @@ def test_a_mission_sees_to_the_bit_what_training_saw(scenario: Scenario) -> None
     rng = np.random.default_rng(1)
     for _ in range(scenario.steps):
         trained = stacked(scenario, seen)
+        arrays: tuple[Any, ...] = trained
         assert trained.features.shape == (3, scenario.uavs, width(scenario))
         assert trained.features.dtype == np.float32
         for world, observations in enumerate(alone):
             for uav in range(scenario.uavs):
                 observation = observations[f"uav_{uav}"]
-                for ours, theirs in zip(view(scenario, uav, observation), trained, strict=True):
+                for ours, theirs in zip(view(scenario, uav, observation), arrays, strict=True):
                     np.testing.assert_array_equal(ours, theirs[world, uav], strict=True)
         actions = rng.integers((scenario.sensors, 15), size=(3, scenario.uavs, 2))
         seen, _ = batch.step(actions[..., 0], actions[..., 1])
