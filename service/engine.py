@@ -141,7 +141,7 @@ class Engine:
         watch.lap("augment")
         view.attend(mission)
         watch.lap("attend")
-        prompt = mission.template.prompt(view.state, view.shown(mission), mission.experiences)
+        prompt = mission.template.prompt(view.state, view.shown(mission), mission.experiences, view.nearest(mission))
         tokens = self._count(prompt)
         watch.lap("prompt")
         deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S

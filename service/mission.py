@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from service.checkpoint import initial_modules
+from service.demonstrations import solved
+from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
 from service.learner import Learner, Sample
 from service.problems import Conflict, NotFound, Refused
@@ -73,18 +75,24 @@ class Mission:
         self.top_k = spec.top_k or settings.top_k
         told = spec.prompt.experiences
         self._experience_limit = settings.experiences if told is None else told
+        self._selection = spec.prompt.selection or settings.selection
         # Mode `value` has nothing else to decide by.
         self.attends = spec.attention == "on" or self.mode == "value"
-        self._check_prompt(settings)
         ranked = self.attends and spec.prompt.order == "score"
-        self.template = Template(
-            self.scenario, spec.prompt, spec.features, experiences=self._experience_limit, ranked=ranked
-        )
-        self.experiences: list[str] = []
-        self.decisions = 0
-        self.feedback = 0
         levels = self.scenario.max_velocity + 1
         modules = initial_modules(spec.init, spec.features, levels, spec.seed)
+        self.template = Template(
+            self.scenario,
+            spec.prompt,
+            spec.features,
+            experiences=self._experience_limit,
+            ranked=ranked,
+            demonstrations=solved(spec, self.scenario, modules, self.top_k if self.attends else None),
+        )
+        self._check_prompt(settings)
+        self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
+        self.decisions = 0
+        self.feedback = 0
         self.learner = Learner(modules, learning_rate=settings.learning_rate)
         sensors = self.scenario.sensors
         self.visits = np.full(sensors, _NEVER, dtype=np.int64)
@@ -98,6 +106,11 @@ class Mission:
         self._attempts: dict[int, dict[int, int]] = {}
         self._pending: dict[str, Pending] = {}
         self._applied: OrderedDict[str, None] = OrderedDict()
+
+    @property
+    def experiences(self) -> list[str]:
+        """Lines of the prompt's block of experiences."""
+        return self.memory.block
 
     @property
     def rates(self) -> FloatArray:
@@ -133,12 +146,18 @@ class Mission:
         style, rows = self.spec.prompt, self.scenario.sensors
         if self.attends:
             rows = min(rows, self.top_k)
-        needed = prompt_tokens(style.format, rows, self._experience_limit, self.spec.features)
+        lines = self._experience_limit + (NEAREST if self._selection == "similar" else 0)
+        needed = prompt_tokens(style.format, rows, lines, self.spec.features, self.template.demonstrations)
         if self.mode != "value" and needed > settings.llm_context:
+            shown = f"{self._experience_limit} experiences"
+            lower = "prompt.experiences"
+            if style.demonstrations:
+                shown += f", {style.demonstrations} demonstrations"
+                lower += ", prompt.demonstrations"
             raise Refused(
                 "prompt",
-                f"{self._experience_limit} experiences and {rows} sensors as {style.format} need up to {needed} tokens "
-                f"and AICVDS_LLM_CONTEXT is {settings.llm_context}: raise it, or lower prompt.experiences or top_k",
+                f"{shown} and {rows} sensors as {style.format} need up to {needed} tokens "
+                f"and AICVDS_LLM_CONTEXT is {settings.llm_context}: raise it, or lower {lower} or top_k",
             )
 
     def find(self, decision_id: str, field: str = "decision_id") -> Literal["pending", "applied"]:
@@ -216,8 +235,10 @@ class Mission:
         else:
             self._confirm_visit(decision)
         line = self.template.experience(decision.seen, decision.sensor_id, decision.velocity, outcome.cost)
-        self._remember(line)
-        return decision.sample
+        sample = decision.sample
+        features = None if sample is None else sample.features[sample.chosen].copy()
+        self.memory.remember(Experience(line, outcome.cost, features))
+        return sample
 
     def _confirm_visit(self, decision: Pending) -> None:
         self._confirmed[decision.sensor_id] = max(self._confirmed[decision.sensor_id], decision.step)
@@ -232,14 +253,6 @@ class Mission:
         presumed = max(self._open_visits.get(sensor_id, {}).values(), default=_NEVER)
         self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
 
-    def _remember(self, line: str) -> None:
-        """Append only, so that the LLM's prefix cache lives; at the limit the older half goes at once."""
-        if self._experience_limit == 0:
-            return
-        self.experiences.append(line)
-        if len(self.experiences) > self._experience_limit:
-            del self.experiences[: len(self.experiences) - max(1, self._experience_limit // 2)]
-
     def status(self) -> MissionStatus:
         """What ``GET /missions/{id}`` says."""
         return MissionStatus(
@@ -249,7 +262,9 @@ class Mission:
             top_k=self.top_k,
             attention=self.spec.attention,
             features=self.spec.features,
-            prompt=self.spec.prompt.model_copy(update={"experiences": self._experience_limit}),
+            prompt=self.spec.prompt.model_copy(
+                update={"experiences": self._experience_limit, "selection": self._selection}
+            ),
             init=self.spec.init,
             seed=self.spec.seed,
             decisions=self.decisions,

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from service.demonstrations import Solved
 from service.features import State
 from service.rows import FORMATS, UNKNOWN, Cells, cells, columns, full_cells, meanings
 from shared.scenario import Scenario
@@ -30,12 +31,18 @@ Rules:
 3. Velocity is a whole number from 0 to {max_velocity} m/s. Fly slowly to stay near a far sensor with a full queue, \
 fast when the sensor is near or there is little to collect.
 
-{experiences}Answer with two whole numbers and nothing else: sensor_id velocity"""
+{experiences}{demonstrations}Answer with two whole numbers and nothing else: sensor_id velocity"""
+
+
+_EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
 
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """One prompt. ``state_uncompressed`` is the last block as it would be without attention and masks."""
+    """One prompt. ``state_uncompressed`` is the last block as it would be without attention and masks.
+
+    Experiences retrieved for this decision alone stand in the last block, in both: they are never cached.
+    """
 
     static: str
     experiences: str
@@ -57,6 +64,7 @@ class Template:
         features: preset that decides on a row's columns.
         experiences: the most that a prompt may hold; with 0 the static block does not speak of them.
         ranked: whether the rows come best first.
+        demonstrations: worked examples for the static block.
     """
 
     def __init__(
@@ -67,9 +75,12 @@ class Template:
         *,
         experiences: int = 8,
         ranked: bool = True,
+        demonstrations: Sequence[Solved] = (),
     ) -> None:
         self._format = FORMATS[(style or PromptStyle()).format]
         self._columns = columns(features)
+        self.demonstrations = "".join(map(self._demonstration, demonstrations))
+        examples = f"{_EXAMPLES}\n\n{self.demonstrations}" if demonstrations else ""
         order = "the most promising first" if ranked else "in no particular order"
         self.static = _STATIC.format(
             step_s=scenario.step_s,
@@ -80,6 +91,7 @@ class Template:
             introduction=self._format.introduction(self._columns, order),
             meanings=meanings(features),
             experiences=f"{self._format.experience_note}\n\n" if experiences else "",
+            demonstrations=examples,
         )
 
     def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
@@ -90,16 +102,30 @@ class Template:
         """The row of a sensor that was not reported."""
         return {**dict.fromkeys(self._columns, UNKNOWN), "sensor_id": str(sensor_id)}
 
-    def prompt(self, state: State, kept_rows: Sequence[int], experiences: Sequence[str]) -> Prompt:
-        """The prompt for one decision; ``kept_rows`` index the state's rows, in the order to show them."""
-        above = self._format.experience_header(self._columns) if experiences else ""
-        gap = self._format.gap if experiences else ""
+    def prompt(
+        self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()
+    ) -> Prompt:
+        """The prompt for one decision.
+
+        Args:
+            kept_rows: of the state's rows those to show, in this order.
+            experiences: the block's lines.
+            nearest: lines that follow them in this prompt alone.
+        """
+        header = self._format.experience_header(self._columns)
+        retrieved = "".join(nearest)
+        if nearest and not experiences:
+            retrieved = header + retrieved
+        last = retrieved + (self._format.gap if experiences or nearest else "")
         return Prompt(
             static=self.static,
-            experiences=above + "".join(experiences),
-            state=gap + self._table([cells(state, row) for row in kept_rows]),
-            state_uncompressed=gap + self._table([full_cells(state, row) for row in range(len(state.ids))]),
+            experiences=(header if experiences else "") + "".join(experiences),
+            state=last + self._table([cells(state, row) for row in kept_rows]),
+            state_uncompressed=last + self._table([full_cells(state, row) for row in range(len(state.ids))]),
         )
+
+    def _demonstration(self, solved: Solved) -> str:
+        return f"{self._table(solved.rows)}Answer: {solved.sensor_id} {solved.velocity}\n\n"
 
     def _table(self, rows: Sequence[Cells]) -> str:
         return "".join((self._format.header(rows[0]), *map(self._format.row, rows))) if rows else ""

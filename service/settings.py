@@ -10,7 +10,7 @@ import httpx
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from shared.wire import Features, Mode
+from shared.wire import Features, Mode, Selection
 
 # Upper bounds in the embedded model's tokens, which has one for each digit: of the static block, and of a row or an
 # experience in each format.
@@ -21,11 +21,19 @@ _REACH_TOKENS = 16
 
 
 def prompt_tokens(
-    row_format: Literal["csv", "json", "markdown"], rows: int, experiences: int, features: Features = "paper"
+    row_format: Literal["csv", "json", "markdown"],
+    rows: int,
+    experiences: int,
+    features: Features = "paper",
+    demonstrations: str = "",
 ) -> int:
-    """Upper bound of a prompt's length in the embedded model's tokens."""
+    """Upper bound of a prompt's length in the embedded model's tokens.
+
+    Args:
+        demonstrations: their text, whose characters are all ASCII: no tokenizer makes more tokens of it.
+    """
     row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
-    return _STATIC_TOKENS + row * (rows + experiences)
+    return _STATIC_TOKENS + row * (rows + experiences) + len(demonstrations)
 
 
 def _default_cache() -> Path:
@@ -81,9 +89,11 @@ class Settings(BaseSettings):
     deadline_ms: int = Field(3000, ge=10, le=60_000)
     # Sensors that the attention module keeps for the prompt (k in the paper).
     top_k: int = Field(5, ge=1, le=100)
-    # Experiences in the prompt before the oldest half is dropped. Appending keeps the LLM's prefix
+    # Experiences in the prompt before half of them are dropped. Appending keeps the LLM's prefix
     # cache; dropping costs one prefill of what stays, so it happens rarely.
     experiences: int = Field(8, ge=0, le=200)
+    # Which of them stay: `recent`, those `similar` to the present state, or the `best` and a few of the worst.
+    selection: Selection = "recent"
     # Adam's step size for the attention and velocity modules (the paper's table).
     learning_rate: float = Field(5e-4, gt=0, le=1)
 

@@ -74,6 +74,12 @@ class View:
         shuffle = np.random.default_rng([mission.spec.seed, self.step, self.uav_id])
         return [self.rows[i] for i in shuffle.permutation(len(self.rows))]
 
+    def nearest(self, mission: Mission) -> list[str]:
+        """Past decisions most like the rows kept, for the prompt's last block, as the mission's selection has it."""
+        if not self.rows:
+            return []
+        return mission.memory.nearest(self._features[[self._admissible.index(row) for row in self.rows]])
+
     def by_value(self, mission: Mission) -> tuple[int, int]:
         """The best-scored sensor and the best velocity for it, by the learned values."""
         row = self.rows[0]

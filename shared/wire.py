@@ -26,6 +26,7 @@ DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within t
 Mode = Literal["llm", "value"]
 Init = Literal["pretrained", "random"]
 Features = Literal["paper", "reach"]
+Selection = Literal["recent", "similar", "best"]
 Source = Literal["llm", "value", "policy"]
 Reason = Literal[
     "mode_value",
@@ -209,14 +210,22 @@ class FeedbackResponse(Wire):
 class PromptStyle(Wire):
     """How the prompt shows the sensors: JSON is one object a line, Markdown a table with its header.
 
-    ``shuffled`` draws the rows' order anew for every step and UAV, from the mission's seed.
+    ``shuffled`` draws the rows' order anew for every step and UAV, from the mission's seed. Experiences are appended
+    until there are too many; ``selection`` says which stay then. ``demonstrations`` are worked examples in the static
+    block.
     """
 
     format: Literal["csv", "json", "markdown"] = "csv"
     order: Literal["score", "shuffled"] = Field("score", description="of the rows; `score`: best first")
     experiences: int | None = Field(
-        None, ge=0, le=100, description="kept before the older half is dropped; default: the service's"
+        None, ge=0, le=100, description="kept before half of them are dropped; default: the service's"
     )
+    selection: Selection | None = Field(
+        None,
+        description="experiences that stay: the newest, those like the present state, or the best and some of the "
+        "worst; default: the service's",
+    )
+    demonstrations: int = Field(0, ge=0, le=20, description="worked examples, solved by the teacher")
 
 
 class MissionSpec(Wire):

@@ -273,19 +273,33 @@ def test_missions(edge: Edge, report: Report) -> None:
 def test_a_mission_says_how_it_shows_the_sensors(edge: Edge, report: Report) -> None:
     client = edge(mode="llm", llm_gguf="none")
     plain = client.put("/missions/plain", json={}).json()
-    assert plain["prompt"] == {"format": "csv", "order": "score", "experiences": 8}
+    assert plain["prompt"] == {
+        "format": "csv",
+        "order": "score",
+        "experiences": 8,
+        "selection": "recent",
+        "demonstrations": 0,
+    }
     assert (plain["attention"], plain["features"]) == ("on", "paper")
     tokens = {}
     for name in ("csv", "json", "markdown"):
         spec = {"prompt": {"format": name, "order": "shuffled", "experiences": 0}, "attention": "off", "top_k": 1}
         made = client.put(f"/missions/{name}", json=spec).json()
-        assert (made["prompt"], made["attention"]) == (spec["prompt"], "off")
+        assert (made["prompt"], made["attention"]) == (plain["prompt"] | spec["prompt"], "off")
         answer = client.post("/decide", json=report(mission_id=name)).json()
         assert [c["sensor_id"] for c in answer["top_k"]] == [0, 1, 2, 3]
         tokens[name] = (answer["tokens"]["state"], answer["tokens"]["state_uncompressed"])
     assert tokens["csv"][0] < tokens["markdown"][0] < tokens["json"][0]
     assert tokens["csv"][1] < tokens["markdown"][1] < tokens["json"][1]
-    for wrong in ({"format": "xml"}, {"order": "best"}, {"experiences": 101}, {"experiences": -1}, {"rows": 1}):
+    for wrong in (
+        {"format": "xml"},
+        {"order": "best"},
+        {"experiences": 101},
+        {"experiences": -1},
+        {"rows": 1},
+        {"selection": "worst"},
+        {"demonstrations": 21},
+    ):
         refused = client.put("/missions/wrong", json={"prompt": wrong})
         assert (refused.status_code, fields(refused)) == (422, [f"prompt.{next(iter(wrong))}"]), refused.text
     long = client.put("/missions/long", json={"prompt": {"format": "json", "experiences": 100}})

@@ -1,0 +1,120 @@
+"""What a fleet remembers of its decisions, and which of them stand in the prompt.
+
+The block of experiences only grows between compactions, so that an LLM server's prefix cache keeps it; a choice is
+made at a compaction alone. Which experiences stay is the ``selection``:
+
+- ``recent``: every outcome is appended; past the limit the older half goes.
+- ``best``: every outcome is appended; past the limit half of the limit stays, ranked by outcome over all that is
+  remembered: the lowest costs, and for a quarter of the lines the highest, as warnings. The worst come first and the
+  best last. After the ranking of examples by Zhou et al., arXiv 2408.00214.
+- ``similar``: nearest neighbours, after their choice by state. After as many outcomes as the limit, half of the limit
+  is chosen: those nearest to the fleet's newest decisions, the nearest last. In between nothing is appended; instead
+  the one experience nearest to the rows at hand, if the block has it not, stands in the last block of the prompt,
+  which is never cached. That is one line a decision, as with the others.
+
+The distance of two experiences is the root mean square difference of the attention features of their chosen rows, each
+0..1: ``d(a, b) = |a - b| / sqrt(dim)``, so 0 is alike and 1 as far as can be. To several rows it is the least of them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.wire import Selection
+
+# Outcomes that a mission remembers to choose from: three missions of the paper's length.
+_REMEMBERED = 270
+# Experiences in the last block with `similar`: more would take more new tokens a decision than `recent` does.
+NEAREST = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Experience:
+    """A past decision: its line in the prompt, its cost, and the chosen row's attention features ``(d,)``, each 0..1.
+
+    ``features`` is None where the modules had no part in the decision; such a one is like no other.
+    """
+
+    line: str
+    cost: float
+    features: NDArray[np.float32] | None
+
+
+class Experiences:
+    """One mission's memory.
+
+    Args:
+        limit: the most lines of the block; 0 keeps none.
+        selection: which stay when there are too many.
+        uavs: how many of the newest decisions are the fleet's present state.
+    """
+
+    def __init__(self, limit: int, selection: Selection = "recent", uavs: int = 1) -> None:
+        self.limit = limit
+        self.selection: Selection = selection
+        self.block: list[str] = []
+        self.compactions = 0
+        self._uavs = uavs
+        self._remembered: deque[Experience] = deque(maxlen=max(_REMEMBERED, limit))
+        self._since = 0
+
+    def remember(self, experience: Experience) -> None:
+        """Append the experience to the block, or compact it; what is in the block stays until the next compaction."""
+        if self.limit == 0:
+            return
+        self._remembered.append(experience)
+        self._since += 1
+        if self.selection != "similar":
+            self.block.append(experience.line)
+        elif self._since < self.limit:
+            return
+        if self.selection == "similar" or len(self.block) > self.limit:
+            self.block = self._chosen(max(1, self.limit // 2))
+            self.compactions += 1
+            self._since = 0
+
+    def nearest(self, rows: NDArray[np.float32]) -> list[str]:
+        """Lines for the last block: with ``similar`` the experience nearest to any of the rows ``(n, d)``.
+
+        Empty with another selection, with no rows, and where the block has the nearest already.
+        """
+        if self.selection != "similar" or not len(rows):
+            return []
+        return [line for line in self._nearest(rows, NEAREST) if line not in self.block]
+
+    def _chosen(self, keep: int) -> list[str]:
+        if self.selection == "recent":
+            return self.block[-keep:]
+        if self.selection == "best":
+            return self._ranked(keep)
+        present = [e.features for e in list(self._remembered)[-self._uavs :] if e.features is not None]
+        return self._nearest(np.stack(present), keep) if present else []
+
+    def _ranked(self, keep: int) -> list[str]:
+        """The highest costs, then the lowest, best last; of equals the newest."""
+        newest_first = reversed(self._remembered)
+        by_cost = sorted(newest_first, key=lambda experience: experience.cost)
+        lines = _distinct(experience.line for experience in by_cost)
+        warnings = min(keep // 4, max(0, len(lines) - keep))
+        best, worst = lines[: keep - warnings], lines[len(lines) - warnings :]
+        return [*reversed(worst), *reversed(best)]
+
+    def _nearest(self, rows: NDArray[np.float32], keep: int) -> list[str]:
+        """The nearest to any of the rows, nearest last; of equals the newest."""
+        known = [(e.line, e.features) for e in reversed(self._remembered) if e.features is not None]
+        if not known:
+            return []
+        features = np.stack([features for _, features in known])
+        distance = np.sqrt(((features[:, None] - rows[None]) ** 2).mean(axis=2)).min(axis=1)
+        order = np.argsort(distance, kind="stable")
+        return _distinct(known[i][0] for i in order)[:keep][::-1]
+
+
+def _distinct(lines: Iterable[str]) -> list[str]:
+    """Each line once, in the order of the first time."""
+    return list(dict.fromkeys(lines))
