@@ -15,6 +15,8 @@ _SUMMARIES = {
     "train": "train the learned baselines, MADQN and MAPPO",
     "explore": "record exploring UAVs on training worlds, for pretrain",
     "pretrain": "train the attention and velocity modules' start on what explore recorded",
+    "demonstrate": "choose worked examples for the prompt from what explore recorded",
+    "replay": "ask a logged mission again of another model, prompt, k or mode",
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 
@@ -46,7 +48,7 @@ aicvds --version prints the version."""
 
 def usage() -> str:
     """The text of ``aicvds --help``."""
-    return _USAGE.format(commands="\n".join(f"  {name:<10} {text}" for name, text in _SUMMARIES.items()))
+    return _USAGE.format(commands="\n".join(f"  {name:<11} {text}" for name, text in _SUMMARIES.items()))
 
 
 def main() -> int:

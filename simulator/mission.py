@@ -73,9 +73,10 @@ class LocalPilot:
 class EdgePilot:
     """Asks an edge, and decides on board with EOF when it gives no usable answer: a UAV in the air must fly on.
 
-    ``spec`` is the mission to make at the edge before the first decision; ``answered`` counts the edge's
-    decisions; ``last_error`` is the last reason for going without. After a step in which the edge was out of
-    reach, the fleet waits until ``scout`` finds it ready, ``reconnect_s`` seconds in all per outage at most.
+    ``spec`` is the mission to make at the edge before the first decision; ``on_request`` hears each request before it
+    is asked; ``answered`` counts the edge's decisions; ``last_error`` is the last reason for going without. After a
+    step in which the edge was out of reach, the fleet waits until ``scout`` finds it ready, ``reconnect_s`` seconds in
+    all per outage at most.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class EdgePilot:
         self._lost = False
         self._fallback: Policy = policy_named(FALLBACK)
         self._fallback.reset(scenario, seed)
+        self.on_request: Callable[[DecideRequest], None] = lambda request: None
         self.answered = 0
         self.last_error: str | None = None
 
@@ -116,6 +118,7 @@ class EdgePilot:
         request = decide_request(
             uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._owed.get(uav)
         )
+        self.on_request(request)
         try:
             exchange = self._ask(request)
         except EdgeError as error:
@@ -355,14 +358,15 @@ def _book(
             collected=int(info["collected"]),
             lost_packets=int(info["lost_packets"]),
             cost=float(info["cost"]),
-            **_of_the_exchange(choice.exchange),
+            **of_the_exchange(choice.exchange),
         )
         flight.decisions.append(decision)
         if log is not None:
             log.append(decision)
 
 
-def _of_the_exchange(exchange: Exchange | None) -> dict[str, Any]:
+def of_the_exchange(exchange: Exchange | None) -> dict[str, Any]:
+    """What a ``Decision`` takes over from the edge's answer; nothing where there was none."""
     if exchange is None:
         return {}
     answer = exchange.response

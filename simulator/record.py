@@ -8,20 +8,21 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Literal, Protocol, Self
+from typing import IO, Literal, Protocol, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from shared.wire import Candidate, Tokens
 
-SUMMARY, DECISIONS, REPORT = "summary.json", "decisions.jsonl", "report.html"
+SUMMARY, DECISIONS, REPORT, REQUESTS = "summary.json", "decisions.jsonl", "report.html", "requests.jsonl"
 LATE_SLACK_MS = 50.0
 # Reasons with which the LLM was asked, and its answer or its silence not used.
 _ASKED_IN_VAIN = frozenset(
     {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
 )
 
+Line = TypeVar("Line")
 DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
 
 
@@ -168,26 +169,27 @@ class Tally(Protocol):
     def lost_packets(self) -> int: ...
 
 
-def refuse_old_result(out: Path, overwrite: bool) -> None:
+def refuse_old_result(out: Path, overwrite: bool, result: str = SUMMARY) -> None:
     """Raises ``BadUse`` when ``out`` is no folder, or holds a result that may not be overwritten."""
     with naming_out(out):
         if out.exists() and not out.is_dir():
             raise BadUse(f"--out {out} is a file; name a folder")
-        held = (out / SUMMARY).exists()
+        held = (out / result).exists()
     if held and not overwrite:
-        raise BadUse(f"--out {out} holds a mission's result already; choose another folder or add --overwrite")
+        what = "a mission's result" if result == SUMMARY else f"a {result}"
+        raise BadUse(f"--out {out} holds {what} already; choose another folder or add --overwrite")
 
 
-def fresh_folder(out: Path) -> None:
-    """Make the folder, without the earlier summary and report, which would stand beside another mission's decisions.
+def fresh_folder(out: Path, stale: Iterable[str] = (SUMMARY, REPORT, REQUESTS)) -> None:
+    """Make the folder, without the earlier mission's files that would stand beside another's decisions.
 
     Raises:
         BadUse: it cannot be written.
     """
     with naming_out(out):
         out.mkdir(parents=True, exist_ok=True)
-        for stale in (SUMMARY, REPORT):
-            (out / stale).unlink(missing_ok=True)
+        for name in stale:
+            (out / name).unlink(missing_ok=True)
 
 
 @contextmanager
@@ -236,19 +238,29 @@ def read_decisions(path: Path) -> list[Decision]:
         OSError: the file cannot be read.
         ValueError: a line that is not the last is no decision; the text names the line.
     """
+    return read_lines(path, TypeAdapter(Decision))
+
+
+def read_lines(path: Path, line: TypeAdapter[Line]) -> list[Line]:
+    """The lines of a JSON Lines file; a last one cut off by a crash is left out.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: a line that is not the last is none; the text names it.
+    """
     lines = path.read_bytes().split(b"\n")
-    decisions = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
+    parsed = []
+    for number, text in enumerate(lines, start=1):
+        if not text.strip():
             continue
         try:
-            decisions.append(Decision.model_validate_json(line))
+            parsed.append(line.validate_json(text))
         except ValidationError as error:
             # Every whole line ends in a newline, so only the remainder after the last one may be torn.
             if number == len(lines):
                 break
             raise ValueError(f"{path}, line {number}: {error.errors(include_url=False)[0]['msg']}") from None
-    return decisions
+    return parsed
 
 
 def visits_per_sensor(decisions: Iterable[Decision], sensors: int) -> list[int]:
@@ -272,7 +284,6 @@ def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str,
         tallies: per policy, one tally a step flown.
     """
     from_edge = [d for d in decisions if d.rtt_ms is not None]
-    trips = [d.rtt_ms for d in from_edge if d.rtt_ms is not None]
     return Summary(
         **flown.model_dump(),
         decisions=len(decisions),
@@ -283,14 +294,21 @@ def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str,
         failures=sum(d.failed for d in decisions),
         late=sum(_is_late(d) for d in from_edge),
         tokens=_tokens([d.tokens for d in from_edge if d.tokens is not None]),
-        rtt_ms=RoundTrips(p50=_percentile(trips, 50), p99=_percentile(trips, 99)),
-        uplink_bytes_mean=_mean([d.request_bytes for d in from_edge]),
+        rtt_ms=round_trips(decisions),
+        uplink_bytes_mean=mean([d.request_bytes for d in from_edge]),
         jain=jain_index(visits_per_sensor(decisions, flown.sensors)),
-        llm_asked=sum(_asked_llm(d) for d in decisions),
+        llm_asked=sum(asked_llm(d) for d in decisions),
     )
 
 
-def _asked_llm(decision: Decision) -> bool:
+def round_trips(decisions: Iterable[Decision]) -> RoundTrips:
+    """Over the decisions that the edge took."""
+    trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
+    return RoundTrips(p50=_percentile(trips, 50), p99=_percentile(trips, 99))
+
+
+def asked_llm(decision: Decision) -> bool:
+    """Whether the LLM was asked for it, in vain or not."""
     if decision.source in ("llm", "guided") or decision.reason in _ASKED_IN_VAIN:
         return True
     return decision.tokens is not None and decision.tokens.server_prompt is not None
@@ -303,13 +321,13 @@ def _is_late(decision: Decision) -> bool:
 
 
 def _tokens(counts: list[Tokens]) -> TokenSummary:
-    prompt, uncompressed = _mean([t.prompt for t in counts]), _mean([t.uncompressed for t in counts])
-    state, state_uncompressed = _mean([t.state for t in counts]), _mean([t.state_uncompressed for t in counts])
+    prompt, uncompressed = mean([t.prompt for t in counts]), mean([t.uncompressed for t in counts])
+    state, state_uncompressed = mean([t.state for t in counts]), mean([t.state_uncompressed for t in counts])
     return TokenSummary(
         prompt_mean=prompt,
         uncompressed_mean=uncompressed,
         saved_pct=_saved_pct(prompt, uncompressed),
-        cached_mean=_mean([t.cached for t in counts if t.cached is not None]),
+        cached_mean=mean([t.cached for t in counts if t.cached is not None]),
         cached_pct=_cached_pct(counts),
         state_mean=state,
         state_uncompressed_mean=state_uncompressed,
@@ -317,7 +335,8 @@ def _tokens(counts: list[Tokens]) -> TokenSummary:
     )
 
 
-def _mean(values: Sequence[float]) -> float | None:
+def mean(values: Sequence[float]) -> float | None:
+    """The mean, ``None`` of nothing."""
     return sum(values) / len(values) if values else None
 
 

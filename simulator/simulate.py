@@ -26,6 +26,7 @@ from simulator.client import EdgeClient, EdgeError, edge_url
 from simulator.record import (
     DECISIONS,
     REPORT,
+    REQUESTS,
     SUMMARY,
     BadUse,
     BySource,
@@ -36,6 +37,7 @@ from simulator.record import (
     summarise,
     told_sources,
 )
+from simulator.requests import RequestLog, resolved
 from simulator.site import Site, chosen_site
 from simulator.uplink import LossyTransport
 
@@ -58,7 +60,8 @@ class Simulate:
 
     The UAVs fly the scenario's world step by step, ask the edge at every waypoint, and report what each decision
     cost. EOF and WQCS then fly the same world for comparison. Written to --out: summary.json,
-    decisions.jsonl (one decision a line, written as they happen) and report.html (open it in a browser).
+    decisions.jsonl (one decision a line, written as they happen), report.html (open it in a browser) and, where an
+    edge was asked, requests.jsonl (what it was asked, about 1 kB a decision with 10 sensors, for `aicvds replay`).
 
     Start an edge, then fly against it from another terminal:
 
@@ -211,18 +214,24 @@ def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None
     from simulator.mission import EdgePilot, LocalPilot
 
     if job.edge is None:
+        fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console)
         return _conclude(job, flight, None, None, console)
     with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _scout(job.edge) as scout:
-        model = _wait(ground, job, console, alive)
+        model = await_edge(ground, job.wait_s, console, alive)
         news = _News()
         pilot = EdgePilot(
             radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
             scout=scout, reconnect_s=job.reconnect_s, on_wait=news.waiting,
         )  # fmt: skip
-        mode = ground.put_mission(job.mission_id, pilot.spec).mode
-        flight = _fly(job, pilot, console, news)
-    code = _conclude(job, flight, mode, model, console)
+        made = ground.put_mission(job.mission_id, pilot.spec)
+        fresh_folder(job.out)
+        with naming_out(job.out):
+            requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, made))
+        with requests:
+            pilot.on_request = requests.append
+            flight = _fly(job, pilot, console, news)
+    code = _conclude(job, flight, made.mode, model, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
         print(
@@ -250,14 +259,21 @@ def _scout(edge: str) -> EdgeClient:
     return EdgeClient(edge, timeout_s=SCOUT_TIMEOUT_S, attempts=1, api_key=os.environ.get(API_KEY) or None)
 
 
-def _wait(ground: EdgeClient, job: Job, console: Console, alive: Callable[[], None]) -> str | None:
+def await_edge(
+    ground: EdgeClient, wait_s: float, console: Console, alive: Callable[[], None] = lambda: None
+) -> str | None:
+    """Wait until the edge can decide and its LLM loads no more; returns the LLM's name, if it has one.
+
+    Raises:
+        EdgeError: no edge answers as one within ``wait_s`` seconds.
+    """
     with console.status(f"Waiting for the edge at {ground.base_url}") as status:
 
         def waiting(cause: str) -> None:
             alive()
             status.update(f"Waiting for the edge at {ground.base_url}: {escape(cause)}")
 
-        readiness = ground.wait_ready(job.wait_s, on_wait=waiting)
+        readiness = ground.wait_ready(wait_s, on_wait=waiting)
         alive()
     if readiness.llm == "ready":
         console.print(f"The edge is ready; its LLM is {escape(readiness.model or 'unnamed')}.")
@@ -301,7 +317,6 @@ def _fly(job: Job, pilot: Pilot, console: Console, news: _News | None = None) ->
     from simulator.mission import fly
 
     news = news or _News()
-    fresh_folder(job.out)
     with naming_out(job.out):
         log = DecisionLog(job.out / DECISIONS)
     columns = (
@@ -348,7 +363,7 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
 
         write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, flight.sensor_xy)
     show(summary, console)
-    for name in (SUMMARY, DECISIONS, REPORT):
+    for name in (SUMMARY, DECISIONS, REPORT, *((REQUESTS,) if job.edge else ())):
         console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)
     return INTERRUPTED if flight.interrupted else 0
 

@@ -31,7 +31,7 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
     out = tmp_path / "run"
     code = simulate.main(["--edge", stub.url, "--steps", "3", "--seed", "4", "--deadline-ms", "900", "--out", str(out)])
     assert code == 0
-    assert sorted(p.name for p in out.iterdir()) == ["decisions.jsonl", "report.html", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["decisions.jsonl", "report.html", "requests.jsonl", "summary.json"]
     summary = summary_in(out)
     assert (summary.seed, summary.steps, summary.decisions, summary.deadline_ms) == (4, 3, 9, 900)
     assert len(read_decisions(out / "decisions.jsonl")) == 9
