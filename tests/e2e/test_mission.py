@@ -7,11 +7,14 @@ from simulator.record import read_decisions
 from tests.e2e.processes import run, serving_edge
 
 
-def test_a_mission_flown_by_the_llm(tmp_path: Path) -> None:
+def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
     # The deadline is generous because this tests what is decided, not how fast the machine is.
     with serving_edge(AICVDS_DEADLINE_MS="30000") as (url, _):
         flown = run("simulate", "--edge", url, "--steps", "6", "--seed", "2", "--out", str(tmp_path / "out"))
+        options = ("--top-k", "3", "--demonstrations", "2", "--selection", "similar", "--out", str(tmp_path / "again"))
+        again = run("replay", str(tmp_path / "out"), "--edge", url, *options)
     assert flown.returncode == 0, flown.stderr
+    assert again.returncode == 0, again.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["decisions"], summary["late"]) == (18, 0)
     assert summary["by_source"]["llm"] > 9
@@ -24,3 +27,10 @@ def test_a_mission_flown_by_the_llm(tmp_path: Path) -> None:
         given = [d.sensor_id for d in decisions if d.step == step]
         assert len(set(given)) == 3, "no sensor is given to two UAVs of one step"
     assert "<svg" in (tmp_path / "out" / "report.html").read_text()
+
+    replay = json.loads((tmp_path / "again" / "replay.json").read_text())
+    assert (replay["decisions"], replay["unasked"]) == (18, 0)
+    assert set(replay["changed"]) == {"top_k", "prompt.demonstrations", "prompt.selection"}
+    assert replay["replayed"]["by_source"]["llm"] == summary["by_source"]["llm"]
+    assert replay["replayed"]["llm_new_tokens"] < 0.5 * replay["replayed"]["llm_prompt_tokens"]
+    assert replay["replayed"]["cost_usd"] == 0
