@@ -8,12 +8,16 @@ import math
 import threading
 import time
 import uuid
+from collections.abc import Awaitable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Literal
 
+from service.candidates import GuidedTemplate
+from service.guided import LLM, Deliberation, trust_of
 from service.learner import Sample
 from service.llm.answer import NoDecision, check_answer
+from service.llm.calibration import LabelReader
 from service.llm.client import Completion
 from service.llm.upstream import Upstream
 from service.metrics import Metrics
@@ -23,6 +27,7 @@ from service.policy import decide_without_llm
 from service.prompt import Prompt
 from service.settings import Settings
 from service.tokens import TokenCounter, price_usd
+from service.trust import Advice
 from service.view import View
 from shared.wire import (
     BatchRequest,
@@ -30,6 +35,7 @@ from shared.wire import (
     DecideResponse,
     FeedbackRequest,
     FeedbackResponse,
+    Guided,
     Outcome,
     Reason,
     Source,
@@ -69,12 +75,22 @@ class Stopwatch:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A sensor and a velocity, with the reason where they are not the LLM's."""
+    """A sensor and a velocity, with the reason where the LLM had no part in them.
+
+    In mode ``guided`` also what the response tells of it, and the advice that trust learns from.
+    """
 
     sensor_id: int
     velocity: int
     reason: Reason | None
     completion: Completion | None
+    guided: Guided | None = None
+    advice: Advice | None = None
+
+    @property
+    def source(self) -> Source:
+        """Who decided."""
+        return "guided" if self.guided and self.reason is None else _SOURCES.get(self.reason, "policy")
 
 
 class Engine:
@@ -83,6 +99,7 @@ class Engine:
     def __init__(self, settings: Settings, upstream: Upstream, counter: TokenCounter, metrics: Metrics) -> None:
         self._settings = settings
         self._upstream = upstream
+        self.labels = LabelReader(upstream)
         self._counter = counter
         self._metrics = metrics
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
@@ -137,15 +154,26 @@ class Engine:
     ) -> DecideResponse:
         attempt = mission.attempt(step, uav.uav_id)
         mission.observe(uav)
+        if mission.mode == "guided":
+            mission.belief.hear(uav, step)
         view = View.of(mission, uav, step)
         watch.lap("augment")
         view.attend(mission)
         watch.lap("attend")
-        prompt = mission.template.prompt(view.state, view.shown(mission), mission.experiences, view.nearest(mission))
+        deliberation = Deliberation.of(mission, view) if mission.mode == "guided" and view.rows else None
+        if deliberation is not None:
+            prompt = deliberation.prompt
+        else:
+            prompt = mission.template.prompt(
+                view.state, view.shown(mission), mission.experiences, view.nearest(mission)
+            )
         tokens = self._count(prompt)
         watch.lap("prompt")
         deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
-        choice = await self._choose(mission, view, prompt, deadline, watch)
+        if deliberation is not None:
+            choice = await self._weigh(mission, view, deliberation, deadline, watch)
+        else:
+            choice = await self._choose(mission, view, prompt, deadline, watch)
         decision_id = uuid.uuid4().hex
         pending = view.pending(mission, decision_id, choice.sensor_id, choice.velocity)
         watch.lap("check")
@@ -156,15 +184,20 @@ class Engine:
             step=step,
             sensor_id=choice.sensor_id,
             velocity=choice.velocity,
-            source=_SOURCES.get(choice.reason, "policy"),
+            source=choice.source,
             reason=choice.reason,
             model=None if choice.reason else self._upstream.model,
             top_k=view.candidates,
+            guided=choice.guided,
             tokens=self._with_usage(tokens, choice.completion),
             deadline_ms=deadline_ms,
             latency_ms=watch.total(),
         )
         mission.commit(pending, attempt)
+        if mission.mode == "guided":
+            mission.belief.told(uav.uav_id, step, (choice.sensor_id, choice.velocity), mission.rates)
+        if choice.advice is not None:
+            trust_of(mission, self._upstream.model).note(decision_id, choice.advice)
         self._metrics.record_decision(answer)
         return answer
 
@@ -185,24 +218,65 @@ class Engine:
                 raise NoDecision("answer_reserved", f"sensor {sensor} was given away meanwhile")
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
-            reserved = mission.reserved(view.step, view.uav_id)
-            sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
-            if sensor in reserved:
-                # Every sensor reported is taken: one that was not reported is worth a try, a taken one is not.
-                sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
+            sensor, velocity = self._by_policy(mission, view)
             reason = error.reason
-        if mission.mode == "llm" and reason != "no_candidate":
+        if mission.mode != "value" and reason != "no_candidate":
             self._metrics.llm_requests.labels(reason or "ok").inc()
         return Choice(sensor, velocity, reason, completion)
 
+    def _by_policy(self, mission: Mission, view: View) -> tuple[int, int]:
+        reserved = mission.reserved(view.step, view.uav_id)
+        sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
+        if sensor in reserved:
+            # Every sensor reported is taken: one that was not reported is worth a try, a taken one is not.
+            sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
+        return sensor, velocity
+
+    async def _weigh(
+        self, mission: Mission, view: View, deliberation: Deliberation, deadline: float, watch: Stopwatch
+    ) -> Choice:
+        """Mode ``guided``: the LLM's word weighed with the others' and with the critic, which thinks while it is asked.
+
+        Without the LLM the others decide: source ``policy``, with the reason.
+        """
+        template, labels = deliberation.prompt.static, list(deliberation.offer.labels)
+        thinking = asyncio.create_task(asyncio.to_thread(deliberation.judge))
+        completion: Completion | None = None
+        told: dict[str, float] | None = None
+        reason: Reason | None = None
+        try:
+            asked = self.labels.ask(template, deliberation.prompt.user, labels)
+            completion = await self._within(asked, deadline, watch)
+            told = self.labels.read(completion, template, labels)
+        except NoDecision as error:
+            log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
+            reason = error.reason
+        finally:
+            judgement = await thinking
+        watch.lap("judge")
+        self._metrics.llm_requests.labels(reason or "ok").inc()
+        trust = trust_of(mission, self._upstream.model)
+        known = self.labels.bias(template) is not None and self._upstream.logprobs
+        gone = mission.reserved(view.step, view.uav_id)
+        verdict = deliberation.conclude(trust, judgement, told, calibrated=known, gone=gone)
+        if told is not None and isinstance(mission.template, GuidedTemplate):
+            self.labels.calibrate(template, mission.template.content_free(), mission.template.labels)
+        if verdict is None:
+            sensor, velocity = self._by_policy(mission, view)
+            return Choice(sensor, velocity, "answer_reserved", completion)
+        self._metrics.llm_trust.observe(trust.weights[LLM])
+        return Choice(*verdict.action, reason, completion, verdict.told, verdict.advice)
+
     async def _ask(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Completion:
+        levels = mission.scenario.max_velocity + 1
+        return await self._within(self._upstream.ask(prompt.static, prompt.user, view.offered, levels), deadline, watch)
+
+    async def _within(self, asked: Awaitable[Completion], deadline: float, watch: Stopwatch) -> Completion:
         limit = asyncio.timeout(min(deadline - time.perf_counter(), _HURRY_S if self._closing else math.inf))
         try:
             async with limit:
                 self._waiting.add(limit)
-                return await self._upstream.ask(
-                    prompt.static, prompt.user, view.offered, mission.scenario.max_velocity + 1
-                )
+                return await asked
         except TimeoutError:
             raise NoDecision("llm_timeout", "no answer within the deadline") from None
         finally:
@@ -214,6 +288,8 @@ class Engine:
         if mission.find(outcome.decision_id) == "pending":
             result = "applied"
             sample = mission.apply(outcome)
+            for trust in mission.trust.values():
+                trust.settle(outcome.decision_id, outcome.cost)
             if sample is not None and self._room.acquire(blocking=False):
                 self._learning.submit(self._learn, mission, sample, outcome.cost)
             elif sample is not None:

@@ -10,6 +10,7 @@ from shared.wire import DecideResponse
 
 _DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
 _OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)
+_TRUST_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
 
 
 class Metrics:
@@ -29,6 +30,9 @@ class Metrics:
         )
         self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
         self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
+        self.llm_trust = Histogram(
+            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_TRUST_BUCKETS
+        )
         self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)

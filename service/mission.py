@@ -8,7 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from service.candidates import GuidedTemplate
 from service.checkpoint import initial_modules
+from service.critic import Belief
 from service.demonstrations import solved
 from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
@@ -17,6 +19,7 @@ from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template
 from service.rows import Cells
 from service.settings import Settings, prompt_tokens
+from service.trust import Trust
 from shared.channel import FloatArray
 from shared.scenario import Scenario, scenario_named
 from shared.wire import MissionSpec, MissionStatus, Mode, Outcome, UavState
@@ -81,13 +84,22 @@ class Mission:
         ranked = self.attends and spec.prompt.order == "score"
         levels = self.scenario.max_velocity + 1
         modules = initial_modules(spec.init, spec.features, levels, spec.seed)
-        self.template = Template(
-            self.scenario,
-            spec.prompt,
-            spec.features,
-            experiences=self._experience_limit,
-            ranked=ranked,
-            demonstrations=solved(spec, self.scenario, modules, self.top_k if self.attends else None),
+        self.template = (
+            GuidedTemplate(
+                self.scenario,
+                rows=self.top_k if self.attends else self.scenario.sensors,
+                experiences=self._experience_limit,
+                ranked=ranked,
+            )
+            if self.mode == "guided"
+            else Template(
+                self.scenario,
+                spec.prompt,
+                spec.features,
+                experiences=self._experience_limit,
+                ranked=ranked,
+                demonstrations=solved(spec, self.scenario, modules, self.top_k if self.attends else None),
+            )
         )
         self._check_prompt(settings)
         self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
@@ -106,6 +118,9 @@ class Mission:
         self._attempts: dict[int, dict[int, int]] = {}
         self._pending: dict[str, Pending] = {}
         self._applied: OrderedDict[str, None] = OrderedDict()
+        # Mode `guided`: what the critic judges by, and the trust by the LLM's name.
+        self.belief = Belief(self.scenario)
+        self.trust: dict[str, Trust] = {}
 
     @property
     def experiences(self) -> list[str]:

@@ -14,7 +14,7 @@ from shared.trajectory import progress_of, trajectories
 
 # What a metre a second is worth in urgent packets: a UAV that dwells on little lets the rest of its way overflow.
 # On 30 worlds of scenario `paper`, 0.5 to 4 lost 54 to 61 packets, differences within their noise.
-_VELOCITY_BONUS = 0.5
+VELOCITY_BONUS = 0.5
 # Numbers a velocity level that the velocity scorer is told.
 LEVEL_FEATURES = 4
 
@@ -56,7 +56,7 @@ class Reach:
         """From distances ``(V, J)``, and queues and urgencies ``(J,)``; a queue of 0 where nothing can be sent."""
         packets = np.minimum(queue, packets_per_step(distance, scenario)).astype(np.float64)
         velocities = np.arange(len(distance), dtype=np.float64)
-        return cls(distance, packets, urgency * packets + _VELOCITY_BONUS * velocities[:, None])
+        return cls(distance, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
 
     @property
     def best(self) -> NDArray[np.int64]:

@@ -87,6 +87,15 @@ class View:
         values = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], approach)
         return int(self.state.ids[row]), int(values.argmax())
 
+    def values(self, mission: Mission) -> dict[int, NDArray[np.float32]]:
+        """What the modules think of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v."""
+        found = {}
+        for row, candidate in zip(self.rows, self.candidates, strict=True):
+            approach = self.state.approach(row, mission.scenario)
+            levels = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], approach).numpy()
+            found[candidate.sensor_id] = candidate.score + levels - levels.max()
+        return found
+
     def pending(self, mission: Mission, decision_id: str, sensor_id: int, velocity: int) -> Pending:
         """The decision, as its outcome will need it."""
         rows = np.flatnonzero(self.state.ids == sensor_id)

@@ -23,11 +23,11 @@ SensorId = Annotated[int, Field(ge=0, lt=MAX_SENSORS)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
 
-Mode = Literal["llm", "value"]
+Mode = Literal["llm", "guided", "value"]
 Init = Literal["pretrained", "random"]
 Features = Literal["paper", "reach"]
 Selection = Literal["recent", "similar", "best"]
-Source = Literal["llm", "value", "policy"]
+Source = Literal["llm", "guided", "value", "policy"]
 Reason = Literal[
     "mode_value",
     "no_candidate",
@@ -147,6 +147,25 @@ class Candidate(Wire):
     score: float
 
 
+class Weighed(Wire):
+    """A candidate of mode ``guided``. ``llm`` is its calibrated probability, ``null`` where the LLM was silent."""
+
+    sensor_id: SensorId
+    velocity: int = Field(ge=0, le=14)
+    llm: float | None = None
+    mixture: float = Field(description="the advisers' probabilities, weighted by trust")
+    regret: float = Field(description="packets that the critic expects it to lose above the best candidate")
+    score: float = Field(description="ln(mixture) - 0.3 min(regret, 8): the highest is flown")
+
+
+class Guided(Wire):
+    """How mode ``guided`` decided: who was trusted how far, and the best candidates, best first."""
+
+    trust: dict[str, float] = Field(description="by adviser, before this decision; they sum to 1")
+    calibrated: bool = Field(description="whether the LLM's bias towards labels was taken off")
+    candidates: list[Weighed] = Field(max_length=5)
+
+
 class Tokens(Wire):
     """Token accounting of one decision.
 
@@ -183,6 +202,7 @@ class DecideResponse(Wire):
     reason: Reason | None = Field(None, description="why the decision is not the LLM's")
     model: str | None = None
     top_k: list[Candidate]
+    guided: Guided | None = Field(None, description="in mode `guided` only")
     tokens: Tokens
     deadline_ms: int = Field(description="what this decision was given")
     latency_ms: dict[str, float] = Field(description="by stage, and total")

@@ -40,6 +40,31 @@ def constrain(constraint: Constraint, sensor_ids: Sequence[int], velocities: int
     return {}
 
 
+def constrain_label(constraint: Constraint, labels: Sequence[str]) -> dict[str, Any]:
+    """The request fields that hold a server to one of some labels, each a single token.
+
+    OpenAI's ``json_schema`` could only name the label within an object, not in the first token: such a server is left
+    free, and the labels are found among its likeliest tokens.
+    """
+    if constraint == "grammar":
+        return {"grammar": f"root ::= {_alternatives(list(labels))}"}
+    if constraint == "structured_outputs":
+        return {"structured_outputs": {"choice": list(labels)}}
+    return {}
+
+
+def check_label(text: str, labels: Collection[str]) -> str:
+    """The label that a text is.
+
+    Raises:
+        NoDecision: it is none of those offered.
+    """
+    label = text.strip()
+    if label not in labels:
+        raise NoDecision("answer_format", repr(text[:80]))
+    return label
+
+
 def json_schema(sensor_ids: list[int], velocities: list[int]) -> dict[str, Any]:
     """OpenAI's ``response_format`` for ``{"sensor_id": ..., "velocity": ...}``."""
     schema = {

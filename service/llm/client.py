@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import httpx
 
-from service.llm.answer import Constraint, NoDecision, constrain
+from service.llm.answer import Constraint, NoDecision, constrain, constrain_label
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES = 256 * 1024
 _MAX_TOKENS = 10**9
 # What servers answer to a field that they do not know; anything else says nothing about the field.
 _NOT_UNDERSTOOD = (400, 404, 422)
+# The most likely tokens that OpenAI and vLLM tell.
+TOLD_TOKENS = 20
 
 
 class NotUnderstood(NoDecision):
@@ -27,12 +31,16 @@ class Unreachable(NoDecision):
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """An answer's text and the server's ``usage``; ``None`` where it said nothing."""
+    """An answer's text and the server's ``usage``; ``None`` where it said nothing.
+
+    ``first_token`` holds the probabilities of the likeliest first tokens, empty where the server told none.
+    """
 
     text: str
     prompt_tokens: int | None
     cached_tokens: int | None
     completion_tokens: int | None
+    first_token: dict[str, float] = field(default_factory=dict)
 
 
 class LLMClient:
@@ -79,7 +87,7 @@ class LLMClient:
         prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
         if prompt is not None and cached is not None:
             cached = min(cached, prompt)
-        return Completion(text, prompt, cached, completion)
+        return Completion(text, prompt, cached, completion, _first_token(answer["choices"][0]))
 
     async def _call(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
         content = bytearray()
@@ -126,3 +134,51 @@ def chat_body(
     if constraint == "grammar":
         body["cache_prompt"] = True
     return body
+
+
+def label_body(
+    model: str | None,
+    system: str,
+    user: str,
+    constraint: Constraint,
+    labels: Sequence[str],
+    logprobs: bool = True,
+) -> dict[str, Any]:
+    """The request body for one token that is a label, with the likeliest tokens' probabilities if ``logprobs``.
+
+    llama.cpp tells its probabilities from before the grammar unless asked for those after sampling; after sampling at
+    temperature 0 all but one are 0. So it samples at temperature 1 with nothing cut off: the text is then a draw, and
+    the probabilities are exactly the model's among the labels.
+    """
+    body: dict[str, Any] = {
+        "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
+        "temperature": 0,
+        "max_tokens": 1,
+        "stream": False,
+        **constrain_label(constraint, labels),
+    }
+    if model:
+        body["model"] = model
+    if constraint == "grammar":
+        body["cache_prompt"] = True
+    if logprobs:
+        body |= {"logprobs": True, "top_logprobs": TOLD_TOKENS}
+        if constraint == "grammar":
+            body |= {"post_sampling_probs": True, "samplers": ["temperature"], "temperature": 1}
+    return body
+
+
+def _first_token(choice: Any) -> dict[str, float]:
+    """Probabilities of the likeliest first tokens: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
+    try:
+        first = choice["logprobs"]["content"][0]
+        told = first.get("top_logprobs") or first.get("top_probs") or []
+        found: dict[str, float] = {}
+        for entry in told[: 4 * TOLD_TOKENS]:
+            probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
+            if isinstance(entry["token"], str) and 0.0 <= probability <= 1.0:
+                token = entry["token"].strip()
+                found[token] = min(1.0, found.get(token, 0.0) + float(probability))
+        return found
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
+        return {}

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.llm.answer import Constraint, NoDecision
-from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body
+from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
 from service.prompt import Template
@@ -46,6 +47,8 @@ class Upstream:
         self._task: asyncio.Task[None] | None = None
         self.model = settings.llm_model
         self.constraint: Constraint = "none"
+        # Whether the server tells the probabilities of tokens.
+        self.logprobs = False
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
@@ -57,7 +60,7 @@ class Upstream:
         ready = self.status == "ready"
         return Readiness(
             ready=True,
-            decides="llm" if ready else "policy",
+            decides=self._settings.mode if ready else "policy",
             llm=self.status,
             model=self.model,
             constraint=self.constraint if ready else None,
@@ -85,9 +88,19 @@ class Upstream:
         Raises:
             NoDecision: no answer, with the reason.
         """
+        return await self._ask(chat_body(self.model, system, user, self.constraint, sensor_ids, velocities))
+
+    async def ask_label(self, system: str, user: str, labels: Sequence[str]) -> Completion:
+        """One token that should be a label, with the likeliest tokens' probabilities where the server tells them.
+
+        Raises:
+            NoDecision: no answer, with the reason.
+        """
+        return await self._ask(label_body(self.model, system, user, self.constraint, labels, self.logprobs))
+
+    async def _ask(self, body: dict[str, Any]) -> Completion:
         if self._client is None or self.status != "ready":
             raise NoDecision("llm_loading" if self.status == "loading" else "llm_unavailable", self.status)
-        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
         try:
             return await self._client.complete(body)
         except Unreachable as gone:
@@ -132,6 +145,7 @@ class Upstream:
             if self.model is None:
                 self.model = next(iter(await self._client.models()), None)
             self.constraint = await self._probe(self._client)
+            self.logprobs = await self._probe_logprobs(self._client)
             template = Template(SCENARIOS["paper"], experiences=settings.experiences)
             first = chat_body(self.model, template.static, "0,50,-90,1,100\n", self.constraint, [0], 15)
             await self._client.complete(first)
@@ -152,6 +166,14 @@ class Upstream:
         if refusal is not None:
             await client.complete(self._probe_body("none"))
         return "none"
+
+    async def _probe_logprobs(self, client: LLMClient) -> bool:
+        """Whether the server tells the probabilities of the first token: it may ignore or refuse the field."""
+        body = label_body(self.model, "Answer in words.", "Say hello.", self.constraint, ["A", "B"])
+        try:
+            return bool((await client.complete(body)).first_token)
+        except NotUnderstood:
+            return False
 
     def _probe_body(self, constraint: Constraint) -> dict[str, Any]:
         return chat_body(self.model, "Answer in words.", "Say hello.", constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)

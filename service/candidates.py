@@ -1,0 +1,172 @@
+"""Mode ``guided``: the sensor-velocity pairs to choose from, and how an LLM names one with a single token.
+
+A candidate's label is a letter. A row of the prompt shows a sensor's first letter; the letters after it stand for
+its faster velocities. Always as many a row, so that the letters' places in the prompt, and with them what the LLM
+favours a letter or a place by, are the same for a mission's life.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from string import ascii_uppercase
+from typing import Self
+
+import numpy as np
+
+from service.critic import Action
+from service.features import State
+from service.prompt import Prompt, Template
+from service.reach import Reach, distances_ahead
+from service.rows import Cells, cells, full_cells
+from shared.scenario import Scenario
+
+# OpenAI and vLLM tell the probabilities of at most 20 tokens.
+_MOST_LABELS = 20
+_MOST_PACES = 4
+# Velocities at which at least this much of the most that can be moved is moved are all as good for the sensor.
+_NEARLY = 0.9
+
+_STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
+At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.
+
+Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost.
+
+Each row is one sensor, {order}: a letter, then
+queue,age,velocities
+queue: packets waiting. age: steps since its last visit. velocities: the slowest and the fastest, in m/s, at which the \
+UAV can collect.
+{letters}
+
+Rules:
+1. Prefer a full queue, then a long age.
+2. Fly slowly to stay near full queues, fast when there is little to collect.
+
+{experiences}Answer with one letter and nothing else."""
+
+_EXPERIENCES = "Past decisions are queue,age>velocity:cost, where 0 is the best cost.\n\n"
+# Rows that say nothing of any sensor.
+_CONTENT_FREE = ("N/A", "?,?,?")
+
+
+def paces(labels_for: int) -> int:
+    """Letters a row, where so many rows must do with 20: 4 at the most, at least 1."""
+    return max(1, min(_MOST_PACES, _MOST_LABELS // labels_for))
+
+
+class GuidedTemplate(Template):
+    """The prompt of mode ``guided``; it has one format and no demonstrations.
+
+    Args:
+        scenario: the mission's world.
+        rows: the most that a prompt shows.
+        experiences: the most that it may hold; with 0 the static block does not speak of them.
+        ranked: whether the rows come best first.
+    """
+
+    def __init__(self, scenario: Scenario, *, rows: int, experiences: int, ranked: bool) -> None:
+        super().__init__(scenario, experiences=experiences, ranked=ranked)
+        self.paces = paces(rows)
+        self.rows = min(rows, _MOST_LABELS // self.paces)
+        order = "the most promising first" if ranked else "in no particular order"
+        named = ascii_uppercase[: self.paces]
+        letters = (
+            f"In the row that begins with {named[0]}, the letters {', '.join(named)} are its velocities, slowest to "
+            "fastest; so in the other rows."
+            if self.paces > 1
+            else "The letter is the sensor at its fastest velocity."
+        )
+        self.static = _STATIC.format(
+            step_s=scenario.step_s,
+            capacity=scenario.queue_capacity,
+            order=order,
+            letters=letters,
+            experiences=_EXPERIENCES if experiences else "",
+        )
+
+    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
+        """Such as ``52,3>7:0``, the cost in tenths."""
+        return f"{seen['queue']},{seen['age']}>{velocity}:{min(99, round(10 * cost))}\n"
+
+    def offer(self, offer: Offer, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()) -> Prompt:
+        """The prompt for one decision, the offer's rows in their order."""
+        last = "".join(nearest)
+        whole = "".join(",".join(full_cells(state, row).values()) + "\n" for row in range(len(state.ids)))
+        return Prompt(
+            static=self.static,
+            experiences="".join(experiences),
+            state=last + offer.rows,
+            state_uncompressed=last + whole,
+        )
+
+    def content_free(self) -> list[str]:
+        """User messages with as many rows as there can be, none of which says anything."""
+        heads = ascii_uppercase[: self.rows * self.paces : self.paces]
+        return ["".join(f"{letter}{nothing}\n" for letter in heads) for nothing in _CONTENT_FREE]
+
+    @property
+    def labels(self) -> list[str]:
+        """Every letter that a prompt of this mission can offer."""
+        return list(ascii_uppercase[: self.rows * self.paces])
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """What there is to choose from: ``actions`` (sensor ID, velocity), each once, in the order of the rows.
+
+    ``labels`` names actions by index; several letters may name the same. ``rows`` is their text.
+    """
+
+    actions: list[Action]
+    labels: dict[str, int]
+    rows: str
+
+    @classmethod
+    def of(cls, state: State, shown: Sequence[int], uav: int, template: GuidedTemplate, scenario: Scenario) -> Self:
+        """Of the rows of a state, in the order to show them; no more than the template has letters for."""
+        reach = state.reach or _reach(state, uav, scenario)
+        actions: dict[Action, int] = {}
+        labels: dict[str, int] = {}
+        text = []
+        for place, row in enumerate(shown[: template.rows]):
+            speeds = velocities(reach, row, template.paces)
+            letters = ascii_uppercase[place * template.paces :][: template.paces]
+            for letter, velocity in zip(letters, speeds, strict=True):
+                labels[letter] = actions.setdefault((int(state.ids[row]), velocity), len(actions))
+            known = cells(state, row)
+            text.append(f"{letters[0]}{known['queue']},{known['age']},{_span(speeds)}\n")
+        return cls(list(actions), labels, "".join(text))
+
+    def with_actions(self, added: Sequence[Action]) -> Offer:
+        """With more that no letter names."""
+        known = dict.fromkeys(self.actions)
+        return Offer(list(known | dict.fromkeys(added)), self.labels, self.rows)
+
+    def spread(self, by_label: dict[str, float]) -> list[float]:
+        """Probabilities of labels as those of actions."""
+        probabilities = [0.0] * len(self.actions)
+        for label, probability in by_label.items():
+            probabilities[self.labels[label]] += probability
+        return probabilities
+
+
+def velocities(reach: Reach, row: int, count: int) -> list[int]:
+    """The velocities worth offering for a sensor, slowest first, ``count`` of them with repetitions.
+
+    Of the span in which nearly all that can be moved is moved: the ends, the middle, and the best by worth. On 4
+    worlds of scenario `paper` a planner held to them lost 21 packets, to all fifteen 26, to 0, 7 and 14 m/s 37.
+    """
+    packets = reach.packets[:, row]
+    good = np.flatnonzero(packets >= _NEARLY * packets.max())
+    slowest, fastest, best = int(good[0]), int(good[-1]), int(reach.best[row])
+    wanted = [fastest, slowest, best, (slowest + fastest) // 2][:count]
+    return sorted(wanted)
+
+
+def _span(speeds: Sequence[int]) -> str:
+    return f"{speeds[0]}-{speeds[-1]}" if speeds[0] != speeds[-1] else str(speeds[0])
+
+
+def _reach(state: State, uav: int, scenario: Scenario) -> Reach:
+    distance = distances_ahead(uav, state.position, state.progress_m, state.places, scenario)
+    return Reach.of(distance, np.where(state.able, state.queue, 0.0), state.urgency, scenario)

@@ -1,0 +1,152 @@
+"""Mode ``guided``: advisers weighed by learned trust, and a critic that sees what this decision would lose.
+
+The candidates are the rows' sensors at a few velocities each, and what the advisers would do themselves. Adviser e (the
+LLM, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight w_e, and the
+critic expects a candidate to lose m(a) packets above the best. What is flown is
+
+    argmax_a  ln(sum_e w_e p_e(a)) - rate min(m(a), cap)
+
+This is Hedge over pairs of an adviser and a candidate, with the critic's judgement as the prediction of this very
+decision's loss: optimistic Hedge (Rakhlin and Sridharan 2013), whose regret shrinks with the prediction's error. So an
+adviser is overruled where the critic sees a disaster, even before trust has learned; and as trust grows, its word
+counts for more than the critic's small differences. The best is taken rather than a draw: losses are estimated for
+every candidate, so that exploring would teach nothing, and cost packets.
+
+The weights and what they guarantee are in :mod:`service.trust`; the critic in :mod:`service.critic`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from service.candidates import GuidedTemplate, Offer
+from service.critic import Action, Judgement, Situation, judge
+from service.experts import EXPERTS, SMOOTHING
+from service.mission import Mission
+from service.prompt import Prompt
+from service.trust import CAP, RATE, Advice, Trust
+from service.view import View
+from shared.channel import FloatArray
+from shared.wire import Guided, Weighed
+
+LLM = "llm"
+# The LLM starts with as much as all others together: a bad one is found out within a few decisions, in which the critic
+# keeps it from the worst, and a good one is wanted from the start.
+_PRIOR_LLM = 0.5
+_TOLD = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is flown, what the response tells of it, and what trust is to learn from it."""
+
+    action: Action
+    told: Guided
+    advice: Advice
+
+
+@dataclass(frozen=True, slots=True)
+class Deliberation:
+    """One decision's candidates, the LLM-free advisers' probabilities of them ``(n,)`` by name, and the situation.
+
+    Taken at once from what the mission knows then; ``judge`` may run in another thread.
+    """
+
+    offer: Offer
+    prompt: Prompt
+    advised: dict[str, FloatArray]
+    situation: Situation
+
+    @classmethod
+    def of(cls, mission: Mission, view: View) -> Self:
+        """For a mission of mode ``guided`` and a view with at least one row."""
+        template = mission.template
+        if not isinstance(template, GuidedTemplate):
+            raise TypeError(f"mission {mission.mission_id} flies in mode {mission.mode}, not guided")
+        shown = Offer.of(view.state, view.shown(mission), view.uav_id, template, mission.scenario)
+        offer = shown.with_actions([action for expert in EXPERTS for action in expert.proposals(mission, view)])
+        reserved = mission.reserved(view.step, view.uav_id)
+        situation = Situation.of(
+            mission.belief,
+            mission.rates,
+            mission.scenario,
+            view.step,
+            view.uav_id,
+            seed=mission.spec.seed,
+            reserved=reserved,
+        )
+        return cls(
+            offer=offer,
+            prompt=template.offer(offer, view.state, mission.experiences, view.nearest(mission)),
+            advised={expert.name: expert.probabilities(mission, view, offer.actions) for expert in EXPERTS},
+            situation=situation,
+        )
+
+    def judge(self) -> Judgement:
+        """What the critic expects of every candidate."""
+        return judge(self.situation, self.offer.actions)
+
+    def conclude(
+        self,
+        trust: Trust,
+        judgement: Judgement,
+        llm: dict[str, float] | None,
+        *,
+        calibrated: bool,
+        gone: Collection[int] = (),
+    ) -> Verdict | None:
+        """Weigh the advice; None where every candidate's sensor is gone.
+
+        Args:
+            llm: probabilities of the offer's labels; None where the LLM was silent.
+            gone: sensors that others were given meanwhile.
+        """
+        spoken = dict(self.advised)
+        if llm is not None:
+            told = np.asarray(self.offer.spread(llm))
+            # What no label names is as likely as what the LLM ruled out.
+            spoken[LLM] = (1.0 - SMOOTHING) * told + SMOOTHING / len(told)
+        weights = trust.among(spoken)
+        mixture = np.sum([weights[name] * p for name, p in spoken.items()], axis=0)
+        regret = judgement.lost - judgement.lost.min()
+        score = np.log(mixture) - RATE * np.minimum(regret, CAP)
+        free = ~np.isin([sensor for sensor, _ in self.offer.actions], list(gone))
+        if not free.any():
+            return None
+        best = int(np.where(free, score, -np.inf).argmax())
+        advice = Advice(
+            regret={name: float(p @ np.minimum(regret, CAP)) for name, p in spoken.items()},
+            flown={name: float(p[best]) for name, p in spoken.items()},
+            expected_cost=float(judgement.cost[best]),
+        )
+        llm_told = spoken.get(LLM)
+        weighed = [
+            Weighed(
+                sensor_id=self.offer.actions[i][0],
+                velocity=self.offer.actions[i][1],
+                llm=None if llm_told is None else round(float(llm_told[i]), 4),
+                mixture=round(float(mixture[i]), 4),
+                regret=round(float(regret[i]), 3),
+                score=round(float(score[i]), 4),
+            )
+            for i in np.argsort(-np.where(free, score, -np.inf), kind="stable")[:_TOLD].tolist()
+            if free[i]
+        ]
+        shares = {name: round(weight, 4) for name, weight in trust.weights.items()}
+        return Verdict(
+            self.offer.actions[best], Guided(trust=shares, calibrated=calibrated, candidates=weighed), advice
+        )
+
+
+def trust_of(mission: Mission, model: str | None) -> Trust:
+    """A mission's trust in its advisers while this LLM is one of them."""
+    name = model or ""
+    if name not in mission.trust:
+        share = (1.0 - _PRIOR_LLM) / len(EXPERTS)
+        prior = {LLM: _PRIOR_LLM, **{expert.name: share for expert in EXPERTS}}
+        mission.trust[name] = Trust(prior, most_open=8 * mission.scenario.uavs)
+    return mission.trust[name]

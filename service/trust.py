@@ -1,0 +1,123 @@
+"""Whom to trust: Hedge with a fixed share over advisers, from what each one's advice would have cost.
+
+Every adviser e gives a distribution over the same candidates at every decision, so a loss can be estimated for each of
+them at each decision, not only for the one that was followed: full information. That is Hedge (Freund and Schapire
+1997), and EXP4's experts (Auer, Cesa-Bianchi, Freund and Schapire 2002) without its exploration:
+
+    w_e <- (1 - share) w_e exp(-rate l_e) / Z + share / N,     l_e = sum_a p_e(a) l(a),     0 <= l <= cap
+
+Hedge's bound (Freund and Schapire 1997, theorem 2), for decisions drawn from the weights and losses of 0..cap: over any
+number of decisions it loses at most ``cap (rate L_e + ln(1 / prior_e)) / (1 - exp(-rate cap))`` for every adviser e and
+its loss L_e. With the rate 0.3, the cap 8 and a prior of 0.5 that is 6.1 packets + 2.6 L_e: to find out a faultless
+adviser costs six packets of estimated loss, however many decisions a mission has. The fixed share (Herbster and Warmuth
+1998) keeps every adviser alive, so that one that turns good is found again. An adviser that is silent keeps its odds
+against the others (sleeping experts: Freund, Schapire, Singer and Warmuth 1997).
+
+``l(a)`` is the critic's regret of a candidate, corrected by what really happened. After action b was flown, with the
+probability q(b) behind it, the surprise ``s = c - E[c | b]`` is added where an adviser had advised b, as a doubly
+robust estimate would (Dudik, Langford and Li 2011):
+
+    l_e = sum_a p_e(a) regret(a) + min(p_e(b) / q(b), 4) scale (s - mean s),   clipped to -cap..cap
+
+The mean surprise is taken off because a UAV may report another cost than the critic predicts (``--cost paper``).
+Decisions are the best candidate, not a draw, so q(b) is no propensity: where the critic is wrong about candidates that
+are never flown, nothing corrects it. That is the price of not exploring; a draw would pay for it in lost packets.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import exp
+
+# Of the weight, a decision: an adviser that turns good after it was given up is back in some ten decisions.
+_SHARE = 0.01
+# A packet of regret is worth this much in log-odds.
+RATE = 0.3
+# Packets: one decision, however bad, costs an adviser no more.
+CAP = 8.0
+# A failed transmission more than predicted counts as this many packets.
+_SCALE = 4.0
+_LEAST_BEHIND = 0.25
+# Decisions that the mean surprise is learned over.
+_MEMORY = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """What the advisers who spoke said to one decision, by their names.
+
+    ``regret``: packets that the advice loses above the best candidate, by the critic. ``flown``: the probability that
+    it gave to what was flown. ``expected_cost`` of what was flown, by the critic.
+    """
+
+    regret: Mapping[str, float]
+    flown: Mapping[str, float]
+    expected_cost: float
+
+
+class Trust:
+    """The weights of named advisers, which sum to 1, and the advice whose outcome is still to come.
+
+    Args:
+        prior: each one's weight before anything is known; normalised.
+        most_open: decisions whose outcome may still come; older ones are forgotten.
+    """
+
+    def __init__(self, prior: Mapping[str, float], most_open: int = 64) -> None:
+        self._open: OrderedDict[str, Advice] = OrderedDict()
+        self._most_open = most_open
+        total = sum(prior.values())
+        self._weights = {name: weight / total for name, weight in prior.items()}
+        self._surprise = 0.0
+        self.updates = 0
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Each adviser's weight, 0..1."""
+        return dict(self._weights)
+
+    def among(self, speaking: Mapping[str, object]) -> dict[str, float]:
+        """The weights of those that speak, which sum to 1."""
+        total = sum(self._weights[name] for name in speaking)
+        return {name: self._weights[name] / total for name in speaking}
+
+    def note(self, decision_id: str, advice: Advice) -> None:
+        """Remember the advice until the decision's outcome is known."""
+        self._open[decision_id] = advice
+        while len(self._open) > self._most_open:
+            self._open.popitem(last=False)
+
+    def settle(self, decision_id: str, cost: float) -> None:
+        """Learn from a decision's realised cost, if its advice is remembered."""
+        advice = self._open.pop(decision_id, None)
+        if advice is not None:
+            self.update(advice.regret, advice.flown, self._excess(cost, advice.expected_cost))
+
+    def _excess(self, cost: float, expected: float) -> float:
+        """What a realised cost was above the expected and above what it usually is, packets."""
+        raw = max(-1.0, min(1.0, cost - expected))
+        excess = raw - self._surprise
+        self._surprise += (raw - self._surprise) / _MEMORY
+        return _SCALE * excess
+
+    def update(self, regret: Mapping[str, float], flown: Mapping[str, float], surprise: float) -> None:
+        """Learn from one decision.
+
+        Args:
+            regret: by adviser that spoke, the packets that its advice loses above the best candidate.
+            flown: by adviser that spoke, the probability that it gave to what was flown.
+            surprise: what the realised cost was above the expected and above what that usually is, packets.
+        """
+        speaking = self.among(regret)
+        behind = max(_LEAST_BEHIND, sum(speaking[name] * flown[name] for name in speaking))
+        held = sum(self._weights[name] for name in regret)
+        weighed = {}
+        for name, weight in speaking.items():
+            loss = regret[name] + min(flown[name] / behind, 1.0 / _LEAST_BEHIND) * surprise
+            weighed[name] = weight * exp(-RATE * max(-CAP, min(CAP, loss)))
+        total = sum(weighed.values())
+        for name in weighed:
+            self._weights[name] = held * ((1.0 - _SHARE) * weighed[name] / total + _SHARE / len(weighed))
+        self.updates += 1

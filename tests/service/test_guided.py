@@ -1,0 +1,250 @@
+"""Mode guided: candidates, calibration, and scripted LLMs that are always wrong, always right, or late."""
+
+import re
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi import FastAPI, Request
+from fastapi.responses import JSONResponse, Response
+
+from service.candidates import GuidedTemplate
+from service.critic import Belief, Situation, judge
+from service.guided import LLM, Deliberation, trust_of
+from service.llm.answer import NoDecision
+from service.llm.calibration import calibrated, probabilities
+from service.llm.client import Completion
+from service.mission import Mission
+from service.settings import Settings
+from service.view import View
+from shared.trajectory import trajectories
+from shared.wire import MissionSpec, Outcome
+from tests.running import listening, serving
+from tests.service.making import PAPER, attended, uav
+from tests.service.test_upstream import FAULTS, misbehaving, wait_for
+
+Report = Callable[..., dict[str, Any]]
+Edge = Callable[..., httpx.Client]
+
+TEMPLATE = GuidedTemplate(PAPER, rows=5, experiences=8, ranked=True)
+
+
+def guided(**settings: Any) -> Mission:
+    return Mission("test", MissionSpec(features="reach"), Settings(mode="guided", **settings))
+
+
+def deliberation(mission: Mission, step: int = 0) -> tuple[View, Deliberation]:
+    x, y = PAPER.lap_centres[0]
+    state = uav(
+        step=step, position=(x + PAPER.lap_radius_m, y), x=[x + PAPER.lap_radius_m + 40.0 * i for i in range(6)]
+    )
+    mission.belief.hear(state, step)
+    view = attended(mission, state, step)
+    return view, Deliberation.of(mission, view)
+
+
+def completion(text: str, **first_token: float) -> Completion:
+    return Completion(text, None, None, None, first_token)
+
+
+def test_every_row_has_four_letters_whose_velocities_rise() -> None:
+    view, made = deliberation(guided())
+    offer = made.offer
+    assert list(offer.labels) == list("ABCDEFGHIJKLMNOPQRST")
+    rows = offer.rows.splitlines()
+    assert [row[0] for row in rows] == list("AEIMQ")
+    assert all(re.fullmatch(r"[A-Z]\d+,\d+,\d+(-\d+)?", row) for row in rows)
+    for place, sensor in enumerate(view.offered):
+        pairs = [offer.actions[offer.labels[chr(65 + 4 * place + i)]] for i in range(4)]
+        assert {s for s, _ in pairs} == {sensor}
+        assert [v for _, v in pairs] == sorted(v for _, v in pairs)
+
+
+@pytest.mark.parametrize(("rows", "paces"), [(1, 4), (5, 4), (6, 3), (10, 2), (20, 1), (100, 1)])
+def test_twenty_letters_do_for_any_k(rows: int, paces: int) -> None:
+    template = GuidedTemplate(PAPER, rows=rows, experiences=0, ranked=True)
+    assert template.paces == paces
+    assert len(template.labels) <= 20
+
+
+def test_the_static_block_never_changes_and_the_rest_is_short() -> None:
+    mission = guided()
+    view, first = deliberation(mission)
+    for number in range(12):
+        decision_id = f"{number:032x}"
+        mission.commit(view.pending(mission, decision_id, 1, 7))
+        mission.apply(Outcome(decision_id=decision_id, cost=0.3))
+    _, later = deliberation(mission, step=3)
+    assert later.prompt.static.encode() == first.prompt.static.encode()
+    assert later.prompt.experiences.splitlines()[-1] == "20,0>7:3"
+
+
+def test_calibration_takes_a_favourite_label_away() -> None:
+    """An LLM that says A whatever is asked, and prefers B a little where B is better."""
+    bias = {"A": 0.9, "B": 0.05, "C": 0.05}
+    told = {"A": 0.85, "B": 0.11, "C": 0.04}
+    assert max(told, key=lambda label: told[label]) == "A"
+    corrected = calibrated(told, bias)
+    assert max(corrected, key=lambda label: corrected[label]) == "B"
+    assert sum(corrected.values()) == pytest.approx(1.0)
+    # What says no more than the bias says nothing.
+    assert calibrated(bias, bias) == pytest.approx(dict.fromkeys("ABC", 1 / 3))
+
+
+def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> None:
+    assert probabilities(completion("x", A=0.6, B=0.2, the=0.2), "AB") == pytest.approx({"A": 0.75, "B": 0.25})
+    # C was not among the likeliest tokens.
+    assert probabilities(completion("A", A=0.6, B=0.2), "ABC")["C"] == pytest.approx(0.1 / 0.9)
+    assert probabilities(completion(" B\n"), "AB") == pytest.approx({"A": 0.025, "B": 0.975})
+    with pytest.raises(NoDecision):
+        probabilities(completion("hello", the=1.0), "AB")
+
+
+def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None:
+    belief = Belief(PAPER)
+    start = trajectories(PAPER)[0].at(0.0)
+    near = [float(start[0]) - 20.0]
+    state = uav(position=(float(start[0]), float(start[1])), x=near, queue=[60.0])
+    state.sensors.y[0] = float(start[1])
+    belief.hear(state, 0)
+    situation = Situation.of(belief, np.full(PAPER.sensors, 5.0), PAPER, 0, 0)
+    judged = judge(situation, [(0, 0), (1, 0)])
+    assert judged.lost[1] > judged.lost[0] + 1
+    # Sensor 1 was never reported: nothing can be collected from it.
+    assert judged.cost[1] >= 1.0 > judged.cost[0]
+
+
+def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
+    mission = guided()
+    trust = trust_of(mission, "stub")
+    for step in range(15):
+        view, made = deliberation(mission, step)
+        judgement = made.judge()
+        label = answer(made, judgement.lost)
+        verdict = made.conclude(
+            trust, judgement, {name: float(name == label) for name in made.offer.labels}, calibrated=False
+        )
+        assert verdict is not None
+        decision_id = f"{step:032x}"
+        trust.note(decision_id, verdict.advice)
+        trust.settle(decision_id, verdict.advice.expected_cost)
+    return trust.weights[LLM]
+
+
+def test_trust_falls_for_the_worst_and_not_for_the_best() -> None:
+    def worst(made: Deliberation, lost: np.ndarray) -> str:
+        return max(made.offer.labels, key=lambda name: lost[made.offer.labels[name]])
+
+    def best(made: Deliberation, lost: np.ndarray) -> str:
+        return min(made.offer.labels, key=lambda name: lost[made.offer.labels[name]])
+
+    assert learned(worst) < 0.05
+    assert learned(best) > 0.5
+
+
+def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
+    mission = guided()
+    view, made = deliberation(mission)
+    judgement = made.judge()
+    worst = max(made.offer.labels, key=lambda name: judgement.lost[made.offer.labels[name]])
+    assert judgement.lost.max() - judgement.lost.min() > 8
+    told = {name: float(name == worst) for name in made.offer.labels}
+    verdict = made.conclude(trust_of(mission, "stub"), judgement, told, calibrated=False)
+    assert verdict is not None
+    assert verdict.action != made.offer.actions[made.offer.labels[worst]]
+
+
+def test_what_others_got_meanwhile_is_not_flown() -> None:
+    mission = guided()
+    view, made = deliberation(mission)
+    trust, judgement = trust_of(mission, "stub"), made.judge()
+    first = made.conclude(trust, judgement, None, calibrated=False)
+    assert first is not None
+    second = made.conclude(trust, judgement, None, calibrated=False, gone={first.action[0]})
+    assert second is not None and second.action[0] != first.action[0]
+    everything = {sensor for sensor, _ in made.offer.actions}
+    assert made.conclude(trust, judgement, None, calibrated=False, gone=everything) is None
+
+
+class Chooser:
+    """A server that says one label, with probabilities if it tells any; it favours A where the rows say nothing."""
+
+    def __init__(self, answer: str, tells: bool) -> None:
+        self.answer, self.tells = answer, tells
+        self.bodies: list[dict[str, Any]] = []
+        self.app = FastAPI()
+        self.app.get("/v1/models")(self.models)
+        self.app.post("/v1/chat/completions")(self.complete)
+
+    async def models(self) -> dict[str, Any]:
+        return {"data": [{"id": "stub-1"}]}
+
+    async def complete(self, request: Request) -> Response:
+        body = await request.json()
+        self.bodies.append(body)
+        empty = "N/A" in body["messages"][-1]["content"] or "?" in body["messages"][-1]["content"]
+        text = "A" if empty else self.answer
+        choice: dict[str, Any] = {"message": {"content": text}}
+        if self.tells and body.get("logprobs"):
+            told = [{"token": text, "logprob": -0.1}, {"token": "B", "logprob": -2.5}]
+            choice["logprobs"] = {"content": [{"token": text, "logprob": -0.1, "top_logprobs": told}]}
+        return JSONResponse({"choices": [choice], "usage": {"prompt_tokens": 300, "completion_tokens": 1}})
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_decides_and_says_how(edge: Edge, report: Report, tells: bool) -> None:
+    model = Chooser("A", tells)
+    with serving(model.app) as url:
+        client = edge(mode="guided", llm_url=f"{url}/v1")
+        assert wait_for(client, "ready")["decides"] == "guided"
+        answer = client.post("/decide", json=report()).json()
+        for _ in range(100):
+            again = client.post("/decide", json=report(step=1)).json()
+            if again["guided"]["calibrated"] or not tells:
+                break
+            time.sleep(0.02)
+        metrics = client.get("/metrics").text
+    assert (answer["source"], answer["reason"], answer["model"]) == ("guided", None, "stub-1")
+    shown = answer["guided"]
+    assert set(shown["trust"]) == {"llm", "value", "policy"}
+    assert sum(shown["trust"].values()) == pytest.approx(1.0, abs=1e-3)
+    best = shown["candidates"][0]
+    assert (best["sensor_id"], best["velocity"]) == (answer["sensor_id"], answer["velocity"])
+    scores = [candidate["score"] for candidate in shown["candidates"]]
+    assert scores == sorted(scores, reverse=True) and len(scores) <= 5
+    assert (shown["calibrated"], again["guided"]["calibrated"]) == (False, tells)
+    assert "aicvds_llm_trust_count" in metrics
+    asked = [body for body in model.bodies if body["messages"][-1]["content"] != "Say hello."][1:]
+    assert all(body["max_tokens"] == 1 for body in asked)
+    assert len({body["messages"][0]["content"] for body in asked}) == 1
+
+
+@pytest.mark.parametrize("fault", ["silent", "resetting", "500", "no text"])
+def test_without_the_llm_the_others_decide(edge: Edge, report: Report, fault: str) -> None:
+    handler, reason = FAULTS[fault]
+    with listening(misbehaving(handler)) as url:
+        client = edge(mode="guided", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=600)
+        wait_for(client, "ready")
+        answer = client.post("/decide", json=report()).json()
+    assert (answer["source"], answer["reason"], answer["model"]) == ("policy", reason, None)
+    assert answer["guided"]["candidates"][0]["llm"] is None
+    assert answer["guided"]["trust"]["llm"] == 0.5
+
+
+def test_a_mission_learns_whom_to_trust_from_what_comes_back(edge: Edge, report: Report) -> None:
+    """An LLM that always names the first row's slowest velocity."""
+    with serving(Chooser("A", tells=False).app) as url:
+        client = edge(mode="guided", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        outcome = None
+        for step in range(12):
+            answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
+            outcome = {"decision_id": answer["decision_id"], "cost": 0.0}
+    assert answer["guided"]["trust"]["llm"] != 0.5
+
+
+def test_another_mode_says_nothing_of_trust(edge: Edge, report: Report) -> None:
+    assert edge().post("/decide", json=report()).json()["guided"] is None
