@@ -1,4 +1,4 @@
-"""Receding-horizon planning: what it believes, that it repeats, and that it beats what is simpler."""
+"""Receding-horizon planning: that it repeats, is told nothing hidden, and beats what is simpler."""
 
 from __future__ import annotations
 
@@ -9,80 +9,12 @@ import pytest
 
 from shared.scenario import SCENARIOS, Scenario
 from simulator.policies import policy_named
-from simulator.policies.mpc import FleetBelief, RecedingHorizon
+from simulator.policies.mpc import RecedingHorizon
 from simulator.rollout import rollout
-from simulator.world import Observation, PipelineWorld
+from simulator.world import PipelineWorld
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 10})
 NONE: frozenset[int] = frozenset()
-
-
-def beacons(queue: list[float], last_heard: list[int], now: int) -> Observation:
-    count = len(queue)
-    return Observation(
-        step=np.array([now]),
-        position=np.zeros(2),
-        progress=np.zeros(1),
-        sensor_position=np.zeros((count, 2)),
-        queue=np.array(queue, dtype=np.float64),
-        battery=np.full(count, 40.0),
-        channel_gain=np.full(count, -80.0),
-        last_heard=np.array(last_heard),
-    )
-
-
-def belief() -> FleetBelief:
-    return FleetBelief(Scenario(name="two", sensors=2, uavs=2))
-
-
-# ---- the fleet's belief
-
-
-def test_a_sensor_never_heard_began_like_the_average_one() -> None:
-    fleet = belief()
-    np.testing.assert_allclose(fleet.queue(0), 39.0)
-    np.testing.assert_allclose(fleet.queue(2), 49.0)
-    assert (fleet.base_variance > 0).all()
-
-
-def test_the_newest_beacon_wins_whoever_heard_it() -> None:
-    fleet = belief()
-    fleet.hear(beacons([10.0, 20.0], [4, 2], now=4))
-    fleet.hear(beacons([55.0, 30.0], [1, 3], now=4))
-    np.testing.assert_allclose(fleet.base, [10.0, 30.0])
-    assert fleet.heard.tolist() == [4, 3]
-    assert (fleet.base_variance == 0).all()
-
-
-def test_a_queue_is_rolled_forward_until_it_is_full() -> None:
-    fleet = belief()
-    fleet.hear(beacons([10.0, 58.0], [0, 0], now=0))
-    np.testing.assert_allclose(fleet.queue(3), [25.0, 60.0])
-
-
-def test_the_rate_is_learned_from_successive_beacons() -> None:
-    fleet = belief()
-    for now in range(10):
-        fleet.hear(beacons([8.0 * now % 60, 2.0 * now], [now, now], now=now))
-    assert fleet.rate[0] > 6.5
-    assert fleet.rate[1] < 3.0
-
-
-def test_a_full_queue_says_nothing_of_the_rate() -> None:
-    fleet = belief()
-    fleet.hear(beacons([50.0, 50.0], [0, 0], now=0))
-    fleet.hear(beacons([60.0, 55.0], [8, 8], now=8))
-    assert fleet.rate[0] == pytest.approx(5.0)
-    assert fleet.rate[1] < 5.0
-
-
-def test_what_was_collected_is_subtracted_and_no_arrival() -> None:
-    fleet = belief()
-    fleet.hear(beacons([50.0, 50.0], [0, 0], now=0))
-    fleet.collect(0, 60, step=0)
-    assert fleet.queue(1)[0] == pytest.approx(5.0)
-    fleet.hear(beacons([9.0, 50.0], [1, 0], now=1))
-    assert fleet.rate[0] > 5.0
 
 
 # ---- the policy
@@ -141,13 +73,13 @@ def test_with_nothing_in_reach_it_still_answers() -> None:
 
 
 def test_with_no_time_to_search_it_still_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simulator.policies.mpc._MOST_WORK", 1e-9)
+    monkeypatch.setattr("shared.fleetplan.receding._MOST_WORK", 1e-9)
     assert len(flown(SHORT, 100)) == 10
 
 
 def test_with_no_work_saved_it_searches_briefly_and_still_loses_less_than_eof(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simulator.policies.mpc._SAVED_WORK", 0.0)
-    monkeypatch.setattr("simulator.policies.mpc._WORK", 1e-9)
+    monkeypatch.setattr("shared.fleetplan.receding._SAVED_WORK", 0.0)
+    monkeypatch.setattr("shared.fleetplan.receding._WORK", 1e-9)
     stress = SCENARIOS["stress"].model_copy(update={"steps": 12})
     eof = sum(t.lost_packets for t in rollout(PipelineWorld(stress), policy_named("eof"), 101))
     assert sum(lost for lost, _ in flown(stress, 101)) < eof

@@ -1,0 +1,201 @@
+"""Receding-horizon planning over a fleet's belief: plan some steps for all UAVs, fly the first, plan again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.fleetplan.belief import FAR_M, FleetBelief
+from shared.fleetplan.greedy import look_ahead
+from shared.fleetplan.problem import FleetProblem, IntArray, price
+from shared.fleetplan.risk import neglect
+from shared.fleetplan.solver import Budget, Plan, plan
+from shared.scenario import Scenario
+
+_HORIZON = 8
+# Losses this long after the horizon still count, as if nobody came in the meantime.
+_BEYOND = 4
+# Deterministic seconds of search for a whole fleet's step: what it may take, and what it may take on average, so that
+# a hard world does not cost a multiple of an easy one. A mission begins with some saved.
+_MOST_WORK = 0.3
+_WORK = 0.1
+_SAVED_WORK = 1.0
+# Larger fleets plan UAV by UAV, each with the others' plans as they stand, and less far.
+_JOINT_UAVS = 4
+_NEAR_HORIZON = 4
+_MOST_SENSORS = 40
+_NEAR_SENSORS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A plan to be searched for, taken from a belief at once: another thread may search.
+
+    Attributes:
+        step: the plan's first.
+        uavs: the columns of the problem's UAVs, by index.
+        free: those of them whose actions the plan may choose.
+        kept: shape ``(n,)``, IDs of the sensors planned for; the problem has one more, nowhere.
+        problem: what to solve.
+        before: shape ``(H, I, 2)``, the last plan in the problem's terms.
+        work: deterministic seconds that the search may take.
+        saved: whether so much was saved that the search may begin from the last plan alone.
+    """
+
+    step: int
+    uavs: list[int]
+    free: list[int]
+    kept: IntArray
+    problem: FleetProblem
+    before: IntArray
+    work: float
+    saved: bool
+
+    def search(self, seconds: float = math.inf) -> Plan:
+        """The best plan found within the work and the wall clock, never worse than what it starts from.
+
+        Raises:
+            ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
+        """
+        start = self.before
+        if not self.saved:
+            greedy = look_ahead(self.problem)
+            start = min(start, greedy, key=lambda actions: price(self.problem, actions)[1])
+        return plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
+
+
+class RecedingHorizon:
+    """Plan eight steps ahead for the fleet with CP-SAT, fly the first, and plan again.
+
+    What is minimised are the packets expected to be lost in those steps and, with nobody coming, in four more; see
+    :func:`shared.fleetplan.neglect`. A plan is made for all UAVs that are present; those that were told already what to
+    do in this step are held to it. Fleets of more than four plan UAV by UAV, four steps ahead.
+
+    The search is limited in the solver's deterministic time, so that a mission repeats to the bit. Steps that are
+    solved early save time for others; where none is left, a short search starts from the better of the last plan and
+    :func:`shared.fleetplan.look_ahead`, and never ends with a worse one.
+
+    Attributes:
+        plans: by UAV, its planned actions ``(n, 2)``, sensor (-1: none) and velocity, from step ``step`` on.
+    """
+
+    def __init__(self, scenario: Scenario, belief: FleetBelief) -> None:
+        self._scenario = scenario
+        self._belief = belief
+        self.step = -1
+        self.plans: dict[int, IntArray] = {}
+        self._joint = scenario.uavs <= _JOINT_UAVS
+        self._saved = _SAVED_WORK
+
+    def begin(self, step: int) -> None:
+        """Go on to a later step: the belief advances, and the plans lose what was flown."""
+        if step <= self.step:
+            return
+        gone = step - self.step
+        self._belief.advance(step)
+        self._saved += _WORK
+        self.plans = {uav: actions[gone:] for uav, actions in self.plans.items()}
+        self.step = step
+
+    def draft(self, uavs: Collection[int], taken: Collection[int] = ()) -> Draft | None:
+        """What a plan of this step has to solve in which these UAVs are yet to be told.
+
+        Args:
+            uavs: they were located in this step.
+            taken: sensors that are given away in this step, beside those that the belief was told of.
+
+        Returns:
+            None where none of the UAVs flies its trajectory.
+        """
+        belief, step, world = self._belief, self.step, self._scenario
+        present = [uav for uav in belief.present(step) if belief.uavs[uav].progress_m is not None]
+        free = [uav for uav in (present if self._joint else uavs) if uav in present]
+        if not set(uavs) & set(free):
+            return None
+        decided = {uav: told for uav, told in belief.decided(step).items() if uav in present}
+        left = world.steps - step
+        # Past the scenario's last step a fleet may fly on.
+        horizon = min(_HORIZON if self._joint else _NEAR_HORIZON, left if left > 0 else _HORIZON)
+        fixed = {u: np.array([told]) for u, told in decided.items()}
+        fixed |= {u: self.plans[u][:horizon] for u in present if u not in free and len(self.plans.get(u, ()))}
+        kept = self._worth_planning(free if self._joint else [u for u in uavs if u in present], horizon)
+        index = {int(sensor): k for k, sensor in enumerate(kept)}
+        nowhere = len(kept)
+
+        def renamed(actions: IntArray) -> IntArray:
+            return np.array([(index.get(sensor, nowhere), v) for sensor, v in actions.tolist()], dtype=np.int64)
+
+        problem = FleetProblem(
+            scenario=world,
+            trajectories=[belief.trajectory(u) for u in present],
+            progress_m=np.array([belief.uavs[u].progress_m for u in present], dtype=np.float64),
+            places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
+            fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
+            usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
+            **self._outlook(kept, horizon),
+        )
+        before = np.empty((horizon, len(present), 2), dtype=np.int64)
+        before[:] = nowhere, world.max_velocity
+        for column, u in enumerate(present):
+            last = self.plans.get(u, np.empty((0, 2), dtype=np.int64))[:horizon]
+            before[: len(last), column] = renamed(last).reshape(-1, 2)
+        long = _MOST_WORK / world.uavs
+        saved = self._joint and self._saved >= long
+        return Draft(step, present, free, kept, problem, before, long if saved else _WORK / world.uavs, saved)
+
+    def adopt(self, draft: Draft, best: Plan) -> None:
+        """Fly by this plan from now on, unless the fleet has gone on meanwhile."""
+        self._saved -= best.work
+        if draft.step != self.step:
+            return
+        names = np.append(draft.kept, -1)
+        for column, uav in enumerate(draft.uavs):
+            if uav in draft.free:
+                actions = best.actions[:, column]
+                self.plans[uav] = np.stack((names[actions[:, 0]], actions[:, 1]), axis=-1)
+
+    def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
+        """The sensors that these UAVs can reach within the horizon; of very many, those that fill first."""
+        belief, world = self._belief, self._scenario
+        flown = np.arange(horizon * world.max_velocity + 1) * world.step_s
+        near = np.zeros(world.sensors, dtype=np.bool_)
+        for uav in free:
+            near |= (belief.distances(uav, flown) <= world.radio_radius_m).any(axis=0)
+        near |= not near.any()
+        room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.rate, 1e-9)
+        order = np.argsort(np.where(near, room, np.inf), kind="stable")
+        return np.sort(order[: min(int(near.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
+
+    def _usable(self, kept: IntArray, horizon: int, taken: Collection[int]) -> NDArray[np.bool_]:
+        """All but what others, who were not decided for here, have taken in this step."""
+        usable = np.ones((horizon, len(kept) + 1), dtype=np.bool_)
+        usable[0, :-1] = ~np.isin(kept, list(taken))
+        return usable
+
+    def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
+        """What is expected of the kept sensors, and of one nowhere that never has a packet."""
+        world, belief, step = self._scenario, self._belief, self.step
+        queue, rate = belief.queue(step)[kept], belief.rate[kept]
+        came = np.rint(queue + np.arange(horizon + 1)[:, None] * rate).astype(np.int64)
+        beyond = max(0, min(_BEYOND, world.steps - step - horizon)) if step < world.steps else _BEYOND
+        risk = neglect(
+            base=belief.base[kept],
+            base_variance=belief.base_variance[kept],
+            age=np.maximum(step - belief.since[kept], 0),
+            rate=rate,
+            rate_variance=rate / belief.watched[kept],
+            capacity=world.queue_capacity,
+            horizon=horizon,
+            beyond=beyond,
+        )
+        return {
+            "queue": np.append(np.minimum(came[0], world.queue_capacity), 0),
+            "battery": np.append(belief.battery[kept], 0.0),
+            "arrivals": np.pad(np.diff(came, axis=0), ((0, 0), (0, 1))),
+            "risk": np.pad(risk, ((0, 0), (0, 0), (0, 1))),
+        }
