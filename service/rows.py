@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from typing import Literal, Protocol
+from typing import Literal
 
 from service.features import State
 from shared.wire import Features
@@ -66,121 +67,97 @@ def full_cells(state: State, row: int) -> dict[str, str]:
     return {name: text if name in ("sensor_id", "age", "distance") else UNKNOWN for name, text in full.items()}
 
 
-class Format(Protocol):
-    """One way of writing rows."""
+class Format(ABC):
+    """One way of writing rows; one whose rows need no header, unless it says so."""
 
     # What divides the experiences from the rows after them.
-    gap: str
+    gap = ""
+    # How the static block says what a row is, before the names of its numbers, and what stands between those.
+    row_note: str
+    between_names = ", "
     # How the static block says what an experience is.
     experience_note: str
 
     def introduction(self, names: tuple[str, ...], order: str) -> str:
-        """How the static block says what a row is."""
-        ...
+        """How the static block says what a row is, and what its numbers are called."""
+        told = self.row_note.format(order=order, count=_NUMERALS[len(names)])
+        return f"{told}:\n{self.between_names.join(names)}"
 
     def header(self, names: Iterable[str]) -> str:
         """What must stand above the rows each time; empty where the static block has said it."""
-        ...
-
-    def row(self, cells: Cells) -> str:
-        """One sensor's line."""
-        ...
+        return ""
 
     def experience_header(self, names: tuple[str, ...]) -> str:
         """What must stand above the experiences."""
-        ...
+        return ""
 
+    @abstractmethod
+    def row(self, cells: Cells) -> str:
+        """One sensor's line."""
+
+    @abstractmethod
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
         """One past decision's line: the chosen sensor's row without its ID, the answer, and its cost."""
-        ...
 
 
-class Csv:
+class Csv(Format):
     """Comma-separated numbers; the header stands in the static block, where it costs nothing after the first time."""
 
-    gap = ""
+    row_note = "Each row is one sensor, {order}, with {count} numbers"
+    between_names = ","
     experience_note = (
         "Past decisions are rows without their first number, then > sensor_id velocity: cost, where 0 is best."
     )
 
-    def introduction(self, names: tuple[str, ...], order: str) -> str:
-        """With the header."""
-        return f"Each row is one sensor, {order}, with {_NUMERALS[len(names)]} numbers:\n{','.join(names)}"
-
-    def header(self, names: Iterable[str]) -> str:
-        """None."""
-        return ""
-
     def row(self, cells: Cells) -> str:
         """Such as ``3,52,-90,2,140``."""
         return ",".join(cells.values()) + "\n"
-
-    def experience_header(self, names: tuple[str, ...]) -> str:
-        """None."""
-        return ""
 
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
         """Such as ``52,-90,2,140 > 3 7: 0.0``."""
         return f"{','.join(_without_id(cells).values())} > {answer}: {cost}\n"
 
 
-class Json:
+class Json(Format):
     """JSON Lines: an object a line, so that experiences can grow by appending."""
 
-    gap = ""
+    row_note = "Each line is one sensor, {order}, a JSON object with {count} numbers"
     experience_note = (
         "Past decisions are objects without sensor_id, but with the answer (sensor_id velocity) and its cost, "
         "where 0 is best."
     )
 
-    def introduction(self, names: tuple[str, ...], order: str) -> str:
-        """With the keys."""
-        listed = ", ".join(names)
-        return f"Each line is one sensor, {order}, a JSON object with {_NUMERALS[len(names)]} numbers:\n{listed}"
-
-    def header(self, names: Iterable[str]) -> str:
-        """None."""
-        return ""
-
     def row(self, cells: Cells) -> str:
         """Such as ``{"sensor_id":3,"queue":52,"gain":-90,"age":2,"distance":140}``."""
         return f"{_json(cells)}\n"
-
-    def experience_header(self, names: tuple[str, ...]) -> str:
-        """None."""
-        return ""
 
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
         """Such as ``{"queue":52,"gain":-90,"age":2,"distance":140,"answer":"3 7","cost":0.0}``."""
         return f'{_json(_without_id(cells))[:-1]},"answer":"{answer}","cost":{cost}}}\n'
 
 
-class Markdown:
+class Markdown(Format):
     """A table; it is none without its header, so that stands above the rows each time."""
 
     gap = "\n"
+    row_note = "Each row of the table is one sensor, {order}, with {count} numbers"
     experience_note = (
         "Past decisions are a table without sensor_id, but with the answer (sensor_id velocity) and its cost, "
         "where 0 is best."
     )
-
-    def introduction(self, names: tuple[str, ...], order: str) -> str:
-        """With the columns."""
-        listed = ", ".join(names)
-        return f"Each row of the table is one sensor, {order}, with {_NUMERALS[len(names)]} numbers:\n{listed}"
 
     def header(self, names: Iterable[str]) -> str:
         """Two lines."""
         listed = list(names)
         return f"{_piped(listed)}{_piped(['---'] * len(listed))}"
 
-    def row(self, cells: Cells) -> str:
-        """Such as ``| 3 | 52 | -90 | 2 | 140 |``."""
-        return _piped(cells.values())
-
     def experience_header(self, names: tuple[str, ...]) -> str:
         """Two lines."""
         return self.header((*names[1:], "answer", "cost"))
+
+    def row(self, cells: Cells) -> str:
+        """Such as ``| 3 | 52 | -90 | 2 | 140 |``."""
+        return _piped(cells.values())
 
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
         """Such as ``| 52 | -90 | 2 | 140 | 3 7 | 0.0 |``."""

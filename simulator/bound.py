@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 from tyro.conf import arg
 
-from simulator.record import BadUse, Record, naming_out
-from simulator.simulate import check_bounds, reporting
+from simulator.commandline import check_between, check_seed, command_main
+from simulator.record import Record, naming_out
 from simulator.site import Site, chosen_site
 
 # The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
@@ -102,11 +101,7 @@ class BoundRecord(Record):
 
 def main(argv: list[str]) -> int:
     """Bound the world that the command line describes; returns the exit code."""
-    try:
-        options = tyro.cli(BoundOptions, prog="aicvds bound", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
-    return reporting("aicvds bound", lambda console: _run(options, console))
+    return command_main(BoundOptions, "aicvds bound", argv, _run)
 
 
 def clairvoyant(
@@ -177,9 +172,8 @@ def replay(site: Site, seed: int, actions: NDArray[np.int64]) -> int:
 def _run(options: BoundOptions, console: Console) -> int:
     site = chosen_site(options.scenario, options.world, options.steps)
     scenario = site.scenario
-    check_bounds(options.seed, wait_s=0)
-    if not 0.1 <= options.time_limit_s <= 86_400:
-        raise BadUse(f"--time-limit-s {options.time_limit_s:g} is not between 0.1 and 86400")
+    check_seed(options.seed)
+    check_between("--time-limit-s", options.time_limit_s, 0.1, 86_400)
     if options.out is not None:
         with naming_out(options.out):
             options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from rich.console import Console
 
 from simulator.client import EdgeError
+from simulator.commandline import check_between, check_seed, check_wait, command_main
 from simulator.record import BadUse, fresh_folder, naming_out, refuse_old_result
-from simulator.simulate import Job, check_bounds, conduct, reporting
+from simulator.simulate import Job, conduct
 from simulator.site import chosen_site
 
 EDGE_LOG = "edge.log"
@@ -59,12 +59,8 @@ class EdgeDied(EdgeError):
 
 def main(argv: list[str]) -> int:
     """Run the demo that the command line describes; returns the exit code."""
-    try:
-        options = tyro.cli(Demo, prog="aicvds demo", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
     command = shlex.join(["aicvds", "demo", *argv])
-    return reporting("aicvds demo", lambda console: demo(options, command, console))
+    return command_main(Demo, "aicvds demo", argv, lambda options, console: demo(options, command, console))
 
 
 def demo(options: Demo, command: str, console: Console) -> int:
@@ -75,9 +71,9 @@ def demo(options: Demo, command: str, console: Console) -> int:
         EdgeError: the edge died at start, or never became ready.
     """
     site = chosen_site(options.scenario, options.world)
-    check_bounds(options.seed, options.wait_s)
-    if not 0 <= options.port <= 65_535:
-        raise BadUse(f"--port {options.port} is not between 0 and 65535")
+    check_seed(options.seed)
+    check_wait(options.wait_s)
+    check_between("--port", options.port, 0, 65_535)
     refuse_old_result(options.out, overwrite=True)
     port = usable_port(options.port)
     fresh_folder(options.out)

@@ -11,15 +11,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import track
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from shared.wire import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
 from simulator.agreement import Compared, Prices, ReplaySummary, agreement, by_source, show, side
-from simulator.client import EdgeClient, EdgeError, Exchange, edge_url
+from simulator.client import EdgeClient, EdgeError, Exchange
+from simulator.commandline import INTERRUPTED, check_deadline, check_wait, checked_edge, command_main
 from simulator.record import (
     DECISIONS,
     REQUESTS,
@@ -31,15 +31,7 @@ from simulator.record import (
     refuse_old_result,
 )
 from simulator.requests import read_requests
-from simulator.simulate import (
-    API_KEY,
-    DEFAULT_TIMEOUT_S,
-    INTERRUPTED,
-    NETWORK_SLACK_S,
-    await_edge,
-    check_bounds,
-    reporting,
-)
+from simulator.simulate import API_KEY, DEFAULT_TIMEOUT_S, NETWORK_SLACK_S, await_edge
 
 REPLAY, REPLAYED = "replay.json", "replayed.jsonl"
 
@@ -76,7 +68,7 @@ class Replay:
     asked is written), 2 bad use, 130 interrupted (written too). The key of an edge is read from AICVDS_API_KEY.
     """
 
-    run: Annotated[tyro.conf.Positional[Path], arg(metavar="DIR")]
+    run: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder that `aicvds simulate --edge` wrote."""
     edge: Annotated[str | None, arg(metavar="URL")] = None
     """The edge's address, such as http://127.0.0.1:8000. Needed."""
@@ -122,12 +114,8 @@ _OF_PROMPT = ("format", "order", "experiences", "selection", "demonstrations")
 
 def main(argv: list[str]) -> int:
     """Ask again as the command line says; returns the exit code."""
-    try:
-        options = tyro.cli(Replay, prog="aicvds replay", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
     command = shlex.join(["aicvds", "replay", *argv])
-    return reporting("aicvds replay", lambda console: replay(options, command, console))
+    return command_main(Replay, "aicvds replay", argv, lambda options, console: replay(options, command, console))
 
 
 @dataclass(frozen=True)
@@ -169,7 +157,8 @@ def replay(options: Replay, command: str, console: Console) -> int:
         BadUse: the options or the folder do not make a replay.
         EdgeError: no edge answers as one, or it does not take the changed mission.
     """
-    edge = checked_edge(options)
+    check(options)
+    edge = checked_edge(options.edge)
     logged = logged_mission(options.run)
     spec = changed_spec(logged.spec, options)
     from simulator.mission import new_mission_id
@@ -286,23 +275,16 @@ def _decision(flown: Decision, exchange: Exchange) -> Decision:
     )
 
 
-def checked_edge(options: Replay) -> str:
-    """The edge's URL; raises ``BadUse`` for the first option that is out of its bounds."""
-    check_bounds(0, options.wait_s)
-    if options.deadline_ms is not None and not 10 <= options.deadline_ms <= 60_000:
-        raise BadUse(f"--deadline-ms {options.deadline_ms} is not between 10 and 60000")
+def check(options: Replay) -> None:
+    """Raises ``BadUse`` for the first option that is out of its bounds."""
+    check_wait(options.wait_s)
+    check_deadline(options.deadline_ms)
     for name in ("input", "cached", "output"):
         price = getattr(options, f"price_{name}")
         if price is not None and not 0 <= price < float("inf"):
             raise BadUse(f"--price-{name} {price:g} is not at least 0")
         if price is not None and options.price_input is None:
             raise BadUse(f"--price-{name} needs --price-input")
-    if options.edge is None:
-        raise BadUse("--edge is missing: give the edge's address, such as --edge http://127.0.0.1:8000")
-    try:
-        return edge_url(options.edge)
-    except ValueError as error:
-        raise BadUse(f"--edge: {error}") from None
 
 
 def prices(options: Replay) -> Prices | None:

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import os
 import shlex
-import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import httpx
-import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from tyro.conf import FlagCreatePairsOff, arg
 
 from shared.wire import Mode
-from simulator.client import EdgeClient, EdgeError, edge_url
+from simulator.client import EdgeClient
+from simulator.commandline import (
+    INTERRUPTED,
+    check_between,
+    check_deadline,
+    check_seed,
+    check_wait,
+    checked_edge,
+    command_main,
+)
 from simulator.record import (
     DECISIONS,
     REPORT,
@@ -51,7 +56,6 @@ DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
 # A poll that nobody answers must not outlast the pause that it is part of by much.
 SCOUT_TIMEOUT_S = 2.0
-INTERRUPTED = 130
 
 
 @dataclass(frozen=True)
@@ -117,12 +121,8 @@ class Simulate:
 
 def main(argv: list[str]) -> int:
     """Fly the mission that the command line describes; returns the exit code."""
-    try:
-        options = tyro.cli(Simulate, prog="aicvds simulate", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
     command = shlex.join(["aicvds", "simulate", *argv])
-    return reporting("aicvds simulate", lambda console: simulate(options, command, console))
+    return command_main(Simulate, "aicvds simulate", argv, lambda options, console: simulate(options, command, console))
 
 
 def simulate(options: Simulate, command: str, console: Console) -> int:
@@ -158,31 +158,16 @@ def check(options: Simulate) -> None:
     """Raises ``BadUse`` for the first option that is out of its bounds."""
     from simulator.policies import POLICY_NAMES
 
-    check_bounds(options.seed, options.wait_s)
+    check_seed(options.seed)
+    check_wait(options.wait_s)
     if options.policy not in ("edge", *POLICY_NAMES):
         raise BadUse(f"--policy {options.policy}: choose one of edge, {', '.join(POLICY_NAMES)}")
-    if options.deadline_ms is not None and not 10 <= options.deadline_ms <= 60_000:
-        raise BadUse(f"--deadline-ms {options.deadline_ms} is not between 10 and 60000")
-    if not 0 <= options.reconnect_s <= 3600:
-        raise BadUse(f"--reconnect-s {options.reconnect_s:g} is not between 0 and 3600")
-    if options.policy != "edge":
-        if options.edge is not None:
-            raise BadUse(f"--policy {options.policy} asks no edge, so --edge contradicts it; give one of the two")
-        return
-    if options.edge is None:
-        raise BadUse("--edge is missing: give the edge's address, such as --edge http://127.0.0.1:8000")
-    try:
-        edge_url(options.edge)
-    except ValueError as error:
-        raise BadUse(f"--edge: {error}") from None
-
-
-def check_bounds(seed: int, wait_s: float) -> None:
-    """Raises ``BadUse`` for a seed or a wait out of bounds."""
-    if not 0 <= seed < 2**32:
-        raise BadUse(f"--seed {seed} is not between 0 and {2**32 - 1}")
-    if not 0 <= wait_s <= 86_400:
-        raise BadUse(f"--wait-s {wait_s:g} is not between 0 and 86400")
+    check_deadline(options.deadline_ms)
+    check_between("--reconnect-s", options.reconnect_s, 0, 3600)
+    if options.policy == "edge":
+        checked_edge(options.edge)
+    elif options.edge is not None:
+        raise BadUse(f"--policy {options.policy} asks no edge, so --edge contradicts it; give one of the two")
 
 
 @dataclass(frozen=True)
@@ -366,36 +351,3 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
     for name in (SUMMARY, DECISIONS, REPORT, *((REQUESTS,) if job.edge else ())):
         console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)
     return INTERRUPTED if flight.interrupted else 0
-
-
-def reporting(prog: str, run: Callable[[Console], int]) -> int:
-    """Run a command with its errors as one line on stderr and an exit code; SIGTERM ends it as Ctrl-C does."""
-    try:
-        with sigterm_interrupts():
-            return run(Console())
-    except BadUse as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return 2
-    except EdgeError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f"{prog}: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
-        return INTERRUPTED
-
-
-@contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """Within, SIGTERM raises KeyboardInterrupt, so that `docker stop` leaves a result as Ctrl-C does."""
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

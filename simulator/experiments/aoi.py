@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, every_scheme
+from simulator.experiments.plan import Drawing, Experiment
+from simulator.experiments.schemes import every_scheme
 
 _AGES = ("aoi_mean", "aoi_peak", "aoi_worst")
-
-
-def _schemes(setup: Setup) -> list[Scheme]:
-    return every_scheme()
 
 
 EXPERIMENT = Experiment(
     name="aoi",
     title="Age of information",
     summary="mean and peak age of information a sensor, with the nearest-neighbour baseline",
-    schemes=_schemes,
+    schemes=lambda setup: every_scheme(),
     measures=(*_AGES, "lost_packets", "events"),
     drawings=(
         Drawing("aoi", "curves", ("aoi_per_step",), "Age of information, mean over the sensors."),

@@ -8,18 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
-from simulator.client import edge_url
+from simulator.commandline import check_between, checked_edge, command_main
 from simulator.experiments.catalogue import ALL, EXPERIMENTS
 from simulator.experiments.edges import Llm
 from simulator.experiments.plan import QUICK_LLM_SEEDS, QUICK_SEEDS, Experiment, Setup
 from simulator.experiments.result import Result
 from simulator.record import BadUse
-from simulator.simulate import reporting
 from simulator.site import chosen_site
 
 SEEDS, LLM_SEEDS = 30, 10
@@ -81,11 +79,7 @@ def main(argv: list[str]) -> int:
         from simulator.experiments import page
 
         return page.main(argv[1:])
-    try:
-        options = tyro.cli(Options, prog="aicvds experiment", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
-    return reporting("aicvds experiment", lambda console: experiment(options, argv, console))
+    return command_main(Options, "aicvds experiment", argv, lambda options, console: experiment(options, argv, console))
 
 
 def experiment(options: Options, argv: list[str], console: Console) -> int:
@@ -114,13 +108,9 @@ def setup_of(options: Options) -> Setup:
     """The setup that the options say; raises ``BadUse`` for the first that is out of its bounds."""
     seeds = options.seeds if options.seeds is not None else QUICK_SEEDS if options.quick else SEEDS
     llm_seeds = options.llm_seeds if options.llm_seeds is not None else QUICK_LLM_SEEDS if options.quick else LLM_SEEDS
-    for name, value, most in (
-        ("seeds", seeds, 10_000),
-        ("llm-seeds", llm_seeds, 10_000),
-        ("workers", options.workers, 64),
-    ):
-        if not 1 <= value <= most:
-            raise BadUse(f"--{name} {value} is not between 1 and {most}")
+    check_between("--seeds", seeds, 1, 10_000)
+    check_between("--llm-seeds", llm_seeds, 1, 10_000)
+    check_between("--workers", options.workers, 1, 64)
     for model in options.model:
         if not model.is_file():
             raise BadUse(f"--model {model}: there is no such file")
@@ -131,9 +121,8 @@ def setup_of(options: Options) -> Setup:
     if options.scenario is None:
         sites |= {name: chosen_site(name, None, options.steps) for name in _ELSEWHERE if name not in sites}
     pace: Literal["full", "quick"] = "quick" if options.quick else "full"
-    return Setup(
-        sites, Llm(options.llm, _edge(options.edge)), options.model, seeds, min(llm_seeds, seeds), options.steps, pace
-    )
+    edge = None if options.edge is None else checked_edge(options.edge)
+    return Setup(sites, Llm(options.llm, edge), options.model, seeds, min(llm_seeds, seeds), options.steps, pace)
 
 
 def show(result: Result, console: Console) -> None:
@@ -168,12 +157,3 @@ def _commands(name: str, argv: list[str]) -> Callable[[Experiment], str]:
     rest = list(argv)
     rest.remove(name)
     return lambda experiment: shlex.join(["aicvds", "experiment", experiment.name, *rest])
-
-
-def _edge(url: str | None) -> str | None:
-    if url is None:
-        return None
-    try:
-        return edge_url(url)
-    except ValueError as error:
-        raise BadUse(f"--edge: {error}") from None

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, every_scheme
-
-
-def _schemes(setup: Setup) -> list[Scheme]:
-    return every_scheme()
-
+from simulator.experiments.plan import Drawing, Experiment
+from simulator.experiments.schemes import every_scheme
 
 EXPERIMENT = Experiment(
     name="fairness",
     title="Fairness between sensors",
     summary="Jain's index of served visits for every scheme, random included",
-    schemes=_schemes,
+    schemes=lambda setup: every_scheme(),
     measures=("jain", "jain_scheduled", "lost_packets", "events"),
     drawings=(
         Drawing("fairness", "bars", ("jain", "jain_scheduled"), "Jain's index of the sensors' visits."),

@@ -95,9 +95,7 @@ def _bound(planned: Planned, seconds: float) -> Flown:
         found = clairvoyant(planned.site, planned.seed, seconds)
     except ImportError as error:
         raise CannotFly(f"{error}; install the extra: pip install 'aic-vds[planner]'") from error
-    kept = BoundFound(
-        lower_bound=found.lower_bound, lost_packets=found.lost_packets, optimal=found.optimal, gap=found.gap
-    )
+    kept = BoundFound.model_validate(found, from_attributes=True)
     flight = Flight(planned.site.scenario, planned.seed, duration_s=found.seconds)
     return _kept(planned, flight, model=None).model_copy(update={"bound": kept})
 

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from pydantic import ValidationError
 from rich.console import Console
 from tyro.conf import arg
 
 from shared.scenario import Scenario
+from simulator.commandline import command_main
 from simulator.experiments import claims, jain
 from simulator.experiments.catalogue import EXPERIMENTS
-from simulator.experiments.evidence import ZERO, seeds_flown
-from simulator.experiments.plots import BOUND_LABEL, draw, label_of, measured
-from simulator.experiments.result import Figure, Interval, Paired, Result
+from simulator.experiments.evidence import ZERO
+from simulator.experiments.plots import draw, label_of, measured
+from simulator.experiments.result import Figure, Interval, Result
+from simulator.experiments.tables import cell, measure_tables, pair_tables, row_label
 from simulator.record import BadUse, naming_out
-from simulator.simulate import reporting
 
 RESULT = "results.json"
 FIGURES = "figures"
-COLUMNS = 6
-NONE, FEW = "–", " †"
 
 
 @dataclass(frozen=True)
@@ -49,11 +46,7 @@ class Options:
 
 def main(argv: list[str]) -> int:
     """Write the page that the command line asks for; returns the exit code."""
-    try:
-        options = tyro.cli(Options, prog="aicvds experiment page", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
-    return reporting("aicvds experiment page", lambda console: _page(options, console))
+    return command_main(Options, "aicvds experiment page", argv, _page)
 
 
 def _page(options: Options, console: Console) -> int:
@@ -125,9 +118,8 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
             name: [(figure, Path(os.path.relpath(path, folder)).as_posix()) for figure, path in pictures]
             for name, pictures in drawn.items()
         },
-        tables=_tables,
-        pairs=_pairs,
-        label_of=label_of,
+        measure_tables=measure_tables,
+        pair_tables=pair_tables,
         fairness=Fairness.of(results.get("fairness")),
         claims=claims,
         zero=ZERO,
@@ -171,7 +163,7 @@ class Fairness:
         visits = paper.uavs * paper.steps
         by_name = {
             name: Evenness(
-                _row_label(result, name),
+                row_label(result, name),
                 served,
                 measured(result, name, "jain_scheduled"),
                 measured(result, name, "lost_packets"),
@@ -249,56 +241,9 @@ def _learned(result: Result | None) -> tuple[Interval, Interval] | None:
     return (found[0], found[1]) if found[0] and found[1] else None
 
 
-def _tables(result: Result) -> Iterable[tuple[list[str], list[tuple[str, list[str]]]]]:
-    """Columns of measures, a few a table, and a row a scheme: its label, marked where its seeds are few, and cells."""
-    measures = iter(dict.fromkeys(m for found in result.schemes.values() for m in found))
-    while some := list(islice(measures, COLUMNS)):
-        rows = {_row_label(result, name): [measured(result, name, m) for m in some] for name in result.schemes}
-        if result.bound.keys() & set(some):
-            rows[BOUND_LABEL] = [result.bound.get(m) for m in some]
-        # A measure of at most 1 is a share or an index.
-        digits = [
-            3 if 0 < max((found.mean for found in column if found), default=0.0) <= 1 else 1
-            for column in zip(*rows.values(), strict=True)
-        ]
-        told_rows = [(label, list(map(cell, cells, digits))) for label, cells in rows.items()]
-        yield [label_of(result, m) for m in some], told_rows
-
-
-def _row_label(result: Result, name: str) -> str:
-    return label_of(result, name) + (FEW if seeds_flown(result, name) < claims.CLAIM_SEEDS else "")
-
-
-def _pairs(result: Result) -> list[tuple[str, str, str, str, str]]:
-    """Of each pair: the scheme, the other, the measure, and their difference and ratio."""
-    both: dict[tuple[str, str, str], dict[str, str]] = {}
-    for found in result.paired:
-        at = both.setdefault((found.scheme, found.reference, found.measure), {})
-        at[found.kind] = cell(found, 2 if found.kind == "ratio" or abs(found.mean) <= 1 else 1)
-    return [
-        (
-            label_of(result, a),
-            BOUND_LABEL if b == "bound" else label_of(result, b),
-            label_of(result, measure),
-            told.get("difference", NONE),
-            told.get("ratio", NONE),
-        )
-        for (a, b, measure), told in both.items()
-    ]
-
-
 def told(value: float) -> str:
     """A number in a sentence: whole when it is large."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:,.1f}"
-
-
-def cell(found: Interval | Paired | None, digits: int = 1) -> str:
-    """A mean with its interval, to so many decimals and whole when it is large; a dash where there is none."""
-    if found is None:
-        return NONE
-    decimals = 0 if abs(found.mean) >= 100 else digits
-    mean, low, high = (f"{number:,.{decimals}f}" for number in (found.mean, found.low, found.high))
-    return mean if found.low == found.high else f"{mean} [{low}, {high}]"
 
 
 def told_seeds(seeds: Sequence[int]) -> str:

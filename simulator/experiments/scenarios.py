@@ -4,9 +4,18 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, at_full_speed, edge_policy, llm, locals_there_are, value, value_reach
+from simulator.experiments.schemes import (
+    PLANNER,
+    Scheme,
+    at_full_speed,
+    edge_policy,
+    llm,
+    locals_there_are,
+    value,
+    value_reach,
+)
 
-_POLICIES = ("madqn", "mappo", "eof", "wqcs", "max_gain", "nearest", "random")
+_POLICIES = ("madqn", "mappo", PLANNER, "eof", "wqcs", "max_gain", "nearest", "random")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:

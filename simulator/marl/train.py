@@ -9,15 +9,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from shared.scenario import Scenario
+from simulator.commandline import INTERRUPTED, check_between, check_seed, command_main
 from simulator.marl.plan import MOST_EPISODES, STATE, Plan
 from simulator.record import BadUse, naming_out
-from simulator.simulate import INTERRUPTED, reporting
 from simulator.site import chosen_scenario
 
 # Torch and TorchRL take seconds to import; `--help` and bad use answer without them.
@@ -70,13 +69,9 @@ class Train:
 
 def main(argv: list[str]) -> int:
     """Train what the command line describes; returns the exit code."""
-    try:
-        options = tyro.cli(Train, prog="aicvds train", args=argv)
-    except SystemExit as done:
-        return done.code if isinstance(done.code, int) else 2
     # Whether it was resumed does not change what it makes.
     command = shlex.join(["aicvds", "train", *(word for word in argv if word != "--resume")])
-    return reporting("aicvds train", lambda console: train(options, command, console))
+    return command_main(Train, "aicvds train", argv, lambda options, console: train(options, command, console))
 
 
 def train(options: Train, command: str, console: Console) -> int:
@@ -112,14 +107,11 @@ def train(options: Train, command: str, console: Console) -> int:
 
 def check(options: Train) -> None:
     """Raises ``BadUse`` for the first option that is out of its bounds."""
-    if options.episodes is not None and not 1 <= options.episodes <= MOST_EPISODES:
-        raise BadUse(f"--episodes {options.episodes} is not between 1 and {MOST_EPISODES}")
-    if not 0 <= options.seed < 2**32:
-        raise BadUse(f"--seed {options.seed} is not between 0 and {2**32 - 1}")
-    if not 1 <= options.threads <= 64:
-        raise BadUse(f"--threads {options.threads} is not between 1 and 64")
-    if not 0 <= options.save_s <= 3600:
-        raise BadUse(f"--save-s {options.save_s:g} is not between 0 and 3600")
+    if options.episodes is not None:
+        check_between("--episodes", options.episodes, 1, MOST_EPISODES)
+    check_seed(options.seed)
+    check_between("--threads", options.threads, 1, 64)
+    check_between("--save-s", options.save_s, 0, 3600)
 
 
 def _planned(options: Train, scenario: Scenario) -> tuple[Callable[[Scenario, int, int], Learner], Plan]:

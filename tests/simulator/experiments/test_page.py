@@ -9,7 +9,6 @@ import pytest
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.page import (
     Swap,
-    cell,
     late_and_whole,
     main,
     packets_and_events,
@@ -19,6 +18,7 @@ from simulator.experiments.page import (
     write_page,
 )
 from simulator.experiments.result import Paired, Result
+from simulator.experiments.tables import cell
 from simulator.record import BadUse
 from tests.simulator.experiments.made_results import CURVES, figure, interval, result, zero_from
 

@@ -1,0 +1,149 @@
+"""The results page's tables: a result's measures and its paired comparisons, none too wide to read.
+
+What was measured in one scenario has a row a scheme and a column a measure. What was measured in several is told one
+measure a table, with a column a scenario.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+from simulator.experiments.claims import CLAIM_SEEDS
+from simulator.experiments.evidence import seeds_flown
+from simulator.experiments.plots import BOUND_LABEL, label_of, measured
+from simulator.experiments.result import Interval, Paired, Result
+
+COLUMNS = 6
+NONE, FEW = "–", " †"
+
+Found = Interval | Paired | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table to print: a row has a cell a column; ``caption`` is empty where the columns say all.
+
+    Without rows the caption says all.
+    """
+
+    caption: str
+    columns: list[str]
+    rows: list[list[str]]
+
+
+def measure_tables(result: Result) -> list[Table]:
+    """What every scheme scored; its label is marked where its seeds are few."""
+    measures = list(dict.fromkeys(m for found in result.schemes.values() for m in found))
+    if any(_site_of(measure) for measure in measures):
+        return _by_site(result, measures)
+    left, tables = iter(measures), []
+    while some := list(islice(left, COLUMNS)):
+        rows = {row_label(result, name): [measured(result, name, m) for m in some] for name in result.schemes}
+        if result.bound.keys() & set(some):
+            rows[BOUND_LABEL] = [result.bound.get(m) for m in some]
+        digits = [_digits(column) for column in zip(*rows.values(), strict=True)]
+        told = [[label, *map(cell, cells, digits)] for label, cells in rows.items()]
+        tables.append(Table("", ["scheme", *(label_of(result, m) for m in some)], told))
+    return tables
+
+
+def _by_site(result: Result, measures: Sequence[str]) -> list[Table]:
+    tables = []
+    for name, sites in _sites_of(measures).items():
+        rows = {
+            row_label(result, scheme): [measured(result, scheme, f"{name}@{site}") for site in sites]
+            for scheme in result.schemes
+        }
+        digits = _digits([found for cells in rows.values() for found in cells])
+        told = {label: [cell(found, digits) for found in cells] for label, cells in rows.items()}
+        caption = _sited_label(result, name, sites[0])
+        values = {text for cells in told.values() for text in cells} - {NONE}
+        if len(values) == 1:
+            tables.append(Table(f"{caption}: {values.pop()} for every scheme in every scenario", [], []))
+        else:
+            tables.append(Table(caption, ["scheme", *sites], [[label, *cells] for label, cells in told.items()]))
+    return tables
+
+
+def pair_tables(result: Result) -> list[Table]:
+    """Differences and ratios of schemes on the same worlds."""
+    both: dict[tuple[str, str, str], dict[str, Paired]] = {}
+    for found in result.paired:
+        both.setdefault((found.scheme, found.reference, found.measure), {})[found.kind] = found
+    if any(_site_of(measure) for _, _, measure in both):
+        return _pairs_by_site(result, both)
+    rows = [
+        [
+            label_of(result, scheme),
+            _reference_label(result, reference),
+            label_of(result, measure),
+            *(_pair_cell(told.get(kind)) for kind in ("difference", "ratio")),
+        ]
+        for (scheme, reference, measure), told in both.items()
+    ]
+    return [Table("", ["scheme", "against", "measure", "difference", "ratio"], rows)] if rows else []
+
+
+def _pairs_by_site(result: Result, both: Mapping[tuple[str, str, str], Mapping[str, Paired]]) -> list[Table]:
+    tables = []
+    for reference in dict.fromkeys(reference for _, reference, _ in both):
+        compared = [(scheme, measure) for scheme, other, measure in both if other == reference]
+        for name, sites in _sites_of([measure for _, measure in compared]).items():
+            for kind in ("difference", "ratio"):
+                rows = [
+                    [
+                        label_of(result, scheme),
+                        *(_pair_cell(both.get((scheme, reference, f"{name}@{site}"), {}).get(kind)) for site in sites),
+                    ]
+                    for scheme in dict.fromkeys(scheme for scheme, _ in compared)
+                ]
+                caption = f"{_sited_label(result, name, sites[0])}: {kind} to {_reference_label(result, reference)}"
+                tables.append(Table(caption, ["scheme", *sites], rows))
+    return tables
+
+
+def _site_of(measure: str) -> str:
+    """The site that a measure's name has, such as ``stress`` of ``events@stress``; empty where there was only one."""
+    return measure.partition("@")[2]
+
+
+def _sites_of(measures: Sequence[str]) -> dict[str, list[str]]:
+    """The sites of each measure, both in the order given."""
+    sites: dict[str, list[str]] = {}
+    for measure in dict.fromkeys(measures):
+        name, _, site = measure.partition("@")
+        sites.setdefault(name, []).append(site)
+    return sites
+
+
+def _sited_label(result: Result, name: str, site: str) -> str:
+    return label_of(result, f"{name}@{site}").removesuffix(f", {site}")
+
+
+def _reference_label(result: Result, name: str) -> str:
+    return BOUND_LABEL if name == "bound" else label_of(result, name)
+
+
+def row_label(result: Result, name: str) -> str:
+    """How people call a scheme, marked where its seeds are too few for a claim."""
+    return label_of(result, name) + (FEW if seeds_flown(result, name) < CLAIM_SEEDS else "")
+
+
+def _digits(found: Sequence[Found]) -> int:
+    # A measure of at most 1 is a share or an index.
+    return 3 if 0 < max((interval.mean for interval in found if interval), default=0.0) <= 1 else 1
+
+
+def _pair_cell(found: Paired | None) -> str:
+    return cell(found, 2 if found and (found.kind == "ratio" or abs(found.mean) <= 1) else 1)
+
+
+def cell(found: Found, digits: int = 1) -> str:
+    """A mean with its interval, to so many decimals and whole when it is large; a dash where there is none."""
+    if found is None:
+        return NONE
+    decimals = 0 if abs(found.mean) >= 100 else digits
+    mean, low, high = (f"{number:,.{decimals}f}" for number in (found.mean, found.low, found.high))
+    return mean if found.low == found.high else f"{mean} [{low}, {high}]"
