@@ -1,25 +1,28 @@
-"""What the modules see: the paper's five features, or also what the trajectory brings in reach."""
+"""What is decided from: the paper's features or also what comes in reach, each UAV's reports or the fleet's belief."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, llm, over_edge, value, value_reach
+from simulator.experiments.schemes import OFF, Scheme, llm, over_edge, value, value_as_written
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
     return [
-        value(),
-        value_reach(),
+        value_as_written(),
+        over_edge("value_fleet", "mode value, fleet's belief", mode="value", features="paper", backing=OFF),
+        over_edge("value_ahead", "mode value, reach", mode="value", belief="reported", backing=OFF),
+        value().model_copy(update={"label": "mode value, reach and fleet's belief"}),
         llm(),
         over_edge("llm_reach", "mode llm, features reach", features="reach"),
+        over_edge("llm_fleet", "mode llm, reach and fleet's belief", features="reach", belief="fleet"),
     ]
 
 
 EXPERIMENT = Experiment(
     name="ablation-features",
     title="What the modules see",
-    summary="the paper's features, and those of an edge that knows the trajectory (reach)",
+    summary="the paper's features, those of an edge that knows the trajectory (reach), and the fleet's belief",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "velocity", "llm_decided_pct"),
     drawings=(
@@ -28,6 +31,12 @@ EXPERIMENT = Experiment(
             "ablation_features_totals", "bars", LOSSES, "Losses of a mission by the features that the modules see."
         ),
     ),
-    pairs=(("value_reach", "value"), ("llm_reach", "llm")),
-    notes=("Both from the checkpoint that ships for these features.",),
+    pairs=(
+        ("value_fleet", "value"),
+        ("value_ahead", "value"),
+        ("value_reach", "value_ahead"),
+        ("llm_reach", "llm"),
+        ("llm_fleet", "llm_reach"),
+    ),
+    notes=("All from the checkpoint that ships for these features.",),
 )

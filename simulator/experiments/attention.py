@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import OFF, Scheme, llm, over_edge, value
+from simulator.experiments.schemes import Scheme, llm, over_edge, value_as_written
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
@@ -12,8 +12,8 @@ def _schemes(setup: Setup) -> list[Scheme]:
         llm(),
         over_edge("llm_random_start", "mode llm, k = 5, random start", init="random"),
         over_edge("llm_all", "mode llm, no attention", attention="off"),
-        value(),
-        over_edge("value_random_start", "mode value, random start", mode="value", init="random", backing=OFF),
+        value_as_written(),
+        value_as_written("value_random_start", "mode value, paper's view, random start", init="random"),
     ]
 
 

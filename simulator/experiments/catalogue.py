@@ -8,6 +8,7 @@ from simulator.experiments import (
     aoi,
     attention,
     fairness,
+    guided,
     latency,
     llm_models,
     scenarios,
@@ -21,6 +22,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     module.EXPERIMENT.name: module.EXPERIMENT
     for module in (
         scheduler,
+        guided,
         attention,
         top_k,
         tokens,

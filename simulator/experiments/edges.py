@@ -16,8 +16,8 @@ from rich.console import Console
 from shared.scenario import Scenario
 from simulator.client import EdgeClient, EdgeError
 from simulator.demo import HOST, check_alive, edge_process, usable_port
-from simulator.experiments.chance import answering_at_random
-from simulator.experiments.schemes import ASKED, CHANCE, OFF, Backing
+from simulator.experiments.schemes import ASKED, CHANCE, OFF, WORST, Backing
+from simulator.experiments.stand_ins import answering, drawn, worst
 from simulator.simulate import API_KEY
 from simulator.uplink import LossyTransport
 
@@ -50,7 +50,7 @@ class Llm:
 
     def identity(self, backing: Backing) -> str:
         """What a flight's key says of the LLM: two of one identity answer alike."""
-        if backing in (OFF, CHANCE):
+        if backing in (OFF, CHANCE, WORST):
             return backing
         if backing == ASKED:
             if self.edge is not None:
@@ -101,8 +101,8 @@ def environment_for(backing: Backing, llm: Llm) -> Iterator[Mapping[str, str]]:
     kept |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning"}
     if backing == OFF:
         yield kept | {"AICVDS_MODE": "value"}
-    elif backing == CHANCE:
-        with answering_at_random() as url:
+    elif backing in (CHANCE, WORST):
+        with answering(drawn if backing == CHANCE else worst) as url:
             yield kept | {"AICVDS_LLM_URL": url}
     elif backing != ASKED:
         yield kept | {"AICVDS_LLM_GGUF": str(Path(backing).resolve())}

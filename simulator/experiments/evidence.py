@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from simulator.experiments import intervals
-from simulator.experiments.chance import MODEL as RANDOM_MODEL
 from simulator.experiments.plots import measured
 from simulator.experiments.result import Interval, Paired, Result
+from simulator.experiments.stand_ins import NAMES
 
 # In the mean over missions, a step.
 ZERO = 0.05
@@ -80,5 +80,5 @@ def beats_chance(result: Result, runs: Runs) -> bool | None:
 
 
 def _same_model(a: Result, b: Result) -> bool:
-    models = [set((result.model or "").split(", ")) - {"", RANDOM_MODEL} for result in (a, b)]
+    models = [set((result.model or "").split(", ")) - {"", *NAMES.values()} for result in (a, b)]
     return bool(models[0] & models[1])

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import CHANCE, Scheme, edge_policy, llm, local, over_edge, value
+from simulator.experiments.schemes import CHANCE, Scheme, edge_policy, guided, llm, local, over_edge, value
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
     given = [over_edge(f"llm_{path.stem}", path.stem, backing=str(path)) for path in setup.models]
     asked = llm().model_copy(update={"label": "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"})
     chance = over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE)
-    return [*given, asked, chance, value(), edge_policy(), local("eof"), local("random")]
+    return [*given, asked, chance, guided(), value(), edge_policy(), local("eof"), local("random")]
 
 
 EXPERIMENT = Experiment(

@@ -8,18 +8,21 @@ from simulator.experiments.schemes import (
     PLANNER,
     Scheme,
     at_full_speed,
+    edge_planner,
     edge_policy,
+    guided,
     llm,
     locals_there_are,
     value,
-    value_reach,
+    value_as_written,
 )
 
 _POLICIES = ("madqn", "mappo", PLANNER, "eof", "wqcs", "max_gain", "nearest", "random")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    return [llm(), value(), value_reach(), edge_policy(), *locals_there_are(*_POLICIES), at_full_speed("eof")]
+    ours = [llm(), guided(), value_as_written(), value(), edge_policy(), edge_planner()]
+    return [*ours, *locals_there_are(*_POLICIES), at_full_speed("eof")]
 
 
 EXPERIMENT = Experiment(

@@ -12,9 +12,10 @@ from simulator.record import Record
 # Decisions through an edge are compared for what they are, not for how fast this machine is.
 GENEROUS_DEADLINE_MS = 30_000
 
-# What answers behind an edge: nothing, what --llm names, uniform draws, or a model file by its path.
+# What answers behind an edge: nothing, what --llm names, uniform draws, the worst of what is offered, or a model file
+# by its path.
 Backing = str
-OFF, ASKED, CHANCE = "off", "asked", "chance"
+OFF, ASKED, CHANCE, WORST = "off", "asked", "chance", "worst"
 
 
 class Local(Record):
@@ -29,7 +30,8 @@ class OverEdge(Record):
     """An edge asked over HTTP. ``spec`` is the mission to make, its scenario and seed aside.
 
     ``backing`` is ``off`` (an edge without LLM), ``asked`` (what ``--llm`` names), ``chance`` (an LLM that answers
-    uniform draws) or a GGUF file's path. ``deadline_ms`` of ``None`` is the edge's own.
+    uniform draws), ``worst`` (the emptiest queue, as fast as can be) or a GGUF file's path. ``deadline_ms`` of ``None``
+    is the edge's own.
     """
 
     kind: Literal["edge"] = "edge"
@@ -60,7 +62,7 @@ class Scheme(Record):
     @property
     def asks_llm(self) -> bool:
         """Whether a flight takes an LLM's time."""
-        return self.is_answered and not (isinstance(self.decides, OverEdge) and self.decides.backing == CHANCE)
+        return self.is_answered and not (isinstance(self.decides, OverEdge) and self.decides.backing in (CHANCE, WORST))
 
 
 PLANNER = "mpc"
@@ -121,22 +123,32 @@ def llm() -> Scheme:
     return over_edge("llm", "AIC-VDS, mode llm")
 
 
+def guided(name: str = "guided", label: str = "AIC-VDS, mode guided", **spec: Any) -> Scheme:
+    """The LLM as one adviser among others."""
+    return over_edge(name, label, mode="guided", **spec)
+
+
+def value_as_written(name: str = "value", label: str = "AIC-VDS, mode value, paper's view", **spec: Any) -> Scheme:
+    """What the edge's modules have learned decides, from the paper's features and each UAV's own reports; no LLM."""
+    return over_edge(name, label, mode="value", features="paper", belief="reported", backing=OFF, **spec)
+
+
 def value() -> Scheme:
-    """What the edge's modules have learned decides; no LLM."""
-    return over_edge("value", "AIC-VDS, mode value", mode="value", backing=OFF)
+    """The same with features that look along the trajectory, from the fleet's belief."""
+    return over_edge("value_reach", "AIC-VDS, mode value", mode="value", backing=OFF)
 
 
-def value_reach() -> Scheme:
-    """The same with features that look along the trajectory."""
-    return over_edge("value_reach", "AIC-VDS, mode value, reach", mode="value", features="reach", backing=OFF)
+def edge_planner() -> Scheme:
+    """What the edge answers while its LLM is down."""
+    return over_edge("edge_planner", "edge's planner (LLM down)", mode="policy", backing=OFF)
 
 
 def edge_policy() -> Scheme:
-    """What the edge answers while its LLM is down."""
-    return over_edge("edge_policy", "edge's policy (LLM down)", backing=OFF)
+    """The same where the planner is not installed, from each UAV's own reports."""
+    return over_edge("edge_policy", "edge's look-ahead (no planner)", planner="off", backing=OFF)
 
 
 def every_scheme() -> list[Scheme]:
     """All that can fly, in the order to show them."""
-    ours = [llm(), value(), value_reach(), edge_policy()]
+    ours = [llm(), guided(), value_as_written(), value(), edge_policy(), edge_planner()]
     return [*ours, *locals_there_are(), at_full_speed("eof"), at_full_speed("wqcs")]

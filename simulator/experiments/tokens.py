@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import Scheme, edge_policy, llm, over_edge, value
+from simulator.experiments.schemes import Scheme, edge_policy, guided, llm, over_edge, value
 
 _STATE = ("state_tokens", "state_uncompressed")
 _PROMPT = ("prompt_tokens", "prompt_uncompressed")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    return [llm(), over_edge("llm_all", "mode llm, no attention", attention="off"), value(), edge_policy()]
+    return [llm(), over_edge("llm_all", "mode llm, no attention", attention="off"), guided(), value(), edge_policy()]
 
 
 EXPERIMENT = Experiment(

@@ -14,8 +14,8 @@ import httpx
 import pytest
 
 from simulator.experiments.catalogue import EXPERIMENTS
-from simulator.experiments.chance import answering_at_random
 from simulator.experiments.result import Result
+from simulator.experiments.stand_ins import answering, drawn
 from tests.e2e.processes import AICVDS, run, serving_edge
 
 
@@ -130,7 +130,7 @@ def test_an_edge_without_a_usable_llm_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:
-    with answering_at_random() as llm, serving_edge(AICVDS_LLM_URL=llm) as (url, _):
+    with answering(drawn) as llm, serving_edge(AICVDS_LLM_URL=llm) as (url, _):
         ended = run("experiment", "top-k", "--edge", url, "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
         assert "aicvds_decisions_total" in httpx.get(f"{url}/metrics").text
     assert ended.returncode == 0, ended.stderr
