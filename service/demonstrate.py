@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated
@@ -26,21 +27,40 @@ from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, UavState
 
-# Given a state, the UAV, the scenario and the sensors that are taken: a sensor and a velocity.
-Teacher = Callable[[State, int, Scenario, Collection[int]], tuple[int, int]]
+# Given a recorded decision, the state as the edge saw it, the scenario and the sensors that are taken: a sensor and a
+# velocity, or None where it has no answer.
+Teacher = Callable[[RolloutStep, State, Scenario, Collection[int]], tuple[int, int] | None]
 
-_TEACHERS: dict[str, Teacher] = {"look_ahead": decide_without_llm}
+
+def _look_ahead(
+    step: RolloutStep, state: State, scenario: Scenario, reserved: Collection[int]
+) -> tuple[int, int] | None:
+    return decide_without_llm(state, step.request.uav_id, scenario, reserved)
+
+
+def _recorded(
+    name: str, step: RolloutStep, state: State, scenario: Scenario, reserved: Collection[int]
+) -> tuple[int, int] | None:
+    reference = step.reference
+    return (reference.sensor_id, reference.velocity) if reference and reference.teacher == name else None
+
+
+TEACHERS: dict[str, Teacher] = {
+    "planner": partial(_recorded, "planner"),
+    "clairvoyant": partial(_recorded, "clairvoyant"),
+    "look_ahead": _look_ahead,
+}
 
 
 @dataclass(frozen=True)
 class Demonstrate:
     """Choose the worked examples that a prompt may show (prompt.demonstrations), and write them as JSON.
 
-    Record first:  aicvds explore --missions 60 --out runs/rollouts.jsonl.gz
+    Record first:  aicvds explore --workers 2 --out runs/rollouts.jsonl.gz
 
     Then:  aicvds demonstrate runs/rollouts.jsonl.gz --out service/checkpoints/demonstrations.json
 
-    Every recorded decision with a choice of sensors and something in reach is solved by the teacher. The one in the
+    Every recorded decision with a choice of sensors and something in reach is answered by the teacher. The one in the
     middle of all states comes first, then each time the one farthest from those chosen: so the first few differ most.
     """
 
@@ -50,25 +70,29 @@ class Demonstrate:
     """JSON file to write. The package's own is service/checkpoints/demonstrations.json."""
     count: Annotated[int, arg(metavar="N")] = 40
     """Decisions to choose. A mission shows 20 at most, and leaves out those whose answer it could not give."""
-    teacher: Annotated[str, arg(metavar="NAME")] = "look_ahead"
-    """Who solves them: look_ahead, the edge's policy without an LLM."""
+    teacher: Annotated[str, arg(metavar="NAME")] = "planner"
+    """Whose answers they show: planner or clairvoyant, as `aicvds explore` recorded them, or look_ahead, one step of
+    look-ahead. A clairvoyant acts on arrivals that nobody who reads the prompt can know."""
 
 
 def main(argv: list[str]) -> int:
     """Choose and write; returns the exit code."""
     args = tyro.cli(Demonstrate, prog="aicvds demonstrate", args=argv)
     try:
-        if args.teacher not in _TEACHERS:
-            raise ValueError(f"--teacher {args.teacher}: choose one of {', '.join(_TEACHERS)}")
+        if args.teacher not in TEACHERS:
+            raise ValueError(f"--teacher {args.teacher}: choose one of {', '.join(TEACHERS)}")
         if args.count < 1:
             raise ValueError(f"--count {args.count} is not at least 1")
         header, steps = read_rollouts(args.rollouts)
         total = header.missions * header.scenario.steps * header.scenario.uavs
         told = track(steps, total=total, description="Solving", console=Console(stderr=True))
         demonstrations, states = [], []
-        for demonstration, state in solutions(header, told, _TEACHERS[args.teacher]):
+        for demonstration, state in solutions(header, told, TEACHERS[args.teacher]):
             demonstrations.append(demonstration)
             states.append(state)
+        if not states:
+            fix = "record with aicvds explore --teacher both"
+            raise ValueError(f"{args.rollouts} holds no decision of {args.teacher}: {fix}")
         if len(states) < args.count:
             raise ValueError(f"{args.rollouts} holds {len(states)} decisions with a choice; --count asks {args.count}")
         chosen = [demonstrations[i] for i in farthest_first(np.stack(states), args.count)]
@@ -87,20 +111,21 @@ def solutions(
 ) -> Iterator[tuple[Demonstration, FloatArray]]:
     """Each decision with a choice of sensors as the teacher solves it, and what it is like (:func:`likeness`).
 
-    Where the teacher collects nothing its sensor means nothing, and such a decision is left out. Visiting records,
-    arrival rates and reservations are those of the flight that was recorded.
+    Where the teacher has no answer, or collects nothing as far as the UAV knows, so that its sensor means nothing, the
+    decision is left out. Visiting records, arrival rates and reservations are those of the flight that was recorded.
     """
-    spec, settings = MissionSpec(scenario=header.scenario, features="reach", init="random"), Settings(mode="value")
+    settings = Settings(mode="value")
+    spec = MissionSpec(scenario=header.scenario, features="reach", belief="reported", planner="off", init="random")
     for mission_id, group in groupby(steps, key=lambda step: step.request.mission_id):
         mission = Mission(mission_id, spec, settings)
         for number, step in enumerate(group):
             uav, decision_id = step.request, f"{number:032x}"
-            mission.observe(uav)
+            mission.observe(uav, uav.step)
             view = View.of(mission, uav, uav.step)
             if view.state.admissible.sum() > 1:
                 reserved = mission.reserved(uav.step, uav.uav_id)
-                answer = teacher(view.state, uav.uav_id, mission.scenario, reserved)
-                if _collects(view.state, *answer):
+                answer = teacher(step, view.state, mission.scenario, reserved)
+                if answer is not None and _collects(view.state, *answer):
                     demonstration = _demonstration(mission, uav, uav.step, answer)
                     yield demonstration, likeness(view.state, *answer, mission.scenario)
             mission.commit(view.pending(mission, decision_id, step.sensor_id, step.velocity))

@@ -67,13 +67,17 @@ class Solved:
     velocity: int
 
 
-def solved(spec: MissionSpec, scenario: Scenario, modules: Modules, k: int | None) -> list[Solved]:
+def solved(spec: MissionSpec, features: Features, scenario: Scenario, modules: Modules, k: int | None) -> list[Solved]:
     """As many demonstrations as the mission wants, with the rows that it would have offered, in its order.
 
     One whose answer the mission could not give is left out: a sensor that its modules do not keep among the k, or a
     velocity past its limit. So there are fewer where k is small or the modules are random.
 
     Args:
+        spec: the mission's.
+        features: what its modules see.
+        scenario: its world.
+        modules: its own.
         k: rows of each that the modules keep; None keeps every admissible one, in the request's order.
     """
     found: list[Solved] = []
@@ -81,7 +85,7 @@ def solved(spec: MissionSpec, scenario: Scenario, modules: Modules, k: int | Non
         return found
     pool = packaged()
     for number, demonstration in enumerate(pool.demonstrations):
-        state = demonstration.state(pool.scenario, spec.features)
+        state = demonstration.state(pool.scenario, features)
         rows = np.flatnonzero(state.admissible)
         if k is not None:
             rows = rows[top_k(modules.score(state.features(pool.scenario))[0], k)]

@@ -3,66 +3,137 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from service.features import State
 from service.learner import Sample
 from service.mission import Mission
 from service.policy import decide_without_llm
+from service.reach import Reach, distances_ahead
 from service.settings import Settings
 from service.view import View
-from shared.rollouts import Header, RolloutStep
+from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
-from shared.wire import Features, MissionSpec, Outcome
+from shared.wire import Belief, Features, MissionSpec, Outcome
+
+Target = Literal["return", "immediate"]
+Speed = Literal["teacher", "look_ahead"]
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """A teacher's decision, as the modules would have seen it.
+
+    ``reaches`` is false where its sensor cannot send it a packet after the step: the sensor then means nothing.
+    ``best_velocity`` is that of one step of look-ahead for the sensor (see :attr:`Reach.best`).
+    """
+
+    teacher: str
+    sample: Sample
+    reaches: bool
+    best_velocity: int
+
+    def ranked(self, speed: Speed) -> Sample:
+        """The decision to be ranked first, with the teacher's velocity or the best by look-ahead."""
+        return self.sample if speed == "teacher" else replace(self.sample, velocity=self.best_velocity)
 
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A decision as the modules saw it, the return that followed (minus the discounted cost), and the teacher's.
+    """A decision as the modules saw it, the reward that followed (minus the cost), and the teacher's.
 
-    ``teacher`` is what the look-ahead policy would have decided from the same view; None where its sensor was masked.
+    ``taught`` is None where the teacher's sensor was masked. Where none was recorded, the look-ahead policy teaches.
     """
 
     sample: Sample
     reward: float
-    teacher: Sample | None
+    taught: Taught | None
+
+
+@dataclass(frozen=True)
+class Reward:
+    """What a decision is worth.
+
+    ``return``: minus :func:`fleet_cost`, its mean over ``horizon`` steps with weights ``discount^n``; a mean, so that
+    it has the scale of the online updates' r = -c. ``immediate``: that r, the UAV's own cost of one step.
+    """
+
+    target: Target = "return"
+    horizon: int = 8
+    discount: float = 0.9
+
+    def of(self, steps: Sequence[RolloutStep], scenario: Scenario) -> list[float | None]:
+        """One of each of a UAV's steps in order; None where the mission ends before the horizon does."""
+        if self.target == "immediate":
+            return [-step.cost for step in steps]
+        costs = np.array([fleet_cost(step, scenario) for step in steps])
+        weights = self.discount ** np.arange(self.horizon)
+        means = np.correlate(costs, weights / weights.sum(), "valid") if len(costs) >= self.horizon else np.empty(0)
+        return [*(-means).tolist(), *[None] * (len(costs) - len(means))]
 
 
 def replay(
-    header: Header, steps: Iterable[RolloutStep], horizon: int, discount: float, features: Features = "paper"
+    header: Header,
+    steps: Iterable[RolloutStep],
+    reward: Reward,
+    features: Features = "paper",
+    belief: Belief | None = None,
 ) -> Iterator[list[Example]]:
-    """Each mission's examples, by the same visiting records, arrival rates and features as online."""
+    """Each mission's examples, by the same visiting records, arrival rates and features as online.
+
+    Args:
+        belief: what the features are made from; by default what missions with these features decide from by default.
+    """
     settings = Settings(mode="value")
-    spec = MissionSpec(scenario=header.scenario, features=features, init="random")
+    known: Belief = belief or ("reported" if features == "paper" else "fleet")
+    spec = MissionSpec(scenario=header.scenario, features=features, belief=known, planner="off", init="random")
     for mission_id, group in groupby(steps, key=lambda step: step.request.mission_id):
         logged = list(group)
-        costs: dict[int, list[float]] = {}
+        by_uav: dict[int, list[RolloutStep]] = {}
         for step in logged:
-            costs.setdefault(step.request.uav_id, []).append(fleet_cost(step, header.scenario))
+            by_uav.setdefault(step.request.uav_id, []).append(step)
+        rewards = {uav: iter(reward.of(own, header.scenario)) for uav, own in by_uav.items()}
         mission = Mission(mission_id, spec, settings)
-        examples, turn = [], dict.fromkeys(costs, 0)
+        examples = []
         for number, step in enumerate(logged):
-            uav, decision_id = step.request.uav_id, f"{number:032x}"
-            mission.observe(step.request)
+            decision_id = f"{number:032x}"
+            mission.observe(step.request, step.request.step)
             view = View.of(mission, step.request, step.request.step)
             view.attend(mission)
-            reserved = mission.reserved(view.step, uav)
-            sensor, velocity = decide_without_llm(view.state, uav, mission.scenario, reserved)
-            teacher = view.pending(mission, decision_id, sensor, velocity).sample
+            taught = _taught(mission, view, step.reference)
             mission.commit(view.pending(mission, decision_id, step.sensor_id, step.velocity))
             sample = mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
-            ahead = costs[uav][turn[uav] : turn[uav] + horizon]
-            turn[uav] += 1
-            if sample is not None and len(ahead) == horizon:
-                weights = [discount**n for n in range(horizon)]
-                reward = -sum(w * c for w, c in zip(weights, ahead, strict=True)) / sum(weights)
-                examples.append(Example(sample, reward, teacher))
+            worth = next(rewards[step.request.uav_id])
+            if sample is not None and worth is not None:
+                examples.append(Example(sample, worth, taught))
         yield examples
+
+
+def _taught(mission: Mission, view: View, reference: Reference | None) -> Taught | None:
+    if reference is None:
+        reserved = mission.reserved(view.step, view.uav_id)
+        sensor_id, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
+        teacher = "look_ahead"
+    else:
+        sensor_id, velocity, teacher = reference.sensor_id, reference.velocity, reference.teacher
+    sample = view.pending(mission, "reference", sensor_id, velocity).sample
+    if sample is None:
+        return None
+    reach = _reach(view.state, view.uav_id, sensor_id, mission.scenario)
+    return Taught(teacher, sample, bool(reach.packets[velocity, 0] >= 1), best_velocity=int(reach.best[0]))
+
+
+def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
+    """Of that sensor alone, in any feature preset."""
+    row = np.flatnonzero(state.ids == sensor_id)[:1]
+    distance = distances_ahead(uav, state.position, state.progress_m, state.places[row], scenario)
+    return Reach.of(distance, state.queue[row], state.urgency[row], scenario)
 
 
 def fleet_cost(step: RolloutStep, scenario: Scenario) -> float:
@@ -99,7 +170,8 @@ class Batch:
     """B examples in one: ``features`` ``(B, n, d)`` of as many sensors as the widest has, padded with zeros.
 
     ``admissible`` ``(B, n)`` tells sensors from padding, ``reward`` ``(B,)``, ``taught`` ``(B,)`` whether there is a
-    teacher's choice; where there is none, ``teacher`` repeats ``logged``.
+    teacher's choice and ``reaches`` ``(B,)`` whether its sensor means something; where there is no choice, ``teacher``
+    repeats ``logged``.
     """
 
     features: Tensor
@@ -108,10 +180,11 @@ class Batch:
     logged: Choices
     teacher: Choices
     taught: Tensor
+    reaches: Tensor
 
     @classmethod
-    def of(cls, examples: Sequence[Example]) -> Self:
-        """Examples one after another; at least one."""
+    def of(cls, examples: Sequence[Example], speed: Speed = "look_ahead") -> Self:
+        """Examples one after another, at least one; ``speed`` tells which velocity is the teacher's choice."""
         padded = torch.nn.utils.rnn.pad_sequence(
             [torch.from_numpy(example.sample.features) for example in examples], batch_first=True
         )
@@ -121,8 +194,11 @@ class Batch:
             admissible=torch.arange(padded.shape[1]) < sizes[:, None],
             reward=torch.tensor([example.reward for example in examples], dtype=torch.float32),
             logged=Choices.of([example.sample for example in examples]),
-            teacher=Choices.of([example.teacher or example.sample for example in examples]),
-            taught=torch.tensor([example.teacher is not None for example in examples]),
+            teacher=Choices.of(
+                [example.taught.ranked(speed) if example.taught else example.sample for example in examples]
+            ),
+            taught=torch.tensor([example.taught is not None for example in examples]),
+            reaches=torch.tensor([example.taught is not None and example.taught.reaches for example in examples]),
         )
 
     def __len__(self) -> int:
@@ -136,4 +212,5 @@ class Batch:
             self.logged[rows],
             self.teacher[rows],
             self.taught[rows],
+            self.reaches[rows],
         )

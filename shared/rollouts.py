@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, ValidationError
 
@@ -20,10 +21,19 @@ class Header(Wire):
     behaviour: str
 
 
+class Reference(Wire):
+    """What a teacher would have done: ``planner``, from what the fleet knew, or ``clairvoyant``, all arrivals known."""
+
+    teacher: Literal["planner", "clairvoyant"]
+    sensor_id: SensorId
+    velocity: int = Field(ge=0, le=14)
+
+
 class RolloutStep(Wire):
     """One UAV's decision: what was reported, what was done, and what came of it.
 
-    ``cost`` is the UAV's own c, ``fleet_lost`` the packets lost in that step at all sensors.
+    ``cost`` is the UAV's own c, ``fleet_lost`` the packets lost in that step at all sensors. ``reference`` is None
+    where no teacher was asked; it was not always flown. Files from before there were references are read as that.
     """
 
     request: DecideRequest
@@ -32,6 +42,7 @@ class RolloutStep(Wire):
     cost: float = Field(ge=0)
     failed: bool
     fleet_lost: int = Field(ge=0)
+    reference: Reference | None = None
 
 
 def write_rollouts(path: Path, header: Header, steps: Iterable[RolloutStep]) -> None:

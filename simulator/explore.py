@@ -1,12 +1,14 @@
-"""``aicvds explore``: fly training worlds with exploring UAVs and record every decision, for ``aicvds pretrain``."""
+"""``aicvds explore``: fly training worlds and record every decision, with a teacher's, for ``aicvds pretrain``."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -14,28 +16,52 @@ from rich.console import Console
 from rich.progress import track
 from tyro.conf import arg
 
-from shared.rollouts import Header, RolloutStep, write_rollouts
+from shared.rollouts import Header, Reference, RolloutStep, write_rollouts
 from shared.scenario import Scenario, scenario_named
+
+# The world and the planner take seconds to import; `--help` and bad use answer without them.
+if TYPE_CHECKING:
+    from simulator.teachers import Action, Teacher, TeacherName
+    from simulator.world import Observation
 
 # Training worlds start here, so that no evaluation seed (from 0) is ever among them.
 FIRST_TRAINING_SEED = 1_000_000
-_BEHAVIOUR = "half EOF or WQCS, half a random sensor heard; a random velocity"
+Asked = Literal["both", "planner", "clairvoyant"]
+_BEHAVIOUR = "taught: mostly the reference's; untaught: half EOF or WQCS, half a random sensor; a random velocity"
 
 
 @dataclass(frozen=True)
 class Explore:
-    """Fly training worlds with exploring UAVs and record what they saw, did and paid.
+    """Fly training worlds with exploring UAVs and record what they saw, did and paid, and what a teacher would do.
 
-    Half of the decisions are EOF's or WQCS's, half a random sensor; velocities are random. The worlds' seeds start
-    at 1,000,000, apart from every evaluation seed. The file feeds `aicvds pretrain`.
+    The worlds' seeds start at 1,000,000, apart from every evaluation seed. The file feeds `aicvds pretrain` and
+    `aicvds demonstrate`.
+
+      aicvds explore --workers 2 --out runs/rollouts.jsonl.gz
+
+    The planner (partial observations, some 4 s a world) and a clairvoyant (all arrivals known, 1 to 3 s) take turns,
+    a world each. A UAV mostly flies as its teacher says. In up to half (planner) or a fifth (clairvoyant) of a world's
+    steps the fleet deviates, so that states off the teacher's way are covered: then half of the sensors are EOF's or
+    WQCS's, half random, and velocities are random; a third of the deviations keep the planner's sensor, a third its
+    velocity. What is recorded as the reference is what the teacher would do in that state; a clairvoyant gives none
+    while the fleet deviates, and plans anew after.
+
+    In more worlds nobody teaches, and every step deviates. The same command writes the same decisions, whatever the
+    workers.
     """
 
     out: Annotated[Path, arg(metavar="FILE")]
     """File to write, such as runs/rollouts.jsonl.gz."""
-    missions: Annotated[int, arg(metavar="N")] = 600
-    """Worlds to fly."""
+    missions: Annotated[int, arg(metavar="N")] = 400
+    """Worlds that are taught in. They need the extra `planner`."""
+    untaught: Annotated[int, arg(metavar="N")] = 300
+    """Worlds after these, without a teacher."""
+    teacher: Asked = "both"
+    """Who gives the reference actions: the planner, a clairvoyant, or both in turns."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
     """Their scenario."""
+    workers: Annotated[int, arg(metavar="N")] = 1
+    """Processes to fly them in, 1 to 64."""
 
 
 def main(argv: list[str]) -> int:
@@ -43,41 +69,79 @@ def main(argv: list[str]) -> int:
     args = tyro.cli(Explore, prog="aicvds explore", args=argv)
     try:
         scenario = scenario_named(args.scenario)
-        if args.missions < 1:
-            raise ValueError(f"--missions {args.missions} is not at least 1")
+        for name in ("missions", "untaught"):
+            if getattr(args, name) < 0:
+                raise ValueError(f"--{name} {getattr(args, name)} is less than 0")
+        if args.missions + args.untaught < 1:
+            raise ValueError("--missions and --untaught are 0: there is nothing to fly")
+        if not 1 <= args.workers <= 64:
+            raise ValueError(f"--workers {args.workers} is not between 1 and 64")
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        header = Header(scenario=scenario, missions=args.missions, behaviour=_BEHAVIOUR)
-        seeds = track(range(args.missions), description="Exploring", console=Console())
-        write_rollouts(args.out, header, (step for seed in seeds for step in explore(scenario, seed)))
+        header = Header(scenario=scenario, missions=args.missions + args.untaught, behaviour=_BEHAVIOUR)
+        write_rollouts(args.out, header, _explored(scenario, args))
     except (ValueError, OSError) as error:
         print(f"aicvds explore: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as missing:
+        fix = "pip install 'aic-vds[planner]', or take --missions 0"
+        print(f"aicvds explore: {missing.name} is not installed: {fix}", file=sys.stderr)
         return 2
     print(f"Wrote {args.out}")
     return 0
 
 
-def explore(scenario: Scenario, mission: int) -> Iterator[RolloutStep]:
-    """One mission's decisions in order of step and UAV, in training world number ``mission``."""
+def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
+    teachers = [teacher_of(args.teacher, mission) for mission in range(args.missions)] + [None] * args.untaught
+    fly = partial(_mission, scenario)
+    told = partial(track, description="Exploring", total=len(teachers), console=Console(stderr=True))
+    if args.workers == 1:
+        for steps in told(map(fly, enumerate(teachers))):
+            yield from steps
+        return
+    with get_context("spawn").Pool(args.workers) as pool:
+        for steps in told(pool.imap(fly, enumerate(teachers))):
+            yield from steps
+
+
+def _mission(scenario: Scenario, numbered: tuple[int, TeacherName | None]) -> list[RolloutStep]:
+    mission, teacher = numbered
+    return list(explore(scenario, mission, teacher))
+
+
+def teacher_of(asked: Asked, mission: int) -> TeacherName:
+    """Who teaches in that training world; with both, the planner in even ones."""
+    if asked == "both":
+        return "clairvoyant" if mission % 2 else "planner"
+    return asked
+
+
+def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None) -> Iterator[RolloutStep]:
+    """One mission's decisions in order of step and UAV, in training world number ``mission``.
+
+    Raises:
+        ModuleNotFoundError: there is a teacher and OR-Tools is not installed (extra ``planner``).
+    """
     from simulator.mission import decide_request
-    from simulator.policies import policy_named
+    from simulator.teachers import TEACHERS
     from simulator.world import PipelineWorld
 
     rng = np.random.default_rng([FIRST_TRAINING_SEED, mission])
-    guides = [policy_named("eof"), policy_named("wqcs")]
-    for guide in guides:
-        guide.reset(scenario, mission)
     world = PipelineWorld(scenario)
     observations, _ = world.reset(seed=FIRST_TRAINING_SEED + mission)
-    for _ in range(scenario.steps):
-        choices: list[tuple[int, int]] = []
+    deviation = _Deviation(scenario, mission, rng)
+    asked: Teacher | None = None if teacher is None else TEACHERS[teacher](world)
+    share = 1.0 if asked is None else rng.uniform(0.0, asked.deviations)
+    for step in range(scenario.steps):
+        deviating = bool(rng.random() < share)
+        choices: list[Action] = []
+        references: list[Reference | None] = []
         for uav in range(scenario.uavs):
-            observation = observations[f"uav_{uav}"]
-            taken = frozenset(sensor for sensor, _ in choices)
-            sensor, _ = guides[rng.integers(2)].decide(uav, observation, taken)
-            heard = np.flatnonzero(observation["last_heard"] >= 0)
-            if rng.random() < 0.5 and len(heard):
-                sensor = int(rng.choice(heard))
-            choices.append((sensor, int(rng.integers(scenario.max_velocity + 1))))
+            observation, taken = observations[f"uav_{uav}"], frozenset(sensor for sensor, _ in choices)
+            told = None if asked is None else asked.refer(uav, observation, taken, deviating)
+            choices.append(told if told and not deviating else deviation.instead_of(told, uav, observation, taken))
+            references.append(_reference(teacher, told))
+            if asked is not None:
+                asked.flown(uav, step, choices[-1])
         requests = [decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in range(scenario.uavs)]
         observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in enumerate(choices)})
         for uav, (sensor, velocity) in enumerate(choices):
@@ -89,4 +153,37 @@ def explore(scenario: Scenario, mission: int) -> Iterator[RolloutStep]:
                 cost=float(info["cost"]),
                 failed=bool(info["failed"]),
                 fleet_lost=world.tally[-1].lost_packets,
+                reference=references[uav],
             )
+
+
+def _reference(teacher: TeacherName | None, told: Action | None) -> Reference | None:
+    if teacher is None or told is None:
+        return None
+    return Reference(teacher=teacher, sensor_id=told[0], velocity=told[1])
+
+
+class _Deviation:
+    """What a fleet does that leaves its teacher's way, or has none."""
+
+    def __init__(self, scenario: Scenario, mission: int, rng: np.random.Generator) -> None:
+        from simulator.policies import policy_named
+
+        self._rng = rng
+        self._levels = scenario.max_velocity + 1
+        self._guides = [policy_named("eof"), policy_named("wqcs")]
+        for guide in self._guides:
+            guide.reset(scenario, mission)
+
+    def instead_of(self, told: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
+        """A sensor of EOF's, WQCS's or at random, and a random velocity; or one of both as the teacher says."""
+        rng = self._rng
+        sensor, _ = self._guides[rng.integers(2)].decide(uav, observation, taken)
+        heard = np.flatnonzero(observation["last_heard"] >= 0)
+        if rng.random() < 0.5 and len(heard):
+            sensor = int(rng.choice(heard))
+        velocity = int(rng.integers(self._levels))
+        if told is not None:
+            kept = rng.integers(3)
+            return (told[0] if kept == 1 else sensor), (told[1] if kept == 2 else velocity)
+        return sensor, velocity

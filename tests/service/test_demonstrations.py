@@ -5,17 +5,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.demonstrate import farthest_first, likeness, main, solutions
+from service.demonstrate import TEACHERS, farthest_first, likeness, main, solutions
 from service.demonstrations import packaged
 from service.features import State
 from service.policy import decide_without_llm
 from service.problems import Refused
-from shared.rollouts import Header, read_rollouts, write_rollouts
+from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS, Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
 from simulator.explore import explore
 from tests.service.making import PAPER, attended, mission, uav
 
+SHORT = PAPER.model_copy(update={"steps": 8})
 HEADER = Header(scenario=PAPER, missions=1, behaviour="test")
 
 
@@ -96,24 +97,37 @@ def test_twenty_fit_the_embedded_models_context_and_what_does_not_is_refused() -
         mission(shown(20, format="json").model_copy(update={"mode": "llm"}))
 
 
-def test_the_shipped_ones_are_the_teachers_answers() -> None:
+def test_the_shipped_ones_are_the_planners_and_each_collects_something_that_was_free() -> None:
     pool = packaged()
-    assert pool.teacher == "look_ahead"
-    agreed = 0
+    assert pool.teacher == "planner"
+    short_sighted = 0
     for d in pool.demonstrations:
-        state = d.state(pool.scenario, "paper")
-        assert not set(d.reserved) & set(state.ids[state.admissible])
-        agreed += decide_without_llm(state, d.uav.uav_id, pool.scenario, d.reserved) == (d.sensor_id, d.velocity)
-    # What is rounded for the file may tip a near tie.
-    assert agreed >= 0.9 * len(pool.demonstrations)
+        state = d.state(pool.scenario, "reach")
+        assert state.reach is not None
+        row = state.ids.tolist().index(d.sensor_id)
+        assert state.admissible[row]
+        assert state.reach.packets[d.velocity, row] >= 1
+        short_sighted += decide_without_llm(state, d.uav.uav_id, pool.scenario, d.reserved) == (d.sensor_id, d.velocity)
+    assert short_sighted < 0.7 * len(pool.demonstrations), "the planner sees further than one step"
+
+
+def test_a_demonstration_shows_the_reference_that_was_recorded() -> None:
+    steps = list(explore(SHORT, 0, "planner"))
+    told = {(s.request.uav_id, s.request.step): s.reference for s in steps if s.reference}
+    found = list(solutions(HEADER, steps, TEACHERS["planner"]))
+    assert len(found) > 5
+    for d, _ in found:
+        reference = told[d.uav.uav_id, d.step]
+        assert (reference.sensor_id, reference.velocity) == (d.sensor_id, d.velocity)
+    assert list(solutions(HEADER, steps, TEACHERS["clairvoyant"])) == []
 
 
 def test_any_teacher_may_solve_them() -> None:
     asked: list[tuple[int, int]] = []
 
-    def fullest(state: State, uav_id: int, scenario: Scenario, reserved: object) -> tuple[int, int]:
+    def fullest(step: RolloutStep, state: State, scenario: Scenario, reserved: object) -> tuple[int, int]:
         row = int(np.argmax(np.where(state.admissible, state.queue, -1)))
-        asked.append((uav_id, scenario.sensors))
+        asked.append((step.request.uav_id, scenario.sensors))
         return int(state.ids[row]), 3
 
     found = list(solutions(HEADER, explore(PAPER, 0), fullest))
@@ -139,13 +153,15 @@ def test_what_is_alike_depends_on_the_answer() -> None:
 def test_the_command_writes_what_a_mission_can_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recorded, out = tmp_path / "r.jsonl.gz", tmp_path / "c" / "d.json"
     write_rollouts(recorded, HEADER, explore(SCENARIOS["paper"], 1))
-    assert main([str(recorded), "--out", str(out), "--count", "5"]) == 0
+    look_ahead = ("--teacher", "look_ahead")
+    assert main([str(recorded), "--out", str(out), "--count", "5", *look_ahead]) == 0
     assert "5 of" in capsys.readouterr().out
     assert len(json.loads(out.read_text())["demonstrations"]) == 5
     for options, said in (
-        (["--count", "1000"], "--count asks 1000"),
+        (["--count", "1000", *look_ahead], "--count asks 1000"),
+        (["--count", "1"], "holds no decision of planner: record with aicvds explore --teacher both"),
         (["--count", "0"], "--count 0"),
-        (["--teacher", "socrates"], "choose one of look_ahead"),
+        (["--teacher", "socrates"], "choose one of planner, clairvoyant, look_ahead"),
     ):
         assert main([str(recorded), "--out", str(out), *options]) == 2
         assert said in capsys.readouterr().err
