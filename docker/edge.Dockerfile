@@ -16,10 +16,10 @@ ARG TORCH_INDEX=""
 RUN pip install --no-deps ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$(grep '^torch==' constraints.txt)"
 COPY pyproject.toml ./
 # No source yet, so this installs an empty aic-vds with all that it requires, and outlives every edit of the source.
-# Torch's C++ headers and test programs are a fifth of it, and nothing here compiles.
+# Torch's C++ headers and test programs are a fifth of it, and nothing here compiles. OR-Tools brings pandas.
 RUN touch README.md LICENSE \
- && pip install --constraint constraints.txt '.[service]' \
- && rm -rf /opt/aicvds/lib/python3.11/site-packages/torch/include /opt/aicvds/lib/python3.11/site-packages/torch/test
+ && pip install --constraint constraints.txt '.[service,planner]' \
+ && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test pandas/tests
 
 # These files alone, so that an edit elsewhere does not bring the model again.
 FROM dependencies AS model

@@ -49,6 +49,7 @@ def create_app(settings: Settings) -> FastAPI:
         try:
             yield {"engine": engine, "upstream": upstream, "metrics": metrics}
         finally:
+            await engine.compiler.close()
             await engine.labels.close()
             await upstream.close()
             await asyncio.to_thread(engine.close)

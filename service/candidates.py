@@ -7,7 +7,7 @@ favours a letter or a place by, are the same for a mission's life.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from string import ascii_uppercase
 from typing import Self
@@ -16,7 +16,7 @@ import numpy as np
 
 from service.critic import Action
 from service.features import State
-from service.prompt import Prompt, Template
+from service.prompt import Prompt, Template, note_block
 from service.reach import Reach, distances_ahead
 from service.rows import Cells, cells, full_cells
 from shared.scenario import Scenario
@@ -42,7 +42,7 @@ Rules:
 1. Prefer a full queue, then a long age.
 2. Fly slowly to stay near full queues, fast when there is little to collect.
 
-{experiences}Answer with one letter and nothing else."""
+{note}{experiences}Answer with one letter and nothing else."""
 
 _EXPERIENCES = "Past decisions are queue,age>velocity:cost, where 0 is the best cost.\n\n"
 # Rows that say nothing of any sensor.
@@ -62,9 +62,12 @@ class GuidedTemplate(Template):
         rows: the most that a prompt shows.
         experiences: the most that it may hold; with 0 the static block does not speak of them.
         ranked: whether the rows come best first.
+        note: the operator's.
     """
 
-    def __init__(self, scenario: Scenario, *, rows: int, experiences: int, ranked: bool) -> None:
+    def __init__(
+        self, scenario: Scenario, *, rows: int, experiences: int, ranked: bool, note: str | None = None
+    ) -> None:
         super().__init__(scenario, experiences=experiences, ranked=ranked)
         self.paces = paces(rows)
         self.rows = min(rows, _MOST_LABELS // self.paces)
@@ -81,6 +84,7 @@ class GuidedTemplate(Template):
             capacity=scenario.queue_capacity,
             order=order,
             letters=letters,
+            note=note_block(note),
             experiences=_EXPERIENCES if experiences else "",
         )
 
@@ -137,6 +141,12 @@ class Offer:
             text.append(f"{letters[0]}{known['queue']},{known['age']},{_span(speeds)}\n")
         return cls(list(actions), labels, "".join(text))
 
+    def flown_as(self, velocity: Callable[[int, int], int]) -> Offer:
+        """With other velocities, told by sensor and velocity; labels may come to name the same action."""
+        actions: dict[Action, int] = {}
+        places = [actions.setdefault((s, velocity(s, v)), len(actions)) for s, v in self.actions]
+        return Offer(list(actions), {label: places[i] for label, i in self.labels.items()}, self.rows)
+
     def with_actions(self, added: Sequence[Action]) -> Offer:
         """With more that no letter names."""
         known = dict.fromkeys(self.actions)
@@ -153,14 +163,14 @@ class Offer:
 def velocities(reach: Reach, row: int, count: int) -> list[int]:
     """The velocities worth offering for a sensor, slowest first, ``count`` of them with repetitions.
 
-    Of the span in which nearly all that can be moved is moved: the ends, the middle, and the best by worth. On 4
-    worlds of scenario `paper` a planner held to them lost 21 packets, to all fifteen 26, to 0, 7 and 14 m/s 37.
+    Evenly spaced over the span in which nearly all that can be moved is moved, its ends included: where a UAV is to be
+    for its next sensors is not to be read off this one. Of one, the best by worth.
     """
+    if count == 1:
+        return [int(reach.best[row])]
     packets = reach.packets[:, row]
     good = np.flatnonzero(packets >= _NEARLY * packets.max())
-    slowest, fastest, best = int(good[0]), int(good[-1]), int(reach.best[row])
-    wanted = [fastest, slowest, best, (slowest + fastest) // 2][:count]
-    return sorted(wanted)
+    return [int(level) for level in np.rint(np.linspace(good[0], good[-1], count))]
 
 
 def _span(speeds: Sequence[int]) -> str:

@@ -10,10 +10,11 @@ import time
 import uuid
 from collections.abc import Awaitable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from service.candidates import GuidedTemplate
+from service.compiler import Compiler
 from service.guided import LLM, Deliberation, trust_of
 from service.learner import Sample
 from service.llm.answer import NoDecision, check_answer
@@ -25,7 +26,7 @@ from service.mission import Mission
 from service.missions import Missions
 from service.policy import decide_without_llm
 from service.prompt import Prompt
-from service.settings import Settings
+from service.settings import Settings, usable_cores
 from service.tokens import TokenCounter, price_usd
 from service.trust import Advice
 from service.view import View
@@ -45,7 +46,7 @@ from shared.wire import (
 
 log = logging.getLogger(__name__)
 
-_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value"}
+_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
 # Kept back from the LLM's time for checking, answering and the way through the event loop.
 _RESERVE_S = 0.02
 # After SIGTERM, so that every UAV is answered before the process is killed.
@@ -100,9 +101,12 @@ class Engine:
         self._settings = settings
         self._upstream = upstream
         self.labels = LabelReader(upstream)
+        self.compiler = Compiler(upstream)
         self._counter = counter
         self._metrics = metrics
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
+        self._plans: set[asyncio.Task[None]] = set()
         self._room = threading.Semaphore(_MAX_LESSONS)
         self._waiting: set[asyncio.Timeout] = set()
         self._closing = False
@@ -116,7 +120,8 @@ class Engine:
             limit.reschedule(min(limit.when() or ends, ends))
 
     def close(self) -> None:
-        """Finish the lesson in hand and drop those that are queued."""
+        """Finish the lesson and the plans in hand, and drop those that are queued."""
+        self._planning.shutdown(wait=True, cancel_futures=True)
         self._learning.shutdown(wait=True, cancel_futures=True)
 
     async def decide(self, request: DecideRequest) -> DecideResponse:
@@ -126,10 +131,16 @@ class Engine:
         if request.outcome is not None:
             self._apply(mission, request.outcome)
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
-        return await self._decide(mission, request, request.step, deadline_ms, watch)
+        mission.observe(request, request.step)
+        plan = self._plan(mission, [request.uav_id], request.step, watch.started + deadline_ms / 1e3)
+        return await self._decide(mission, request, request.step, deadline_ms, watch, plan)
 
     async def decide_batch(self, request: BatchRequest) -> list[DecideResponse]:
-        """A fleet's decisions in the order asked; each gets an equal share of the time that is left."""
+        """A fleet's decisions in the order asked; each gets an equal share of the time that is left.
+
+        All that the UAVs report is known before the first decides, and one plan serves them all, until a UAV is told
+        something else than it: then the rest is planned again.
+        """
         watch = Stopwatch()
         total_ms = request.deadline_ms or self._settings.deadline_ms
         answers: list[DecideResponse] = []
@@ -137,10 +148,19 @@ class Engine:
         # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
         for outcome in (uav.outcome for uav in request.uavs if uav.outcome is not None):
             self._apply(mission, outcome)
+        for uav in request.uavs:
+            mission.observe(uav, request.step)
+        waiting = [uav.uav_id for uav in request.uavs]
+        plan: asyncio.Task[None] | None = None
         for turn, uav in enumerate(request.uavs):
             left_ms = total_ms - (time.perf_counter() - watch.started) * 1e3
             share_ms = max(1, int(left_ms / (len(request.uavs) - turn)))
-            answers.append(await self._decide(mission, uav, request.step, share_ms, Stopwatch()))
+            own = Stopwatch()
+            plan = plan or self._plan(mission, waiting[turn:], request.step, own.started + share_ms / 1e3)
+            answer = await self._decide(mission, uav, request.step, share_ms, own, plan)
+            if mission.planner is None or mission.planner.action(uav.uav_id) != (answer.sensor_id, answer.velocity):
+                plan = None
+            answers.append(answer)
             await asyncio.sleep(0)
         return answers
 
@@ -150,12 +170,19 @@ class Engine:
         return FeedbackResponse(decision_id=request.decision_id, result=self._apply(mission, request))
 
     async def _decide(
-        self, mission: Mission, uav: UavState, step: int, deadline_ms: int, watch: Stopwatch
+        self,
+        mission: Mission,
+        uav: UavState,
+        step: int,
+        deadline_ms: int,
+        watch: Stopwatch,
+        plan: asyncio.Task[None] | None,
     ) -> DecideResponse:
         attempt = mission.attempt(step, uav.uav_id)
-        mission.observe(uav)
+        deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
         if mission.mode == "guided":
-            mission.belief.hear(uav, step)
+            await _until(plan, deadline)
+            watch.lap("plan")
         view = View.of(mission, uav, step)
         watch.lap("augment")
         view.attend(mission)
@@ -169,11 +196,13 @@ class Engine:
             )
         tokens = self._count(prompt)
         watch.lap("prompt")
-        deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
         if deliberation is not None:
             choice = await self._weigh(mission, view, deliberation, deadline, watch)
         else:
-            choice = await self._choose(mission, view, prompt, deadline, watch)
+            choice = await self._choose(mission, view, prompt, deadline, watch, plan)
+        levels = mission.scenario.max_velocity + 1
+        # Whoever decided, and whatever was confirmed meanwhile: what the operator forbids is not flown.
+        choice = replace(choice, velocity=mission.guidance.obeyed.nearest(choice.velocity, levels))
         decision_id = uuid.uuid4().hex
         pending = view.pending(mission, decision_id, choice.sensor_id, choice.velocity)
         watch.lap("check")
@@ -194,18 +223,37 @@ class Engine:
             latency_ms=watch.total(),
         )
         mission.commit(pending, attempt)
-        if mission.mode == "guided":
-            mission.belief.told(uav.uav_id, step, (choice.sensor_id, choice.velocity), mission.rates)
         if choice.advice is not None:
             trust_of(mission, self._upstream.model).note(decision_id, choice.advice)
         self._metrics.record_decision(answer)
         return answer
 
-    async def _choose(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Choice:
+    def _plan(self, mission: Mission, uavs: list[int], step: int, deadline: float) -> asyncio.Task[None] | None:
+        """Begin to plan for UAVs of this step, where their mission's mode may need it; the LLM is asked meanwhile."""
+        if mission.planner is None or mission.mode == "value":
+            return None
+        seconds = min(self._settings.planner_ms / 1e3, deadline - _RESERVE_S - time.perf_counter())
+        taken = mission.reserved(step, uavs[0])
+        task = asyncio.create_task(mission.planner.plan(uavs, taken, seconds, self._planning))
+        self._plans.add(task)
+        task.add_done_callback(self._plans.discard)
+        return task
+
+    async def _choose(
+        self,
+        mission: Mission,
+        view: View,
+        prompt: Prompt,
+        deadline: float,
+        watch: Stopwatch,
+        plan: asyncio.Task[None] | None,
+    ) -> Choice:
         """The LLM's choice or the learned values', as the mission's mode says; the policy's where neither has one."""
         completion: Completion | None = None
         reason: Reason | None = None
         try:
+            if mission.mode == "policy":
+                raise NoDecision("mode_policy", "nobody else is asked")
             if not view.rows:
                 raise NoDecision("no_candidate", "no sensor is both heard and free")
             if mission.mode == "value":
@@ -213,20 +261,28 @@ class Engine:
             else:
                 completion = await self._ask(mission, view, prompt, deadline, watch)
                 sensor, velocity = check_answer(completion.text, view.offered, mission.scenario.max_velocity + 1)
+                if not mission.guidance.obeyed.allows(velocity):
+                    raise NoDecision("answer_velocity", f"the operator forbids {velocity} m/s")
             # Others may have been answered while this one waited.
             if sensor in mission.reserved(view.step, view.uav_id):
                 raise NoDecision("answer_reserved", f"sensor {sensor} was given away meanwhile")
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
+            await _until(plan, deadline)
+            watch.lap("plan")
             sensor, velocity = self._by_policy(mission, view)
             reason = error.reason
-        if mission.mode != "value" and reason != "no_candidate":
+        if mission.asks and reason != "no_candidate":
             self._metrics.llm_requests.labels(reason or "ok").inc()
         return Choice(sensor, velocity, reason, completion)
 
     def _by_policy(self, mission: Mission, view: View) -> tuple[int, int]:
+        """The plan's, or one step of look-ahead where there is no plan."""
         reserved = mission.reserved(view.step, view.uav_id)
-        sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
+        planned = mission.planner.action(view.uav_id, reserved) if mission.planner is not None else None
+        if planned is not None:
+            return planned
+        sensor, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved, view.asked)
         if sensor in reserved:
             # Every sensor reported is taken: one that was not reported is worth a try, a taken one is not.
             sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
@@ -333,3 +389,9 @@ class Engine:
             "cost_usd": cost,
         }
         return tokens.model_copy(update=usage)
+
+
+async def _until(plan: asyncio.Task[None] | None, deadline: float) -> None:
+    """Wait for a plan, but not past the deadline; what is found later serves the fleet's next decisions."""
+    if plan is not None:
+        await asyncio.wait({plan}, timeout=max(0.0, deadline - time.perf_counter()))

@@ -17,7 +17,7 @@ from shared.channel import FloatArray
 # In units of the value regression's target, minus the cost.
 _VALUE_TEMPERATURE = 0.05
 # What an adviser that names one candidate leaves to all together, so that its logarithm exists.
-SMOOTHING = 0.05
+SMOOTHING = 0.01
 
 
 class Expert(Protocol):
@@ -25,13 +25,29 @@ class Expert(Protocol):
 
     name: str
 
-    def proposals(self, mission: Mission, view: View) -> list[Action]:
-        """What it would do itself; to be among the candidates."""
+    def proposal(self, mission: Mission, view: View) -> Action | None:
+        """What it would do itself, to be among the candidates; None where it has nothing to say."""
         ...
 
     def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
-        """How it would choose among the candidates, ``(n,)``, summing to 1."""
+        """How it would choose among the candidates, ``(n,)``, summing to 1; only where it has a proposal."""
         ...
+
+
+class PlannerExpert:
+    """The receding-horizon plan, where there is one of this step."""
+
+    name = "planner"
+
+    def proposal(self, mission: Mission, view: View) -> Action | None:
+        """The plan's action."""
+        if mission.planner is None:
+            return None
+        return mission.planner.action(view.uav_id, mission.reserved(view.step, view.uav_id))
+
+    def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
+        """Nearly all for the plan's action."""
+        return one_hot(self.proposal(mission, view), actions)
 
 
 class ValueExpert:
@@ -39,9 +55,9 @@ class ValueExpert:
 
     name = "value"
 
-    def proposals(self, mission: Mission, view: View) -> list[Action]:
+    def proposal(self, mission: Mission, view: View) -> Action | None:
         """The best-scored sensor and the best velocity for it."""
-        return [view.by_value(mission)]
+        return view.by_value(mission)
 
     def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
         """A sensor that attention did not see scores as low as the lowest."""
@@ -56,22 +72,23 @@ class PolicyExpert:
 
     name = "policy"
 
-    def proposals(self, mission: Mission, view: View) -> list[Action]:
+    def proposal(self, mission: Mission, view: View) -> Action | None:
         """Its decision."""
         reserved = mission.reserved(view.step, view.uav_id)
-        return [decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)]
+        return decide_without_llm(view.state, view.uav_id, mission.scenario, reserved, view.asked)
 
     def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
         """Nearly all for its decision."""
-        return one_hot(self.proposals(mission, view)[0], actions)
+        return one_hot(self.proposal(mission, view), actions)
 
 
-# In the order of the response. A planner takes its place here.
-EXPERTS: tuple[Expert, ...] = (ValueExpert(), PolicyExpert())
+PLANNER = PlannerExpert.name
+# In the order of the response.
+EXPERTS: tuple[Expert, ...] = (PlannerExpert(), ValueExpert(), PolicyExpert())
 
 
-def one_hot(action: Action, actions: Sequence[Action]) -> FloatArray:
-    """0.95 for one action, if it is there, and the rest for all alike, ``(n,)``."""
+def one_hot(action: Action | None, actions: Sequence[Action]) -> FloatArray:
+    """0.99 for one action, if it is there, and the rest for all alike, ``(n,)``."""
     probabilities = np.full(len(actions), SMOOTHING / len(actions))
     if action in actions:
         probabilities[actions.index(action)] += 1.0 - SMOOTHING

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from service.reach import Reach, distances_ahead
 from shared.channel import FloatArray, channel_gain_db
+from shared.fleetplan import FleetBelief
 from shared.scenario import Point, Scenario
 from shared.urgency import urgency
 from shared.wire import Features, UavState
@@ -94,6 +95,7 @@ def augment(
     rates: FloatArray,
     reserved: Collection[int],
     preset: Features = "paper",
+    belief: FleetBelief | None = None,
 ) -> State:
     """Complete a UAV's report with visiting records, urgency, and the channel from where it is now.
 
@@ -101,11 +103,15 @@ def augment(
     not change, so the model knows better than an old beacon. Admissible is a sensor heard, with a battery, and not
     reserved.
 
+    With a fleet's belief, queues and batteries are the fleet's, expected now; a sensor that nobody has heard counts as
+    heard, with the queue that is expected of it.
+
     Args:
         visits: step of each sensor's last visit (TVR_j), by sensor ID; one never visited counts from step 0.
         rates: observed arrival rates, packets a step, by sensor ID.
         reserved: sensors that other UAVs were given this step.
         preset: ``reach`` looks ahead along the UAV's trajectory too.
+        belief: what the fleet knows; without it, what this UAV last heard.
     """
     sensors = uav.sensors
     ids = np.asarray(sensors.id, dtype=np.int64)
@@ -114,8 +120,11 @@ def augment(
     position = (uav.position[0], uav.position[1])
     places = np.stack((sensors.x, sensors.y), axis=1)
     distance = np.linalg.norm(places - position, axis=1)
-    queue, battery = filled(sensors.queue), filled(sensors.battery)
-    urgencies = urgency(queue, rates[ids], scenario)
+    queue, battery, rate = filled(sensors.queue), filled(sensors.battery), rates[ids]
+    if belief is not None:
+        heard = np.ones_like(heard)
+        queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], belief.rate[ids]
+    urgencies = urgency(queue, rate, scenario)
     reach = None
     if preset == "reach":
         ahead = distances_ahead(uav.uav_id, position, uav.progress_m, places, scenario)
@@ -130,7 +139,7 @@ def augment(
         queue=queue,
         battery=battery,
         gain=np.where(fresh, filled(sensors.channel_gain), channel_gain_db(distance, scenario)),
-        rate=rates[ids],
+        rate=rate,
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
         urgency=urgencies,
         distance=distance,

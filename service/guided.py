@@ -1,10 +1,10 @@
 """Mode ``guided``: advisers weighed by learned trust, and a critic that sees what this decision would lose.
 
 The candidates are the rows' sensors at a few velocities each, and what the advisers would do themselves. Adviser e (the
-LLM, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight w_e, and the
-critic expects a candidate to lose m(a) packets above the best. What is flown is
+LLM, the planner, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight
+w_e, and the critic expects a candidate to lose m(a) packets above the best. What is flown is
 
-    argmax_a  ln(sum_e w_e p_e(a)) - rate min(m(a), cap)
+    argmax_a  ln(sum_e w_e p_e(a)) - rate min(m(a), cap),    rate = 0.6 a packet, cap = 8 packets
 
 This is Hedge over pairs of an adviser and a candidate, with the critic's judgement as the prediction of this very
 decision's loss: optimistic Hedge (Rakhlin and Sridharan 2013), whose regret shrinks with the prediction's error. So an
@@ -25,7 +25,7 @@ import numpy as np
 
 from service.candidates import GuidedTemplate, Offer
 from service.critic import Action, Judgement, Situation, judge
-from service.experts import EXPERTS, SMOOTHING
+from service.experts import EXPERTS, PLANNER, SMOOTHING
 from service.mission import Mission
 from service.prompt import Prompt
 from service.trust import CAP, RATE, Advice, Trust
@@ -34,9 +34,9 @@ from shared.channel import FloatArray
 from shared.wire import Guided, Weighed
 
 LLM = "llm"
-# The LLM starts with as much as all others together: a bad one is found out within a few decisions, in which the critic
-# keeps it from the worst, and a good one is wanted from the start.
-_PRIOR_LLM = 0.5
+# The planner sees further than the others and needs no finding out. Where there is none, the LLM has as much as all
+# others together: a bad one is found out within a few decisions, in which the critic keeps it from the worst.
+_PRIOR = {LLM: 0.2, PLANNER: 0.6, "value": 0.1, "policy": 0.1}
 _TOLD = 5
 
 
@@ -68,21 +68,26 @@ class Deliberation:
         if not isinstance(template, GuidedTemplate):
             raise TypeError(f"mission {mission.mission_id} flies in mode {mission.mode}, not guided")
         shown = Offer.of(view.state, view.shown(mission), view.uav_id, template, mission.scenario)
-        offer = shown.with_actions([action for expert in EXPERTS for action in expert.proposals(mission, view)])
+        if (asked := view.asked) is not None:
+            rows = {int(sensor): row for row, sensor in enumerate(view.state.ids)}
+            shown = shown.flown_as(lambda sensor, velocity: asked.nearest(rows[sensor], velocity))
+        proposed = {expert: action for expert in EXPERTS if (action := expert.proposal(mission, view)) is not None}
+        offer = shown.with_actions(list(proposed.values()))
         reserved = mission.reserved(view.step, view.uav_id)
         situation = Situation.of(
             mission.belief,
-            mission.rates,
             mission.scenario,
             view.step,
             view.uav_id,
             seed=mission.spec.seed,
             reserved=reserved,
+            course=None if mission.planner is None else mission.planner.course(),
+            guidance=mission.guidance.obeyed,
         )
         return cls(
             offer=offer,
             prompt=template.offer(offer, view.state, mission.experiences, view.nearest(mission)),
-            advised={expert.name: expert.probabilities(mission, view, offer.actions) for expert in EXPERTS},
+            advised={expert.name: expert.probabilities(mission, view, offer.actions) for expert in proposed},
             situation=situation,
         )
 
@@ -146,7 +151,6 @@ def trust_of(mission: Mission, model: str | None) -> Trust:
     """A mission's trust in its advisers while this LLM is one of them."""
     name = model or ""
     if name not in mission.trust:
-        share = (1.0 - _PRIOR_LLM) / len(EXPERTS)
-        prior = {LLM: _PRIOR_LLM, **{expert.name: share for expert in EXPERTS}}
+        prior = {who: share for who, share in _PRIOR.items() if who != PLANNER or mission.planner is not None}
         mission.trust[name] = Trust(prior, most_open=8 * mission.scenario.uavs)
     return mission.trust[name]

@@ -10,19 +10,22 @@ import numpy as np
 
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_modules
-from service.critic import Belief
 from service.demonstrations import solved
 from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
+from service.guidance import OperatorGuidance
 from service.learner import Learner, Sample
+from service.planner import Planner, can_plan
 from service.problems import Conflict, NotFound, Refused
-from service.prompt import Template
+from service.prompt import Template, note_block
 from service.rows import Cells
 from service.settings import Settings, prompt_tokens
 from service.trust import Trust
 from shared.channel import FloatArray
+from shared.fleetplan import FleetBelief
+from shared.guidance import GuidanceAnswer
 from shared.scenario import Scenario, scenario_named
-from shared.wire import MissionSpec, MissionStatus, Mode, Outcome, UavState
+from shared.wire import Belief, Features, MissionSpec, MissionStatus, Mode, Outcome, UavState
 
 # An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
 _PENDING_PER_UAV = 8
@@ -73,8 +76,12 @@ class Mission:
         except ValueError as error:
             raise Refused("scenario", str(error)) from None
         self.mission_id = mission_id
-        self.spec = spec
         self.mode: Mode = spec.mode or settings.mode
+        # The paper's method as it is written, unless asked otherwise.
+        written = self.mode == "llm"
+        self.features: Features = spec.features or ("paper" if written else "reach")
+        self.decides_from: Belief = spec.belief or ("reported" if written else "fleet")
+        self.spec = spec
         self.top_k = spec.top_k or settings.top_k
         told = spec.prompt.experiences
         self._experience_limit = settings.experiences if told is None else told
@@ -83,22 +90,26 @@ class Mission:
         self.attends = spec.attention == "on" or self.mode == "value"
         ranked = self.attends and spec.prompt.order == "score"
         levels = self.scenario.max_velocity + 1
-        modules = initial_modules(spec.init, spec.features, levels, spec.seed)
+        modules = initial_modules(spec.init, self.features, levels, spec.seed)
         self.template = (
             GuidedTemplate(
                 self.scenario,
                 rows=self.top_k if self.attends else self.scenario.sensors,
                 experiences=self._experience_limit,
                 ranked=ranked,
+                note=spec.note,
             )
             if self.mode == "guided"
             else Template(
                 self.scenario,
                 spec.prompt,
-                spec.features,
+                self.features,
                 experiences=self._experience_limit,
                 ranked=ranked,
-                demonstrations=solved(spec, self.scenario, modules, self.top_k if self.attends else None),
+                demonstrations=solved(
+                    spec, self.features, self.scenario, modules, self.top_k if self.attends else None
+                ),
+                note=spec.note,
             )
         )
         self._check_prompt(settings)
@@ -118,9 +129,23 @@ class Mission:
         self._attempts: dict[int, dict[int, int]] = {}
         self._pending: dict[str, Pending] = {}
         self._applied: OrderedDict[str, None] = OrderedDict()
-        # Mode `guided`: what the critic judges by, and the trust by the LLM's name.
-        self.belief = Belief(self.scenario)
+        self.belief = FleetBelief(self.scenario)
+        wanted = (spec.planner or settings.planner) == "on"
+        self.planner = Planner(self.scenario, self.belief) if wanted and can_plan(self.scenario) else None
+        self.guidance = OperatorGuidance(spec.note, self.scenario)
+        # Mode `guided`: by the LLM's name.
         self.trust: dict[str, Trust] = {}
+
+    def obey(self, answer: GuidanceAnswer) -> None:
+        """The operator's word on the guidance; raises as :meth:`OperatorGuidance.answer`."""
+        self.guidance.answer(answer)
+        if self.planner is not None:
+            self.planner.obey(self.guidance.obeyed)
+
+    @property
+    def asks(self) -> bool:
+        """Whether an LLM has a part in the decisions."""
+        return self.mode in ("llm", "guided")
 
     @property
     def experiences(self) -> list[str]:
@@ -162,8 +187,10 @@ class Mission:
         if self.attends:
             rows = min(rows, self.top_k)
         lines = self._experience_limit + (NEAREST if self._selection == "similar" else 0)
-        needed = prompt_tokens(style.format, rows, lines, self.spec.features, self.template.demonstrations)
-        if self.mode != "value" and needed > settings.llm_context:
+        needed = prompt_tokens(style.format, rows, lines, self.features, self.template.demonstrations)
+        # No tokenizer makes more tokens than bytes.
+        needed += len(note_block(self.spec.note).encode())
+        if self.asks and needed > settings.llm_context:
             shown = f"{self._experience_limit} experiences"
             lower = "prompt.experiences"
             if style.demonstrations:
@@ -183,14 +210,20 @@ class Mission:
             return "applied"
         raise NotFound(field, f"mission {self.mission_id} knows no decision {decision_id} (or no longer)")
 
-    def observe(self, uav: UavState) -> None:
-        """Learn arrival rates from the beacons that are news.
+    def observe(self, uav: UavState, step: int) -> None:
+        """Take a UAV's report: arrival rates from the beacons that are news, and all of it into the fleet's belief.
 
         Between two beacons of one sensor, with no visit and no overflow between them, its queue grew by the arrivals.
         """
         ids = np.asarray(uav.sensors.id)
         seen = filled(uav.sensors.last_seen, _NEVER).astype(np.int64)
         queue = filled(uav.sensors.queue)
+        if self.planner is not None:
+            self.planner.begin(step)
+        self.belief.advance(step)
+        self.belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
+        places = np.stack((uav.sensors.x, uav.sensors.y), axis=1)
+        self.belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
         news = seen > self._seen[ids]
         undisturbed = (self._seen[ids] >= 0) & (self.visits[ids] < self._seen[ids])
         usable = news & undisturbed & (queue < self.scenario.queue_capacity) & (queue >= self._queue[ids])
@@ -229,6 +262,7 @@ class Mission:
         self._open_visits.setdefault(decision.sensor_id, {})[decision.decision_id] = decision.step
         self._update_visit(decision.sensor_id)
         self._pending[decision.decision_id] = decision
+        self.belief.tell(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
         own = [d for d in self._pending.values() if d.uav_id == decision.uav_id]
         for forgotten in own[:-_PENDING_PER_UAV]:
             del self._pending[forgotten.decision_id]
@@ -276,7 +310,9 @@ class Mission:
             mode=self.mode,
             top_k=self.top_k,
             attention=self.spec.attention,
-            features=self.spec.features,
+            features=self.features,
+            belief=self.decides_from,
+            planner="off" if self.planner is None else "on",
             prompt=self.spec.prompt.model_copy(
                 update={"experiences": self._experience_limit, "selection": self._selection}
             ),

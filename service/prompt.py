@@ -31,7 +31,12 @@ Rules:
 3. Velocity is a whole number from 0 to {max_velocity} m/s. Fly slowly to stay near a far sensor with a full queue, \
 fast when the sensor is near or there is little to collect.
 
-{experiences}{demonstrations}Answer with two whole numbers and nothing else: sensor_id velocity"""
+{note}{experiences}{demonstrations}Answer with two whole numbers and nothing else: sensor_id velocity"""
+
+
+def note_block(note: str | None) -> str:
+    """The operator's note as the static block has it; nothing without one."""
+    return f"The operator's note, to be obeyed: {note}\n\n" if note else ""
 
 
 _EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
@@ -65,6 +70,7 @@ class Template:
         experiences: the most that a prompt may hold; with 0 the static block does not speak of them.
         ranked: whether the rows come best first.
         demonstrations: worked examples for the static block.
+        note: the operator's.
     """
 
     def __init__(
@@ -76,6 +82,7 @@ class Template:
         experiences: int = 8,
         ranked: bool = True,
         demonstrations: Sequence[Solved] = (),
+        note: str | None = None,
     ) -> None:
         self._format = FORMATS[(style or PromptStyle()).format]
         self._columns = columns(features)
@@ -90,6 +97,7 @@ class Template:
             max_velocity=scenario.max_velocity,
             introduction=self._format.introduction(self._columns, order),
             meanings=meanings(features),
+            note=note_block(note),
             experiences=f"{self._format.experience_note}\n\n" if experiences else "",
             demonstrations=examples,
         )

@@ -11,6 +11,7 @@ from service.engine import Engine
 from service.llm.upstream import Upstream
 from service.metrics import Metrics
 from service.problems import documented
+from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.wire import (
     BatchRequest,
     BatchResponse,
@@ -76,8 +77,10 @@ async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse
 
 @router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422), tags=["missions"])
 async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
-    """Make a mission with its scenario, mode and k; the same again changes nothing."""
-    return engine.missions.put(mission_id, body).status()
+    """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
+    mission = engine.missions.put(mission_id, body)
+    engine.compiler.compile(mission)
+    return mission.status()
 
 
 @router.get("/missions/{mission_id}", responses=documented(404, 422), tags=["missions"])
@@ -90,6 +93,20 @@ async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus
 async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     """Forget a mission and what it learned."""
     engine.missions.delete(mission_id)
+
+
+@router.get("/missions/{mission_id}/guidance", responses=documented(404, 422), tags=["missions"])
+async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
+    """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
+    return engine.missions.get(mission_id).guidance.told(mission_id)
+
+
+@router.post("/missions/{mission_id}/guidance", responses=documented(400, 404, 409, 413, 415, 422), tags=["missions"])
+async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
+    """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
+    mission = engine.missions.get(mission_id)
+    mission.obey(body)
+    return mission.guidance.told(mission_id)
 
 
 @router.get("/healthz", tags=["operation"])

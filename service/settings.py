@@ -82,8 +82,13 @@ class Settings(BaseSettings):
     # Tokens of the embedded model's context; the settings are refused where the longest prompt would not fit.
     llm_context: int = Field(4096, ge=512, le=131_072)
 
-    # Who decides by default: `llm` (the paper's method) or `value` (what the modules learned; no LLM is started).
+    # Who decides by default: `llm` (the paper's method), `guided` (the LLM among other advisers), `value` (what the
+    # modules learned) or `policy` (the planner); with the last two no LLM is started.
     mode: Mode = "llm"
+    # Whether the LLM-free policy plans (extra `planner`) or looks one step ahead.
+    planner: Literal["on", "off"] = "on"
+    # Milliseconds that one search for a plan may take; the best plan until then counts.
+    planner_ms: int = Field(500, ge=10, le=60_000)
     # Milliseconds from request to answer unless the request says otherwise. A third of the paper's 10 s
     # step, so that three UAVs deciding one after another still fit into it.
     deadline_ms: int = Field(3000, ge=10, le=60_000)

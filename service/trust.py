@@ -4,14 +4,17 @@ Every adviser e gives a distribution over the same candidates at every decision,
 them at each decision, not only for the one that was followed: full information. That is Hedge (Freund and Schapire
 1997), and EXP4's experts (Auer, Cesa-Bianchi, Freund and Schapire 2002) without its exploration:
 
-    w_e <- (1 - share) w_e exp(-rate l_e) / Z + share / N,     l_e = sum_a p_e(a) l(a),     0 <= l <= cap
+    w_e <- (1 - share) w_e exp(-rate l_e) / Z + share prior_e,     l_e = sum_a p_e(a) l(a),     0 <= l <= cap
 
 Hedge's bound (Freund and Schapire 1997, theorem 2), for decisions drawn from the weights and losses of 0..cap: over any
 number of decisions it loses at most ``cap (rate L_e + ln(1 / prior_e)) / (1 - exp(-rate cap))`` for every adviser e and
-its loss L_e. With the rate 0.3, the cap 8 and a prior of 0.5 that is 6.1 packets + 2.6 L_e: to find out a faultless
-adviser costs six packets of estimated loss, however many decisions a mission has. The fixed share (Herbster and Warmuth
-1998) keeps every adviser alive, so that one that turns good is found again. An adviser that is silent keeps its odds
-against the others (sleeping experts: Freund, Schapire, Singer and Warmuth 1997).
+its loss L_e. With the rate 0.6, the cap 8 and a prior of 0.5 that is 5.6 packets + 4.8 L_e: to find out a faultless
+adviser costs six packets of estimated loss, however many decisions a mission has. That bound is plain Hedge's, of
+estimated losses and of draws. What is flown is the best candidate and the weights are shared, so it is a guide to the
+constants and no promise of lost packets. The fixed share (Herbster and Warmuth 1998), to the prior (Bousquet and
+Warmuth 2002, to the start vector), keeps every adviser alive, so that one that turns good is found again, and where all
+do alike the prior comes back. An adviser that is silent keeps its odds against the others (sleeping experts: Freund,
+Schapire, Singer and Warmuth 1997).
 
 ``l(a)`` is the critic's regret of a candidate, corrected by what really happened. After action b was flown, with the
 probability q(b) behind it, the surprise ``s = c - E[c | b]`` is added where an adviser had advised b, as a doubly
@@ -34,7 +37,7 @@ from math import exp
 # Of the weight, a decision: an adviser that turns good after it was given up is back in some ten decisions.
 _SHARE = 0.01
 # A packet of regret is worth this much in log-odds.
-RATE = 0.3
+RATE = 0.6
 # Packets: one decision, however bad, costs an adviser no more.
 CAP = 8.0
 # A failed transmission more than predicted counts as this many packets.
@@ -69,7 +72,8 @@ class Trust:
         self._open: OrderedDict[str, Advice] = OrderedDict()
         self._most_open = most_open
         total = sum(prior.values())
-        self._weights = {name: weight / total for name, weight in prior.items()}
+        self._prior = {name: weight / total for name, weight in prior.items()}
+        self._weights = dict(self._prior)
         self._surprise = 0.0
         self.updates = 0
 
@@ -118,6 +122,8 @@ class Trust:
             loss = regret[name] + min(flown[name] / behind, 1.0 / _LEAST_BEHIND) * surprise
             weighed[name] = weight * exp(-RATE * max(-CAP, min(CAP, loss)))
         total = sum(weighed.values())
+        prior = sum(self._prior[name] for name in weighed)
         for name in weighed:
-            self._weights[name] = held * ((1.0 - _SHARE) * weighed[name] / total + _SHARE / len(weighed))
+            kept = (1.0 - _SHARE) * weighed[name] / total
+            self._weights[name] = held * (kept + _SHARE * self._prior[name] / prior)
         self.updates += 1

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from service.asked import Asked
 from service.attention import top_k
 from service.features import State, augment
 from service.learner import Sample
@@ -22,12 +23,14 @@ from shared.wire import Candidate, UavState
 class View:
     """A UAV's view at one step. ``rows`` index the state's arrays: the k sensors kept, best first.
 
-    Without attention ``rows`` are all that is admissible, in the request's order.
+    Without attention ``rows`` are all that is admissible, in the request's order. ``asked`` is what the operator's
+    guidance asks of this step, if it asks for anything.
     """
 
     uav_id: int
     step: int
     state: State
+    asked: Asked | None = None
     rows: list[int] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     _admissible: list[int] = field(default_factory=list)
@@ -44,9 +47,12 @@ class View:
             visits=mission.visits,
             rates=mission.rates,
             reserved=mission.reserved(step, uav.uav_id),
-            preset=mission.spec.features,
+            preset=mission.features,
+            belief=mission.belief if mission.decides_from == "fleet" else None,
         )
-        return cls(uav_id=uav.uav_id, step=step, state=state)
+        guidance, scenario = mission.guidance.obeyed, mission.scenario
+        asked = Asked.of(guidance, state, step, mission.visits, uav.uav_id, scenario)
+        return cls(uav_id=uav.uav_id, step=step, state=state, asked=asked)
 
     @property
     def offered(self) -> list[int]:
@@ -60,6 +66,10 @@ class View:
         if not self._admissible:
             return
         scores, self._contexts = mission.learner.current.score(self._features)
+        if self.asked is not None:
+            # A score is minus a cost, and what counts in a cost are packets / W.
+            added = self.asked.worth[:, self._admissible].max(axis=0) / mission.scenario.queue_capacity
+            scores = scores + torch.from_numpy(added.astype(np.float32))
         kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(self._admissible)))
         self.rows = [self._admissible[i] for i in kept]
         self.candidates = [
@@ -81,11 +91,14 @@ class View:
         return mission.memory.nearest(self._features[[self._admissible.index(row) for row in self.rows]])
 
     def by_value(self, mission: Mission) -> tuple[int, int]:
-        """The best-scored sensor and the best velocity for it, by the learned values."""
+        """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]
         approach = self.state.approach(row, mission.scenario)
         values = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], approach)
-        return int(self.state.ids[row]), int(values.argmax())
+        level = int(values.argmax())
+        if self.asked is not None:
+            level = self.asked.nearest(row, level)
+        return int(self.state.ids[row]), level
 
     def values(self, mission: Mission) -> dict[int, NDArray[np.float32]]:
         """What the modules think of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v."""

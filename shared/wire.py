@@ -8,12 +8,21 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from shared.scenario import Scenario
 
 MAX_SENSORS = 10_000
 MAX_STEP = 1_000_000
+# Characters of an operator's note: it stands in every prompt.
+MAX_NOTE = 280
+
+
+def _one_paragraph(text: str) -> str:
+    if not text.isprintable() or not text.strip():
+        raise ValueError("must be one paragraph of printable characters, without line breaks or control characters")
+    return text
+
 
 MissionId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$", examples=["default"])]
 DecisionId = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", examples=["0123456789abcdef0123456789abcdef"])]
@@ -21,15 +30,18 @@ UavId = Annotated[int, Field(ge=0, le=99)]
 Step = Annotated[int, Field(ge=0, le=MAX_STEP)]
 SensorId = Annotated[int, Field(ge=0, lt=MAX_SENSORS)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Note = Annotated[str, Field(max_length=MAX_NOTE), AfterValidator(_one_paragraph)]
 DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
 
-Mode = Literal["llm", "guided", "value"]
+Mode = Literal["llm", "guided", "value", "policy"]
 Init = Literal["pretrained", "random"]
 Features = Literal["paper", "reach"]
+Belief = Literal["fleet", "reported"]
 Selection = Literal["recent", "similar", "best"]
 Source = Literal["llm", "guided", "value", "policy"]
 Reason = Literal[
     "mode_value",
+    "mode_policy",
     "no_candidate",
     "llm_loading",
     "llm_unavailable",
@@ -261,12 +273,26 @@ class MissionSpec(Wire):
     mode: Mode | None = Field(None, description="default: the service's")
     top_k: int | None = Field(None, ge=1, le=100, description="default: the service's")
     attention: Literal["on", "off"] = Field("on", description="`off`: no pruning, every admissible sensor is offered")
-    features: Features = Field(
-        "paper", description="what the modules see; `reach`: also what the trajectory brings in reach"
+    features: Features | None = Field(
+        None,
+        description="what the modules see: `paper`, its five, or `reach`, also what the trajectory brings in reach; "
+        "default: `paper` in mode `llm`, else `reach`",
+    )
+    belief: Belief | None = Field(
+        None,
+        description="what is decided from: `fleet`, the newest that any UAV reported, rolled forward, or `reported`, "
+        "what the UAV itself last heard; default: `reported` in mode `llm`, the paper's method, else `fleet`",
+    )
+    planner: Literal["on", "off"] | None = Field(
+        None, description="`off`: one step of look-ahead is the LLM-free policy; default: the service's"
     )
     prompt: PromptStyle = PromptStyle()
     init: Init = Field("pretrained", description="the modules' start; `random` is the paper's")
     seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights and of shuffled rows")
+    note: Note | None = Field(
+        None,
+        description="the operator's, in plain words, such as `suspected leak at sensor 4: visit it every third step`",
+    )
 
 
 class MissionStatus(Wire):
@@ -278,6 +304,8 @@ class MissionStatus(Wire):
     top_k: int
     attention: Literal["on", "off"] = "on"
     features: Features = "paper"
+    belief: Belief = "fleet"
+    planner: Literal["on", "off"] = Field("off", description="`on` where it is wanted, installed, and up to the size")
     prompt: PromptStyle = PromptStyle()
     init: Init
     seed: int

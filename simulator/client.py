@@ -14,6 +14,7 @@ from typing import Self, TypeVar
 import httpx
 from pydantic import BaseModel, ValidationError
 
+from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.wire import (
     DecideRequest,
     DecideResponse,
@@ -174,6 +175,18 @@ class EdgeClient:
         path = f"/missions/{mission_id}"
         answer, _ = self._exchange("PUT", path, spec)
         return self._parse(MissionStatus, answer, path)
+
+    def guidance(self, mission_id: str) -> GuidanceStatus:
+        """What the edge understood of the operator's note."""
+        path = f"/missions/{mission_id}/guidance"
+        answer, _ = self._exchange("GET", path, b"")
+        return self._parse(GuidanceStatus, answer, path)
+
+    def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> GuidanceStatus:
+        """Confirm or reject it, or give a structure in its place."""
+        path = f"/missions/{mission_id}/guidance"
+        answer, _ = self._exchange("POST", path, given)
+        return self._parse(GuidanceStatus, answer, path)
 
     def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
         """Ask for one decision, and time it; ``attempts`` overrides the client's."""

@@ -106,7 +106,8 @@ class Simulate:
     channel), max_gain (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner,
     extra `planner`), madqn or mappo (trained networks, extra `marl`)."""
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
-    """How the edge decides: llm (the paper's method) or value (what its modules learned). Default: the edge's."""
+    """How the edge decides: llm (the paper's method), guided (the LLM among other advisers), value (what its modules
+    learned) or policy (the planner). Default: the edge's."""
     deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0

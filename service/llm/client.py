@@ -168,6 +168,38 @@ def label_body(
     return body
 
 
+def rewriting_body(
+    model: str | None,
+    instruction: str,
+    examples: Sequence[tuple[str, str]],
+    text: str,
+    held: dict[str, Any],
+    temperature: float,
+    seed: int,
+) -> dict[str, Any]:
+    """The request body for rewriting a text as the examples are, which are shown as turns of the conversation.
+
+    Args:
+        held: the fields that hold the server to the answer's form.
+    """
+    turns = [
+        {"role": role, "content": content}
+        for example in examples
+        for role, content in zip(("user", "assistant"), example, strict=True)
+    ]
+    body: dict[str, Any] = {
+        "messages": [{"role": "system", "content": instruction}, *turns, {"role": "user", "content": text}],
+        "temperature": temperature,
+        "seed": seed,
+        "max_tokens": 128,
+        "stream": False,
+        **held,
+    }
+    if model:
+        body["model"] = model
+    return body
+
+
 def _first_token(choice: Any) -> dict[str, float]:
     """Probabilities of the likeliest first tokens: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
     try:

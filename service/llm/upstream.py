@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.llm.answer import Constraint, NoDecision
-from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body
+from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body, rewriting_body
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
+from service.orders import INSTRUCTION, constrain_orders
 from service.prompt import Template
 from service.settings import Settings
 from shared.scenario import SCENARIOS
@@ -21,6 +24,11 @@ log = logging.getLogger(__name__)
 
 _RETRY_S = 5.0
 _PROBE_TIMEOUT_S = 60.0
+# What is no decision gives way to one so often, and waits so long for so much silence between them: each spoils the
+# other's prefix cache. In a mission decisions come seconds apart.
+_STEPS_BACK = 3
+_SILENCE_S = 0.5
+_PATIENCE_S = 10.0
 # No model says this of its own accord, so a server that answers it has obeyed the constraint.
 _PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
 _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
@@ -41,7 +49,7 @@ class Upstream:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._status = _Status("off" if settings.mode == "value" else "loading")
+        self._status = _Status("off" if settings.mode in ("value", "policy") else "loading")
         self._client: LLMClient | None = None
         self._embedded: EmbeddedServer | None = None
         self._task: asyncio.Task[None] | None = None
@@ -49,6 +57,9 @@ class Upstream:
         self.constraint: Constraint = "none"
         # Whether the server tells the probabilities of tokens.
         self.logprobs = False
+        self._deciding = 0
+        self._decided_at = -math.inf
+        self._beside: asyncio.Task[Completion] | None = None
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
@@ -88,7 +99,7 @@ class Upstream:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        return await self._ask(chat_body(self.model, system, user, self.constraint, sensor_ids, velocities))
+        return await self._decide(chat_body(self.model, system, user, self.constraint, sensor_ids, velocities))
 
     async def ask_label(self, system: str, user: str, labels: Sequence[str]) -> Completion:
         """One token that should be a label, with the likeliest tokens' probabilities where the server tells them.
@@ -96,7 +107,49 @@ class Upstream:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        return await self._ask(label_body(self.model, system, user, self.constraint, labels, self.logprobs))
+        return await self._decide(label_body(self.model, system, user, self.constraint, labels, self.logprobs))
+
+    async def ask_orders(
+        self, note: str, examples: Sequence[tuple[str, str]], orders: Sequence[str], *, temperature: float, seed: int
+    ) -> str:
+        """An operator's note as some of these orders, where the server can be held to them.
+
+        The embedded model has one slot: a decision that asks it meanwhile goes first, a few times.
+
+        Raises:
+            NoDecision: no answer, with the reason.
+        """
+        held = constrain_orders(self.constraint, orders)
+        body = rewriting_body(self.model, INSTRUCTION, examples, note, held, temperature, seed)
+        for _ in range(_STEPS_BACK if self._embedded is not None else 0):
+            await self._silence()
+            self._beside = asyncio.create_task(self._ask(body), name="ask-beside")
+            try:
+                await asyncio.wait({self._beside})
+            finally:
+                self._beside.cancel()
+            if not self._beside.cancelled():
+                return self._beside.result().text
+        return (await self._ask(body)).text
+
+    async def _decide(self, body: dict[str, Any]) -> Completion:
+        """Ask for a decision: what is asked beside is given up for it."""
+        self._deciding += 1
+        if self._beside is not None:
+            self._beside.cancel()
+        try:
+            return await self._ask(body)
+        finally:
+            self._deciding -= 1
+            self._decided_at = time.monotonic()
+
+    async def _silence(self) -> None:
+        """Wait until no decision has been asked for a while, but not for ever."""
+        begun = time.monotonic()
+        while (now := time.monotonic()) < begun + _PATIENCE_S:
+            if not self._deciding and now - max(begun, self._decided_at) >= _SILENCE_S:
+                return
+            await asyncio.sleep(min(0.1, _SILENCE_S))
 
     async def _ask(self, body: dict[str, Any]) -> Completion:
         if self._client is None or self.status != "ready":

@@ -45,6 +45,7 @@ class FleetBelief:
         heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
         battery: shape ``(J,)``, joules.
         arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps that they came in.
+        visited: shape ``(J,)``, the step of the last visit, as far as UAVs did what they were told; -1 for none.
         uavs: by index, those that were ever located.
     """
 
@@ -63,6 +64,7 @@ class FleetBelief:
         self.heard: IntArray = np.full(count, -1)
         self.battery: FloatArray = np.full(count, scenario.battery_j)
         self.places: FloatArray = np.full((count, 2), np.nan)
+        self.visited: IntArray = np.full(count, -1)
         self.uavs: dict[int, Whereabouts] = {}
 
     @property
@@ -126,6 +128,7 @@ class FleetBelief:
         """Subtract what a UAV collects in a step."""
         self.base[sensor] = max(0.0, self.queue(step)[sensor] - packets)
         self.since[sensor] = step
+        self.visited[sensor] = max(int(self.visited[sensor]), step)
 
     def queue(self, step: int) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``."""

@@ -67,6 +67,7 @@ class Formulation:
     def __init__(self, problem: FleetProblem, links: Links = "exact") -> None:
         self.problem = problem
         self._links = links
+        self._neglect = problem.neglect
         self.model = cp_model.CpModel()
         self.flown: list[list[Any]] = []
         self.serves: dict[Serve, Any] = {}
@@ -118,7 +119,11 @@ class Formulation:
         for step in range(len(row), problem.horizon):
             reached = links[start : start + (step + 1 - len(fixed)) * fastest + 1]
             now = model.new_int_var(start, start + len(reached) - 1, f"c_{uav}_{step}")
-            model.add_linear_constraint(now - (row[-1] if row else 0), 0, fastest)
+            velocity = now - (row[-1] if row else 0)
+            if problem.allowed is None:
+                model.add_linear_constraint(velocity, 0, fastest)
+            else:
+                model.add_linear_expression_in_domain(velocity, cp_model.Domain.from_values(problem.levels.tolist()))
             row.append(now)
             self._serve_within(uav, step, now, np.minimum(reached, self._most[step]), start)
         self.flown.append(row)
@@ -205,16 +210,18 @@ class Formulation:
                     self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
 
     def _expect(self, sensor: int, lost: list[Any], visits: list[Visits]) -> None:
-        """The cost of one sensor: what it loses, or what it is expected to if that is more."""
-        risk = self.problem.risk
-        if risk is None:
-            self._costs += [SCALE * over for over in lost]
+        """The cost of one sensor: what it loses as it counts, or what is paid for leaving it alone if that is more."""
+        neglect, weights = self._neglect, self.problem.weights
+        packet = SCALE if weights is None else round(SCALE * float(weights[sensor]))
+        if neglect is None:
+            self._costs += [packet * over for over in lost]
             return
-        steps = np.rint(SCALE * risk[:, :, sensor]).astype(int)
+        steps = np.rint(SCALE * neglect[:, :, sensor]).astype(int)
         for step, column in enumerate(steps.T):
-            cost = self.model.new_int_var(0, int(column.max(initial=0)) + SCALE * int(self._overflow[step, sensor]), "")
+            most = int(column.max(initial=0)) + packet * int(self._overflow[step, sensor])
+            cost = self.model.new_int_var(0, most, "")
             if step < len(lost):
-                self.model.add(cost >= SCALE * lost[step])
+                self.model.add(cost >= packet * lost[step])
             for since, expected in enumerate(column[: step + 1].tolist()):
                 if expected > (column[since + 1] if since < step else 0):
                     within = _total(literal for now in visits[since : step + 1] for literal, _ in now)

@@ -22,15 +22,21 @@ def look_ahead(problem: FleetProblem) -> IntArray:
     Step by step and in the order of their indices, every UAV takes the sensor and the velocity of greatest
     ``U_j min(q_j, packets movable from the new position) + 0.5 v``, with the urgency
     ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.urgency`, its Poisson taken as a normal of the same mean.
-    Sensors that another takes in the same step are left to it. Batteries are taken to last.
+    Sensors that another takes in the same step are left to it. Batteries are taken to last. The urgent packets of a
+    sensor count as often as its lost ones, and in reach of it what is paid for it being late counts too.
     """
     world = problem.scenario
     window = max(1, math.ceil(world.overflow_horizon_steps))
     actions = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
     flown = np.zeros(problem.uavs, dtype=np.int64)
     queue: FloatArray = problem.queue.astype(np.float64)
+    since = np.zeros(problem.sensors, dtype=np.int64)
+    every = np.arange(problem.sensors)
     for step in range(problem.horizon):
         urgent = _urgency(queue, problem.arrivals[step : step + window].mean(axis=0), world)
+        late = None if problem.late is None else problem.late[since, step, every]
+        if problem.weights is not None:
+            urgent = urgent * problem.weights
         told = {uav: fixed[step] for uav, fixed in problem.fixed.items() if step < len(fixed)}
         free = np.ones(problem.sensors, dtype=np.bool_) if problem.usable is None else problem.usable[step].copy()
         free[[int(sensor) for sensor, _ in told.values()]] = False
@@ -40,13 +46,14 @@ def look_ahead(problem: FleetProblem) -> IntArray:
                 sensor, velocity = told[uav].tolist()
                 packets = _links(problem, uav, flown[uav] + np.array([velocity]))[0]
             else:
-                links = _links(problem, uav, flown[uav] + np.arange(world.max_velocity + 1))
-                sensor, velocity = _best(links, queue, urgent, free)
-                packets = links[velocity]
+                links = _links(problem, uav, flown[uav] + problem.levels)
+                sensor, level = _best(links, queue, urgent, free, problem.levels, late)
+                velocity, packets = int(problem.levels[level]), links[level]
                 free[sensor] = False
             actions[step, uav] = sensor, velocity
             flown[uav] += velocity
             moved[sensor] = max(moved[sensor], float(packets[sensor]))
+        since[moved > 0] = step + 1
         queue = np.minimum(np.maximum(queue - moved, 0.0) + problem.arrivals[step], world.queue_capacity)
     return actions
 
@@ -61,9 +68,19 @@ def _links(problem: FleetProblem, uav: int, velocity: IntArray) -> IntArray:
     return packets_per_step(problem.distance(uav, velocity), problem.scenario)
 
 
-def _best(links: IntArray, queue: FloatArray, urgent: FloatArray, usable: NDArray[np.bool_]) -> tuple[int, int]:
-    """Sensor and velocity, of links ``(V, J)``."""
-    worth = np.where(usable, urgent * np.minimum(queue, links), -1.0)
-    worth += _VELOCITY_BONUS * np.arange(len(links))[:, None]
-    velocity, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
-    return int(sensor), int(velocity)
+def _best(
+    links: IntArray,
+    queue: FloatArray,
+    urgent: FloatArray,
+    usable: NDArray[np.bool_],
+    levels: IntArray,
+    late: FloatArray | None,
+) -> tuple[int, int]:
+    """Sensor and index of the velocity level, of links ``(levels, J)``."""
+    worth = urgent * np.minimum(queue, links)
+    if late is not None:
+        worth = worth + late * (links > 0)
+    worth = np.where(usable, worth, -1.0)
+    worth += _VELOCITY_BONUS * levels[:, None]
+    level, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
+    return int(sensor), int(level)

@@ -34,6 +34,11 @@ class FleetProblem:
             sensor is expected to lose in step e (H stands for all later steps) if nobody has visited it since step s
             began. Its last visit was then in step s - 1 and emptied it; s = 0 means before the plan. Only s <= e
             counts. ``None``: arrivals are certain.
+        allowed: shape ``(V,)``, the velocities 0..V - 1 that a plan may fly at; ``None``: all. Fixed actions are not
+            held to it.
+        weights: shape ``(J,)``, how many times each sensor's lost packets count; ``None``: once.
+        late: shape ``(H + 1, H + 1, J)`` as ``risk``: packets that are paid for leaving a sensor alone so long, beside
+            what it loses. Never less for an earlier s. ``None``: nothing.
 
     Raises:
         ValueError: a shape or a value is wrong; the message names the field.
@@ -49,6 +54,9 @@ class FleetProblem:
     fixed: Mapping[int, IntArray] = field(default_factory=dict)
     usable: NDArray[np.bool_] | None = None
     risk: FloatArray | None = None
+    allowed: NDArray[np.bool_] | None = None
+    weights: FloatArray | None = None
+    late: FloatArray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.places)
@@ -63,8 +71,13 @@ class FleetProblem:
         }
         if self.usable is not None:
             shapes["usable"] = (self.horizon, count)
-        if self.risk is not None:
-            shapes["risk"] = (self.horizon + 1, self.horizon + 1, count)
+        if self.allowed is not None:
+            shapes["allowed"] = (self.scenario.max_velocity + 1,)
+        if self.weights is not None:
+            shapes["weights"] = (count,)
+        for name in ("risk", "late"):
+            if getattr(self, name) is not None:
+                shapes[name] = (self.horizon + 1, self.horizon + 1, count)
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, must be {shape}")
@@ -73,6 +86,8 @@ class FleetProblem:
                 raise ValueError(f"{name} must be whole packets, at least 0")
         if self.queue.max(initial=0) > self.scenario.queue_capacity:
             raise ValueError(f"queue has {self.queue.max()} packets, the capacity is {self.scenario.queue_capacity}")
+        if self.allowed is not None and not self.allowed.any():
+            raise ValueError("allowed has no velocity")
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
                 shape = actions.shape
@@ -92,6 +107,20 @@ class FleetProblem:
     def sensors(self) -> int:
         """Sensors J."""
         return len(self.places)
+
+    @property
+    def levels(self) -> IntArray:
+        """The velocities that a plan may fly at, slowest first."""
+        every = np.arange(self.scenario.max_velocity + 1)
+        return every if self.allowed is None else every[self.allowed]
+
+    @property
+    def neglect(self) -> FloatArray | None:
+        """What is paid for leaving sensors alone: the risk as it counts, and lateness; ``None`` where nothing is."""
+        if self.late is None:
+            return self.risk if self.risk is None or self.weights is None else self.risk * self.weights
+        risk = np.zeros_like(self.late) if self.risk is None else self.risk
+        return self.late + (risk if self.weights is None else risk * self.weights)
 
     def distance(self, uav: int, velocity: IntArray) -> FloatArray:
         """Horizontal distances to all sensors, ``(..., J)`` metres, after steps at velocities that sum to ``(...)``."""
@@ -143,19 +172,21 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
 
 
 def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
-    """The packets that actions lose, and what a plan minimises: those and what is expected above them."""
+    """The packets that actions lose, and what a plan minimises: those as they count and what is expected above them."""
     course = fly(problem, actions)
     lost = int(course.lost.sum())
-    if problem.risk is None:
-        return lost, float(lost)
+    paid = course.lost if problem.weights is None else course.lost * problem.weights
+    neglect = problem.neglect
+    if neglect is None:
+        return lost, float(paid.sum())
     since = np.zeros(problem.sensors, dtype=np.int64)
     cost, every = 0.0, np.arange(problem.sensors)
     for step in range(problem.horizon):
         since[actions[step, course.link[step] > 0, 0]] = step + 1
         # A sensor visited in this very step has its risk from the next one on.
-        expected = np.where(since <= step, problem.risk[np.minimum(since, step), step, every], 0.0)
-        cost += float(np.maximum(expected, course.lost[step]).sum())
-    return lost, cost + float(problem.risk[since, problem.horizon, every].sum())
+        expected = np.where(since <= step, neglect[np.minimum(since, step), step, every], 0.0)
+        cost += float(np.maximum(expected, paid[step]).sum())
+    return lost, cost + float(neglect[since, problem.horizon, every].sum())
 
 
 def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float]]]:

@@ -15,6 +15,7 @@ from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import FleetProblem, IntArray, price
 from shared.fleetplan.risk import neglect
 from shared.fleetplan.solver import Budget, Plan, plan
+from shared.guidance import NO_GUIDANCE, Guidance
 from shared.scenario import Scenario
 
 _HORIZON = 8
@@ -82,11 +83,13 @@ class RecedingHorizon:
 
     Attributes:
         plans: by UAV, its planned actions ``(n, 2)``, sensor (-1: none) and velocity, from step ``step`` on.
+        guidance: what plans obey from the next one on.
     """
 
     def __init__(self, scenario: Scenario, belief: FleetBelief) -> None:
         self._scenario = scenario
         self._belief = belief
+        self.guidance: Guidance = NO_GUIDANCE
         self.step = -1
         self.plans: dict[int, IntArray] = {}
         self._joint = scenario.uavs <= _JOINT_UAVS
@@ -138,9 +141,10 @@ class RecedingHorizon:
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
             **self._outlook(kept, horizon),
+            **self._guided(kept, horizon),
         )
         before = np.empty((horizon, len(present), 2), dtype=np.int64)
-        before[:] = nowhere, world.max_velocity
+        before[:] = nowhere, problem.levels[-1]
         for column, u in enumerate(present):
             last = self.plans.get(u, np.empty((0, 2), dtype=np.int64))[:horizon]
             before[: len(last), column] = renamed(last).reshape(-1, 2)
@@ -168,6 +172,9 @@ class RecedingHorizon:
             near |= (belief.distances(uav, flown) <= world.radio_radius_m).any(axis=0)
         near |= not near.any()
         room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.rate, 1e-9)
+        if self.guidance.wishes:
+            # Where to go is the operator's to say, whatever fills first.
+            room = np.where(np.isfinite(self.guidance.every(world.sensors)), -1.0, room)
         order = np.argsort(np.where(near, room, np.inf), kind="stable")
         return np.sort(order[: min(int(near.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
 
@@ -182,7 +189,6 @@ class RecedingHorizon:
         world, belief, step = self._scenario, self._belief, self.step
         queue, rate = belief.queue(step)[kept], belief.rate[kept]
         came = np.rint(queue + np.arange(horizon + 1)[:, None] * rate).astype(np.int64)
-        beyond = max(0, min(_BEYOND, world.steps - step - horizon)) if step < world.steps else _BEYOND
         risk = neglect(
             base=belief.base[kept],
             base_variance=belief.base_variance[kept],
@@ -191,7 +197,7 @@ class RecedingHorizon:
             rate_variance=rate / belief.watched[kept],
             capacity=world.queue_capacity,
             horizon=horizon,
-            beyond=beyond,
+            beyond=self._beyond(horizon),
         )
         return {
             "queue": np.append(np.minimum(came[0], world.queue_capacity), 0),
@@ -199,3 +205,20 @@ class RecedingHorizon:
             "arrivals": np.pad(np.diff(came, axis=0), ((0, 0), (0, 1))),
             "risk": np.pad(risk, ((0, 0), (0, 0), (0, 1))),
         }
+
+    def _beyond(self, horizon: int) -> int:
+        """Steps after the plan that count."""
+        left = self._scenario.steps - self.step
+        return max(0, min(_BEYOND, left - horizon)) if left > 0 else _BEYOND
+
+    def _guided(self, kept: IntArray, horizon: int) -> dict[str, Any]:
+        """What the guidance asks for, of the kept sensors and of one nowhere."""
+        asked: dict[str, Any] = {}
+        world, step = self._scenario, self.step
+        if self.guidance.restricts:
+            asked["allowed"] = self.guidance.allowed(world.max_velocity + 1)
+        if self.guidance.wishes:
+            asked["weights"] = np.append(self.guidance.weights(world.sensors)[kept], 1.0)
+            late = self.guidance.lateness(step, self._belief.visited, horizon, self._beyond(horizon))
+            asked["late"] = np.pad(late[:, :, kept], ((0, 0), (0, 0), (0, 1)))
+        return asked

@@ -317,12 +317,16 @@ def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any
 
 
 def _begun_as_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
-    """The actions, or everyone at full speed at sensor 0, with the problem's fixed ones at their beginning."""
+    """The actions, or everyone at full speed at sensor 0, with the problem's fixed ones at their beginning.
+
+    Velocities that are not allowed give way to the nearest that are.
+    """
     if actions is None:
         begun = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
-        begun[:, :, 1] = problem.scenario.max_velocity
+        begun[:, :, 1] = problem.levels[-1]
     else:
         begun = actions.copy()
+        begun[:, :, 1] = problem.levels[np.abs(begun[:, :, 1, None] - problem.levels).argmin(axis=-1)]
     for uav, fixed in problem.fixed.items():
         begun[: len(fixed), uav] = fixed
     return begun

@@ -11,6 +11,7 @@ from simulator.experiments import (
     guided,
     latency,
     llm_models,
+    obedience,
     scenarios,
     scheduler,
     tokens,
@@ -31,6 +32,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         ablation_prompt,
         ablation_features,
         llm_models,
+        obedience,
         aoi,
         scenarios,
     )

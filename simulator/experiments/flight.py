@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from shared.guidance import Guidance, GuidanceState
 from simulator.experiments.schemes import Scheme
 from simulator.record import Record, naming_out
 from simulator.site import Site
@@ -60,7 +61,8 @@ class BoundFound(Record):
 class Flown(Record):
     """One flight. ``failures``, ``overflows`` and ``lost_packets`` have one entry a step.
 
-    Of the bound the lists are empty and ``bound`` is there. ``commit`` is the code's that flew it.
+    Of the bound the lists are empty and ``bound`` is there. ``commit`` is the code's that flew it. Where an operator
+    asked for something, ``meant`` is what, and ``guidance`` how the edge took it.
     """
 
     seed: int
@@ -77,6 +79,8 @@ class Flown(Record):
     lost_packets: list[int] = []
     decisions: list[Decided] = []
     bound: BoundFound | None = None
+    meant: Guidance | None = None
+    guidance: GuidanceState | None = None
 
 
 def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> str:
@@ -87,6 +91,9 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
     """
     arrivals = None if site.arrivals is None else hashlib.sha256(site.arrivals.tobytes()).hexdigest()
     decides: dict[str, Any] = scheme.decides.model_dump(mode="json")
+    if decides.get("operator") is None:
+        # Flights without one keep the key that they had before there were any.
+        decides.pop("operator", None)
     if identity is not None:
         decides["identity"] = identity
     whole = {

@@ -6,6 +6,7 @@ import subprocess
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from simulator.client import EdgeError
 from simulator.experiments.edges import EdgeAt, radio
@@ -77,15 +78,22 @@ def fly_over(edge: EdgeAt, planned: Planned) -> Flown:
         radio(edge.url, decides.deadline_ms, scenario, planned.seed) as air,
     ):
         pilot = EdgePilot(air, mission_id, scenario, planned.seed, deadline_ms=decides.deadline_ms)
-        pilot.spec = pilot.spec.model_validate({**pilot.spec.model_dump(), **decides.spec})
+        operator, asked = decides.operator, dict[str, Any]()
+        spec = {**pilot.spec.model_dump(), **decides.spec}
+        if operator is not None:
+            spec["note"] = operator.note(planned.seed)
+            asked["meant"] = operator.told(planned.seed).meant
+        pilot.spec = pilot.spec.model_validate(spec)
         try:
             ground.put_mission(mission_id, pilot.spec)
+            if operator is not None:
+                asked["guidance"] = operator.answer(ground, mission_id, planned.seed)
         except EdgeError:
             edge.alive()
             raise
         flight = fly(planned.site, pilot, planned.seed, on_decision=check)
     edge.alive()
-    return _kept(planned, flight, edge.model)
+    return _kept(planned, flight, edge.model).model_copy(update=asked)
 
 
 def _bound(planned: Planned, seconds: float) -> Flown:

@@ -69,6 +69,28 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return sum(there) / len(there) if there else None
 
 
+def _deadlines_met(flight: Flown) -> float | None:
+    """Of the steps from n - 1 on, those at whose end a sensor to be visited every n steps was served in the last n."""
+    met = []
+    for wish in flight.meant.sensors if flight.meant is not None else []:
+        if wish.visit_every is None:
+            continue
+        served = {d.step for d in flight.decisions if d.sensor == wish.sensor_id and not d.failed}
+        for step in range(wish.visit_every - 1, flight.steps):
+            met.append(not served.isdisjoint(range(step - wish.visit_every + 1, step + 1)))
+    return 100 * sum(met) / len(met) if met else None
+
+
+def _velocities_allowed(flight: Flown) -> float | None:
+    if flight.meant is None or not flight.decisions:
+        return None
+    return 100 * sum(flight.meant.allows(d.velocity) for d in flight.decisions) / len(flight.decisions)
+
+
+def _confirmed(flight: Flown) -> float | None:
+    return None if flight.guidance is None else 100.0 * (flight.guidance == "confirmed")
+
+
 def _tokens(field: Callable[[Counted], float | None]) -> Callable[[Flown], float | None]:
     return lambda flight: _mean(field(d.tokens) for d in flight.decisions if d.tokens is not None)
 
@@ -145,6 +167,9 @@ MEASURES: dict[str, Measure] = {
     "share_network": Measure(
         "HTTP and network, % of the round trip", _share(lambda d: (d.rtt_ms or 0.0) - d.latency_ms.get("total", 0.0))
     ),
+    "deadlines_met_pct": Measure("visit deadlines met, %", _deadlines_met),
+    "velocities_allowed_pct": Measure("steps at allowed velocities, %", _velocities_allowed),
+    "guidance_confirmed_pct": Measure("guidance confirmed, %", _confirmed),
     "llm_decided_pct": Measure(
         "decided by the LLM, %", lambda f: 100 * sum(d.source == "llm" for d in f.decisions) / len(f.decisions)
     ),

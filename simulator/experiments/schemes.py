@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from shared.wire import MissionSpec
+from simulator.experiments.operators import Operator
 from simulator.record import Record
 
 # Decisions through an edge are compared for what they are, not for how fast this machine is.
@@ -31,13 +32,14 @@ class OverEdge(Record):
 
     ``backing`` is ``off`` (an edge without LLM), ``asked`` (what ``--llm`` names), ``chance`` (an LLM that answers
     uniform draws), ``worst`` (the emptiest queue, as fast as can be) or a GGUF file's path. ``deadline_ms`` of ``None``
-    is the edge's own.
+    is the edge's own. ``operator`` says what is asked of the fleet in words, if anything is.
     """
 
     kind: Literal["edge"] = "edge"
     spec: dict[str, Any]
     backing: Backing = ASKED
     deadline_ms: int | None = GENEROUS_DEADLINE_MS
+    operator: Operator | None = None
 
 
 class Clairvoyant(Record):
@@ -106,6 +108,7 @@ def over_edge(
     *,
     backing: Backing = ASKED,
     deadline_ms: int | None = GENEROUS_DEADLINE_MS,
+    operator: Operator | None = None,
     **spec: Any,
 ) -> Scheme:
     """An edge whose mission has the ``spec`` fields given; 5 sensors kept and mode ``llm`` unless told.
@@ -115,7 +118,8 @@ def over_edge(
     """
     whole = MissionSpec.model_validate({"mode": "llm", "top_k": 5, **spec})
     kept = whole.model_dump(mode="json", exclude_defaults=True, exclude={"scenario", "seed"})
-    return Scheme(name=name, label=label, decides=OverEdge(spec=kept, backing=backing, deadline_ms=deadline_ms))
+    decides = OverEdge(spec=kept, backing=backing, deadline_ms=deadline_ms, operator=operator)
+    return Scheme(name=name, label=label, decides=decides)
 
 
 def llm() -> Scheme:

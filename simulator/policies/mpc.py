@@ -19,6 +19,7 @@ class RecedingHorizon:
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission; the seed is not used."""
+        self._scenario = scenario
         self._belief = FleetBelief(scenario)
         self._planner = Planner(scenario, self._belief)
 
@@ -41,9 +42,10 @@ class RecedingHorizon:
         return sensor, velocity
 
     def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
+        """The plan's action; no sensor (-1), at full speed, off the trajectory, where the way is unknown."""
         draft = self._planner.draft([uav], taken)
         if draft is None:
-            raise ValueError(f"UAV {uav} is off its trajectory")
+            return -1, self._scenario.max_velocity
         self._planner.adopt(draft, draft.search())
         sensor, velocity = self._planner.plans[uav][0].tolist()
         return int(sensor), int(velocity)

@@ -59,7 +59,7 @@ def test_help_tells_what_every_experiment_is() -> None:
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (["nonsense"], "there is no experiment 'nonsense': choose one of scheduler, attention"),
+        (["nonsense"], "there is no experiment 'nonsense': choose one of scheduler, guided, attention"),
         (["aoi", "--seeds", "0"], "--seeds 0"),
         (["aoi", "--steps", "0"], "--steps 0"),
         (["aoi", "--llm", "gpt"], "--llm gpt"),
@@ -158,10 +158,10 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
     ended = run("experiment", "llm-models", "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
     result = result_in(tmp_path, "llm-models")
-    assert list(result.schemes) == ["llm", "llm_chance", "value", "edge_policy", "eof", "random"]
+    assert list(result.schemes) == ["llm", "llm_chance", "guided", "value_reach", "edge_policy", "eof", "random"]
     for asked in ("llm", "llm_chance"):
         assert result.schemes[asked]["llm_decided_pct"].mean > 60
-    for unasked in ("value", "edge_policy"):
+    for unasked in ("value_reach", "edge_policy"):
         assert result.schemes[unasked]["llm_decided_pct"].mean == 0
     assert result.model == "SmolLM2-135M-Instruct.Q4_1"
     assert not any("not the LLM's" in note for note in result.notes)

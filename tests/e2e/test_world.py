@@ -29,9 +29,9 @@ def test_the_example_flown_on_board(tmp_path: Path) -> None:
     assert "pipeline_world" in report and "<svg" in report
 
 
-def flown_by_an_edge(mode: str, out: Path, *more: str) -> dict[str, Any]:
+def flown_by_an_edge(mode: str, out: Path, *more: str, planner: str = "on") -> dict[str, Any]:
     """The summary of a mission flown against an edge that has no LLM."""
-    with serving_edge(AICVDS_MODE=mode, AICVDS_LLM_GGUF="none") as (url, _):
+    with serving_edge(AICVDS_MODE=mode, AICVDS_LLM_GGUF="none", AICVDS_PLANNER=planner) as (url, _):
         flown = run("simulate", "--world", str(EXAMPLE), "--edge", url, "--out", str(out), *more)
     assert flown.returncode == 0, flown.stderr
     return summary_in(out)
@@ -45,10 +45,17 @@ def test_the_example_flown_by_the_edges_learned_values(tmp_path: Path) -> None:
 
 def test_the_example_flown_by_the_edges_look_ahead(tmp_path: Path) -> None:
     """It looks ahead along the routes: fast as it flies, what it chooses is in reach where the UAV then is."""
-    summary = flown_by_an_edge("llm", tmp_path)
+    summary = flown_by_an_edge("llm", tmp_path, planner="off")
     assert summary["by_source"]["policy"] == summary["decisions"] == 180
     decisions = read_decisions(tmp_path / "decisions.jsonl")
     assert np.mean([d.velocity for d in decisions]) > 12
+    assert summary["failures"] <= 2
+    assert summary["lost_packets"]["aic_vds"] < summary["lost_packets"]["eof"]
+
+
+def test_the_example_flown_by_the_edges_planner(tmp_path: Path) -> None:
+    summary = flown_by_an_edge("policy", tmp_path, "--steps", "20")
+    assert summary["by_source"]["policy"] == summary["decisions"] == 60
     assert summary["failures"] <= 2
     assert summary["lost_packets"]["aic_vds"] < summary["lost_packets"]["eof"]
 

@@ -14,7 +14,10 @@ PAPER = SCENARIOS["paper"]
 
 
 def mission(spec: MissionSpec | None = None, **settings: Any) -> Mission:
-    return Mission("test", spec or MissionSpec(), Settings(**{"mode": "value", **settings}))
+    """One that decides from what its UAVs report, so that a test need not tell it before; with the paper's features."""
+    spec = spec or MissionSpec()
+    as_written = {"belief": "reported", "features": spec.features or "paper"}
+    return Mission("test", spec.model_copy(update=as_written), Settings(**{"mode": "value", **settings}))
 
 
 def uav(

@@ -1,8 +1,10 @@
 """Mode guided: candidates, calibration, and scripted LLMs that are always wrong, always right, or late."""
 
+import asyncio
 import re
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -11,13 +13,14 @@ import pytest
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
-from service.candidates import GuidedTemplate
-from service.critic import Belief, Situation, judge
+from service.candidates import GuidedTemplate, velocities
+from service.critic import Situation, judge
 from service.guided import LLM, Deliberation, trust_of
 from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.client import Completion
 from service.mission import Mission
+from service.reach import Reach
 from service.settings import Settings
 from service.view import View
 from shared.trajectory import trajectories
@@ -41,7 +44,7 @@ def deliberation(mission: Mission, step: int = 0) -> tuple[View, Deliberation]:
     state = uav(
         step=step, position=(x + PAPER.lap_radius_m, y), x=[x + PAPER.lap_radius_m + 40.0 * i for i in range(6)]
     )
-    mission.belief.hear(state, step)
+    mission.observe(state, step)
     view = attended(mission, state, step)
     return view, Deliberation.of(mission, view)
 
@@ -103,22 +106,84 @@ def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> No
         probabilities(completion("hello", the=1.0), "AB")
 
 
+def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
+    distance = np.full((15, 1), 50.0)
+    reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
+    assert velocities(reach, 0, 4) == [0, 5, 9, 14]
+    assert velocities(reach, 0, 1) == [14]
+    distance[:3] = distance[12:] = 1e9
+    reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
+    assert velocities(reach, 0, 4) == [3, 6, 8, 11]
+
+
 def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None:
-    belief = Belief(PAPER)
+    mission = guided()
     start = trajectories(PAPER)[0].at(0.0)
     near = [float(start[0]) - 20.0]
     state = uav(position=(float(start[0]), float(start[1])), x=near, queue=[60.0])
     state.sensors.y[0] = float(start[1])
-    belief.hear(state, 0)
-    situation = Situation.of(belief, np.full(PAPER.sensors, 5.0), PAPER, 0, 0)
+    mission.observe(state, 0)
+    situation = Situation.of(mission.belief, PAPER, 0, 0)
     judged = judge(situation, [(0, 0), (1, 0)])
     assert judged.lost[1] > judged.lost[0] + 1
     # Sensor 1 was never reported: nothing can be collected from it.
     assert judged.cost[1] >= 1.0 > judged.cost[0]
 
 
-def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
+def test_a_plan_is_judged_by_its_own_continuation_and_never_below_look_ahead() -> None:
+    """Two sensors in reach of each other and one across the lap: to dwell pays, where look-ahead flies away."""
     mission = guided()
+    places = np.array([trajectories(PAPER)[0].at(metres) for metres in (0.0, 1300.0, 1500.0)])
+    state = uav(position=(places[0, 0], places[0, 1]), x=places[:, 0].tolist(), queue=[40.0, 58.0, 58.0])
+    state.sensors.y[:] = places[:, 1].tolist()
+    mission.observe(state, 0)
+
+    def lost(course: list[tuple[int, int]] | None) -> float:
+        plan = None if course is None else {0: course}
+        return float(judge(Situation.of(mission.belief, PAPER, 0, 0, course=plan), [(0, 0)]).lost[0])
+
+    dwells = [(0, 0), (2, 0), (0, 0), (2, 0), (2, 14), (0, 14), (0, 7), (2, 14)]
+    assert lost(dwells) < lost(None) - 1.0
+    assert lost([(0, 0)] * 8) == lost(None)
+
+
+def test_a_sensor_never_heard_may_hold_anything_that_the_world_draws() -> None:
+    mission = guided()
+    state = uav(x=[PAPER.lap_centres[0][0], PAPER.lap_centres[0][0] + 9.0], queue=[39.0, None])
+    mission.observe(state, 0)
+    situation = Situation.of(mission.belief, PAPER, 0, 0)
+    assert situation.unknown.tolist() == [False, True]
+
+
+def planned(mission: Mission, view: View) -> tuple[int, int]:
+    """Let the mission's planner plan."""
+    assert mission.planner is not None
+    with ThreadPoolExecutor(1) as beside:
+        asyncio.run(mission.planner.plan([view.uav_id], (), 10.0, beside))
+    action = mission.planner.action(view.uav_id)
+    assert action is not None
+    return action
+
+
+@pytest.mark.parametrize("answer", ["worst", "random"])
+def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
+    mission = guided(planner="on")
+    trust, random = trust_of(mission, "stub"), np.random.default_rng(0)
+    for step in range(6):
+        view, _ = deliberation(mission, step)
+        plan = planned(mission, view)
+        made = Deliberation.of(mission, view)
+        judgement = made.judge()
+        labels = made.offer.labels
+        worst = max(labels, key=lambda name: judgement.lost[labels[name]])
+        told = worst if answer == "worst" else str(random.choice(list(labels)))
+        verdict = made.conclude(trust, judgement, {name: float(name == told) for name in labels}, calibrated=False)
+        assert verdict is not None and verdict.action == plan
+        assert set(verdict.told.trust) == {"llm", "planner", "value", "policy"}
+
+
+def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
+    mission = guided(planner="off")
     trust = trust_of(mission, "stub")
     for step in range(15):
         view, made = deliberation(mission, step)
@@ -209,7 +274,7 @@ def test_decides_and_says_how(edge: Edge, report: Report, tells: bool) -> None:
         metrics = client.get("/metrics").text
     assert (answer["source"], answer["reason"], answer["model"]) == ("guided", None, "stub-1")
     shown = answer["guided"]
-    assert set(shown["trust"]) == {"llm", "value", "policy"}
+    assert set(shown["trust"]) == {"llm", "planner", "value", "policy"}
     assert sum(shown["trust"].values()) == pytest.approx(1.0, abs=1e-3)
     best = shown["candidates"][0]
     assert (best["sensor_id"], best["velocity"]) == (answer["sensor_id"], answer["velocity"])
@@ -231,19 +296,28 @@ def test_without_the_llm_the_others_decide(edge: Edge, report: Report, fault: st
         answer = client.post("/decide", json=report()).json()
     assert (answer["source"], answer["reason"], answer["model"]) == ("policy", reason, None)
     assert answer["guided"]["candidates"][0]["llm"] is None
-    assert answer["guided"]["trust"]["llm"] == 0.5
+    assert answer["guided"]["trust"] == {"llm": 0.2, "planner": 0.6, "value": 0.1, "policy": 0.1}
 
 
-def test_a_mission_learns_whom_to_trust_from_what_comes_back(edge: Edge, report: Report) -> None:
-    """An LLM that always names the first row's slowest velocity."""
+@pytest.mark.parametrize(("paid", "rises"), [(0.0, True), (1.0, False)])
+def test_a_mission_learns_whom_to_trust_from_what_comes_back(
+    edge: Edge, report: Report, paid: float, rises: bool
+) -> None:
+    """Whether what the LLM talked the fleet into succeeds: the same decisions, another outcome, another trust."""
+    trust = []
     with serving(Chooser("A", tells=False).app) as url:
-        client = edge(mode="guided", llm_url=f"{url}/v1")
-        wait_for(client, "ready")
-        outcome = None
-        for step in range(12):
-            answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
-            outcome = {"decision_id": answer["decision_id"], "cost": 0.0}
-    assert answer["guided"]["trust"]["llm"] != 0.5
+        for cost in (paid, 0.5):
+            client = edge(mode="guided", llm_url=f"{url}/v1", planner="off")
+            wait_for(client, "ready")
+            first = client.post("/decide", json=report(step=0)).json()
+            outcome = {"decision_id": first["decision_id"], "cost": cost}
+            second = client.post("/decide", json=report(step=1, outcome=outcome)).json()
+            trust.append(second["guided"]["trust"]["llm"])
+            followed = first["guided"]["candidates"][0]["llm"]
+    assert followed is not None
+    # The LLM gave more than its share to what was flown, or less.
+    believed = followed > first["guided"]["candidates"][0]["mixture"]
+    assert (trust[0] > trust[1]) == (rises == believed)
 
 
 def test_another_mode_says_nothing_of_trust(edge: Edge, report: Report) -> None:

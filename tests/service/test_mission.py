@@ -19,7 +19,7 @@ def outcome(decision_id: str, cost: float = 0.5, failed: bool = False) -> Outcom
 def test_arrival_rates_are_learned_from_beacons_between_visits() -> None:
     m = mission()
     for step in range(11):
-        m.observe(uav(step=step, queue=[3.0 * step, 60.0, 5.0]))
+        m.observe(uav(step=step, queue=[3.0 * step, 60.0, 5.0]), step)
     prior = m.scenario.mean_arrival_rate
     assert m.rates[0] == pytest.approx((2 * prior + 30) / 12)
     # A full queue hides what overflowed, and says nothing.
@@ -29,18 +29,18 @@ def test_arrival_rates_are_learned_from_beacons_between_visits() -> None:
 
 def test_a_visit_between_two_beacons_spoils_the_estimate() -> None:
     m = mission()
-    m.observe(uav(step=0, queue=[50.0, 50.0]))
+    m.observe(uav(step=0, queue=[50.0, 50.0]), 0)
     decide(m, 1, step=0, sensor=0)
-    m.observe(uav(step=1, queue=[55.0, 55.0]))
+    m.observe(uav(step=1, queue=[55.0, 55.0]), 1)
     assert m.rates[0] == m.scenario.mean_arrival_rate
     assert m.rates[1] == pytest.approx((10 + 5) / 3)
 
 
 def test_an_old_beacon_is_no_news() -> None:
     m = mission()
-    m.observe(uav(step=4, queue=[20.0]))
+    m.observe(uav(step=4, queue=[20.0]), 4)
     before = m.rates.copy()
-    m.observe(uav(step=4, queue=[40.0], last_seen=[2]))
+    m.observe(uav(step=4, queue=[40.0], last_seen=[2]), 4)
     assert (m.rates == before).all()
 
 

@@ -132,7 +132,7 @@ def test_a_mission_takes_a_presets_name_or_a_whole_scenario() -> None:
 
 def test_a_mission_is_the_papers_unless_told_otherwise() -> None:
     spec = MissionSpec()
-    assert (spec.attention, spec.features) == ("on", "paper")
+    assert (spec.attention, spec.features, spec.belief) == ("on", None, None)
     assert spec.prompt == PromptStyle(format="csv", order="score", experiences=None)
 
 

@@ -101,7 +101,7 @@ def test_another_mode_prompt_and_k_are_compared_and_what_differs_is_not_fed_back
     assert again.changed == {
         "mode": ("llm", "value"),
         "top_k": (5, 2),
-        "features": ("paper", "reach"),
+        "features": (None, "reach"),
         "init": ("pretrained", "random"),
         "prompt.format": ("csv", "json"),
         "prompt.experiences": (8, 4),

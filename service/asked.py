@@ -1,0 +1,60 @@
+"""What confirmed guidance asks of one UAV's next step: velocities that it may fly, and what its sensors are worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.features import State
+from service.reach import Reach, distances_ahead
+from shared.channel import FloatArray, link_holds
+from shared.guidance import Guidance
+from shared.scenario import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """V velocity levels, J sensors in the order of the state.
+
+    Attributes:
+        allowed: shape ``(V,)``, the levels that may be flown.
+        due: shape ``(V, J)``, whether the sensor must be visited in this step to be on time, and is in reach then.
+        worth: shape ``(V, J)``, packets on top of the LLM-free policy's: ``(w_j - 1) U_j packets``, and W where due,
+            which is more than anything else in reach. ``-inf`` where the level is not allowed.
+    """
+
+    allowed: NDArray[np.bool_]
+    due: NDArray[np.bool_]
+    worth: FloatArray
+
+    @classmethod
+    def of(
+        cls, guidance: Guidance, state: State, step: int, visits: NDArray[np.int64], uav: int, scenario: Scenario
+    ) -> Self | None:
+        """Of a UAV's state at a step; None where the guidance asks for nothing.
+
+        Args:
+            visits: step of each sensor's last visit, by sensor ID; -1 for never.
+        """
+        if not guidance:
+            return None
+        allowed = guidance.allowed(scenario.max_velocity + 1)
+        distance = distances_ahead(uav, state.position, state.progress_m, state.places, scenario)
+        reach = Reach.of(distance, np.where(state.able, state.queue, 0.0), state.urgency, scenario)
+        overdue = guidance.overdue(step, visits)[state.ids] > 0
+        due = overdue & state.able & link_holds(distance, scenario) & allowed[:, None]
+        weights = guidance.weights(scenario.sensors)[state.ids]
+        worth = (weights - 1.0) * state.urgency * reach.packets + scenario.queue_capacity * due
+        return cls(allowed, due, np.where(allowed[:, None], worth, -np.inf))
+
+    def nearest(self, row: int, level: int) -> int:
+        """The level to fly at for the sensor in that row, where another was wanted: the nearest that may be flown.
+
+        Where the sensor is due, of those that reach it in time. Nearest rather than best: values of levels were learned
+        with all of them, and without the fast ones a UAV that is told the best of the rest hovers.
+        """
+        choices = np.flatnonzero(self.due[:, row] if self.due[:, row].any() else self.allowed)
+        return int(choices[np.abs(choices - level).argmin()])

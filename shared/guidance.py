@@ -1,0 +1,246 @@
+"""Operator guidance: what a fleet is to heed besides losing no packets, as a structure that can be checked and obeyed.
+
+An operator writes a note in plain words; what was understood of it is a :class:`Guidance`. Nobody obeys one that is
+not confirmed. Guidance that asks for nothing changes no number anywhere.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from shared.channel import FloatArray
+from shared.scenario import Scenario
+from shared.wire import MissionId, SensorId, Wire
+
+Level = Annotated[int, Field(ge=0, le=14)]
+MAX_WISHES = 1000
+MAX_WEIGHT = 10.0
+MAX_EVERY = 1000
+# What a step costs in which a sensor has waited longer for a visit than it was to, in lost packets: above what the
+# fullest of sensors loses in a step, so that a deadline gives way only to several sensors that overflow.
+LATE_PACKETS = 20.0
+
+
+class SensorWish(Wire):
+    """What is asked for one sensor.
+
+    A sensor with ``visit_every`` n is to be visited in one step of any n that follow each other.
+    """
+
+    sensor_id: SensorId
+    weight: float = Field(1.0, ge=0, le=MAX_WEIGHT, description="its lost packets count so many times; 0: not at all")
+    visit_every: int | None = Field(None, ge=1, le=MAX_EVERY, description="steps")
+
+
+class Guidance(Wire):
+    """What is asked of a fleet: wishes for sensors, and the velocities that must not be flown.
+
+    The velocities are a hard rule: neither ``forbidden_velocities`` nor any outside ``min_velocity..max_velocity`` are
+    flown, m/s. Weights and visits are weighed against each other.
+    """
+
+    sensors: list[SensorWish] = Field([], max_length=MAX_WISHES)
+    min_velocity: Level | None = None
+    max_velocity: Level | None = None
+    forbidden_velocities: list[Level] = Field([], max_length=15)
+
+    @model_validator(mode="after")
+    def _each_sensor_once(self) -> Self:
+        ids = [wish.sensor_id for wish in self.sensors]
+        if len(set(ids)) < len(ids):
+            twice = next(i for i in ids if ids.count(i) > 1)
+            raise ValueError(f"sensors names sensor {twice} more than once")
+        return self
+
+    def __bool__(self) -> bool:
+        """Whether it asks for anything."""
+        return self.wishes or self.restricts
+
+    @property
+    def wishes(self) -> bool:
+        """Whether any sensor is to be treated unlike the others."""
+        return any(wish.weight != 1.0 or wish.visit_every is not None for wish in self.sensors)
+
+    @property
+    def restricts(self) -> bool:
+        """Whether it forbids any velocity; perhaps none that the scenario has."""
+        return bool(self.forbidden_velocities) or self.min_velocity is not None or self.max_velocity is not None
+
+    def check(self, scenario: Scenario) -> None:
+        """Whether a fleet in this scenario can obey.
+
+        Raises:
+            Impossible: an unknown sensor, a velocity that there is not, or no velocity left.
+        """
+        for row, wish in enumerate(self.sensors):
+            if wish.sensor_id >= scenario.sensors:
+                known = f"there are {scenario.sensors}, from 0"
+                raise Impossible(f"sensors[{row}].sensor_id", f"sensor {wish.sensor_id} is unknown: {known}")
+        named = {"min_velocity": self.min_velocity, "max_velocity": self.max_velocity}
+        named |= {f"forbidden_velocities[{row}]": level for row, level in enumerate(self.forbidden_velocities)}
+        for name, level in named.items():
+            if level is not None and level > scenario.max_velocity:
+                raise Impossible(name, f"{level} m/s is more than the fleet's highest, {scenario.max_velocity} m/s")
+        if not self.allowed(scenario.max_velocity + 1).any():
+            raise Impossible("forbidden_velocities", "no velocity is left to fly at")
+
+    def allowed(self, levels: int) -> NDArray[np.bool_]:
+        """Which of the velocities 0..levels - 1 m/s may be flown, shape ``(levels,)``."""
+        level = np.arange(levels)
+        fastest = levels if self.max_velocity is None else self.max_velocity
+        slowest = 0 if self.min_velocity is None else self.min_velocity
+        return (level >= slowest) & (level <= fastest) & ~np.isin(level, self.forbidden_velocities)
+
+    def allows(self, velocity: int) -> bool:
+        """Whether this velocity may be flown."""
+        return bool(self.allowed(velocity + 1)[velocity])
+
+    def nearest(self, velocity: int, levels: int) -> int:
+        """The velocity of 0..levels - 1 that may be flown nearest to this one, the slower of two."""
+        choices = np.flatnonzero(self.allowed(levels))
+        return int(choices[np.abs(choices - velocity).argmin()])
+
+    def weights(self, sensors: int) -> FloatArray:
+        """How many times each sensor's lost packets count, shape ``(J,)``."""
+        weights = np.ones(sensors)
+        for wish in self.sensors:
+            weights[wish.sensor_id] = wish.weight
+        return weights
+
+    def every(self, sensors: int) -> FloatArray:
+        """Steps within which each sensor is to be visited, shape ``(J,)``; infinite where nobody said."""
+        every = np.full(sensors, np.inf)
+        for wish in self.sensors:
+            if wish.visit_every is not None:
+                every[wish.sensor_id] = wish.visit_every
+        return every
+
+    def overdue(self, step: int, visits: NDArray[np.int64]) -> FloatArray:
+        """How long each sensor is overdue in a step in which nobody visits it, steps, shape ``(J,)``.
+
+        1 where it must be visited in this very step to be on time, 0 where there is time.
+
+        Args:
+            visits: step of the last visit, ``(J,)``; -1 for never, which counts as just before step 0.
+        """
+        late: FloatArray = np.maximum(step - visits - self.every(len(visits)) + 1.0, 0.0)
+        return late
+
+    def lateness(self, step: int, visits: NDArray[np.int64], horizon: int, beyond: int) -> FloatArray:
+        """What a plan from ``step`` on pays for sensors left alone, packets: :attr:`FleetProblem.late`.
+
+        ``late[s, e, j]`` is the price in the plan's step e, H standing for the ``beyond`` steps after it, if nobody has
+        visited sensor j since the plan's step s began.
+
+        Args:
+            visits: step of the last visit before the plan, ``(J,)``; -1 for never.
+
+        Returns:
+            Shape ``(H + 1, H + 1, J)``.
+        """
+        late = np.zeros((horizon + 1, horizon + 1, len(visits)))
+        for since in range(horizon + 1):
+            last = visits if since == 0 else np.full_like(visits, step + since - 1)
+            for now in range(since, horizon + 1):
+                steps = [now] if now < horizon else range(horizon, horizon + beyond)
+                late[since, now] = sum(LATE_PACKETS * (self.overdue(step + n, last) > 0) for n in steps)
+        return late
+
+    def in_words(self) -> str:
+        """What it asks for, in plain English, from the structure alone."""
+        said = []
+        for wish in self.sensors:
+            if wish.visit_every is not None:
+                often = "in every step" if wish.visit_every == 1 else f"at least once in every {wish.visit_every} steps"
+                said.append(f"Visit sensor {wish.sensor_id} {often}.")
+            if wish.weight == 0:
+                said.append(f"Ignore what sensor {wish.sensor_id} loses.")
+            elif wish.weight != 1:
+                said.append(f"Count each packet that sensor {wish.sensor_id} loses {wish.weight:g} times.")
+        if self.min_velocity is not None:
+            said.append(f"Never fly slower than {self.min_velocity} m/s.")
+        if self.max_velocity is not None:
+            said.append(f"Never fly faster than {self.max_velocity} m/s.")
+        if self.forbidden_velocities:
+            levels = " or ".join(map(str, sorted(set(self.forbidden_velocities))))
+            said.append(f"Never fly at {levels} m/s.")
+        return " ".join(said) or "Nothing beyond the mission's own rules."
+
+
+class Waiting:
+    """How long n sensors have waited for a visit in B copies of a world, and what that costs: for rollouts.
+
+    Args:
+        guidance: asks for the visits.
+        kept: shape ``(n,)``, the sensors' IDs.
+        step: the first to be simulated.
+        visits: step of the last visit by sensor ID, ``(J,)``; -1 for never.
+        copies: B.
+    """
+
+    def __init__(
+        self, guidance: Guidance, kept: NDArray[np.int64], step: int, visits: NDArray[np.int64], copies: int
+    ) -> None:
+        self._every = guidance.every(len(visits))[kept]
+        self._waited = np.tile(step - visits[kept], (copies, 1))
+
+    def visit(self, sensor: NDArray[np.int64], where: NDArray[np.bool_]) -> None:
+        """In the copies ``(B,)`` where that holds, this one of the n sensors ``(B,)`` is visited in this step."""
+        self._waited[where, sensor[where]] = 0
+
+    def end_step(self) -> FloatArray:
+        """What being late costs in this step, packets, ``(B,)``; the next step begins."""
+        late = LATE_PACKETS * (self._waited >= self._every).sum(axis=1)
+        self._waited += 1
+        return np.asarray(late, dtype=np.float64)
+
+
+class Impossible(ValueError):
+    """Guidance that this fleet cannot obey; ``field`` says where."""
+
+    def __init__(self, field: str, detail: str) -> None:
+        super().__init__(f"{field}: {detail}")
+        self.field = field
+        self.detail = detail
+
+
+NO_GUIDANCE = Guidance()
+
+# `none`: no note, and no structure of the operator's own.
+GuidanceState = Literal["none", "compiling", "proposed", "confirmed", "rejected", "failed"]
+
+
+class GuidanceStatus(Wire):
+    """``GET /missions/{id}/guidance``: the operator's note, what was understood, and whether it is obeyed.
+
+    Only what is ``confirmed`` is obeyed.
+    """
+
+    mission_id: MissionId
+    status: GuidanceState
+    note: str | None = None
+    guidance: Guidance | None = Field(None, description="what was understood, or given by the operator")
+    in_words: str | None = Field(None, description="the same in plain English, made from the structure alone")
+    origin: Literal["llm", "operator"] | None = Field(None, description="whose structure it is")
+    model: str | None = Field(None, description="the LLM that was asked")
+    failure: str | None = Field(None, description="why nothing could be made of the note")
+
+
+class GuidanceAnswer(Wire):
+    """``POST /missions/{id}/guidance``: confirm or reject what was understood, or give a structure in its place.
+
+    A structure given is confirmed by being given, with or without an LLM, a note, or anything understood of it.
+    """
+
+    answer: Literal["confirm", "reject"] | None = None
+    guidance: Guidance | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.answer is None) == (self.guidance is None):
+            raise ValueError("give either answer or guidance")
+        return self
