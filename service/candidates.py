@@ -33,9 +33,9 @@ At each waypoint you choose one sensor to collect from and the velocity for the 
 Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost.
 
 Each row is one sensor, {order}: a letter, then
-queue,age,velocities
-queue: packets waiting. age: steps since its last visit. velocities: the slowest and the fastest, in m/s, at which the \
-UAV can collect.
+queue,age,velocity
+queue: packets waiting. age: steps since its last visit. velocity: the fastest, in m/s, at which the UAV can collect; \
+the slowest before it where that is not 0.
 {letters}
 
 Rules:
@@ -174,7 +174,8 @@ def velocities(reach: Reach, row: int, count: int) -> list[int]:
 
 
 def _span(speeds: Sequence[int]) -> str:
-    return f"{speeds[0]}-{speeds[-1]}" if speeds[0] != speeds[-1] else str(speeds[0])
+    # Two tokens a row less where the slowest is 0, as for most.
+    return f"{speeds[0]}-{speeds[-1]}" if 0 < speeds[0] < speeds[-1] else str(speeds[-1])
 
 
 def _reach(state: State, uav: int, scenario: Scenario) -> Reach:
