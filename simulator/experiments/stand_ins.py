@@ -44,13 +44,15 @@ def drawn(body: dict[str, Any]) -> str:
 def worst(body: dict[str, Any]) -> str:
     """The row of the emptiest queue at its fastest velocity, of a prompt of mode ``guided``.
 
+    Whatever else is asked, such as what an edge asks to see that the grammar is obeyed, is answered by a draw.
+
     Raises:
-        ValueError: the request is none of mode ``guided``.
+        ValueError: as :func:`drawn`.
     """
     grammar = body.get("grammar")
     found = _LABEL.fullmatch(grammar) if isinstance(grammar, str) else None
     if not found:
-        raise ValueError("only requests with a grammar of one letter are answered")
+        return drawn(body)
     letters: list[str] = re.findall(r'"([A-Z])"', found[1])
     rows = {letter: int(queue) for letter, queue in _ROW.findall(body["messages"][-1]["content"]) if letter in letters}
     if not rows:

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import httpx
 import pytest
+from rich.console import Console
 
-from simulator.experiments.edges import Llm, environment_for
-from simulator.experiments.schemes import ASKED, CHANCE, OFF
+from simulator.experiments.edges import Llm, edge_for, environment_for
+from simulator.experiments.schemes import ASKED, CHANCE, OFF, WORST, Backing
 
 SERVER = "http://127.0.0.1:8080/v1"
 
@@ -70,3 +71,9 @@ def test_llms_that_may_answer_differently_have_different_identities(tmp_path: Pa
 def test_whether_there_is_an_llm_to_ask() -> None:
     assert Llm().there and Llm(SERVER).there and not Llm("none").there
     assert Llm("none", edge="http://e:8000").there
+
+
+@pytest.mark.parametrize("backing", [CHANCE, WORST])
+def test_an_edge_takes_a_stand_in_for_an_llm(backing: Backing, tmp_path: Path) -> None:
+    with edge_for(backing, Llm(), tmp_path / "edge.log", Console(quiet=True)) as edge:
+        assert edge.model
