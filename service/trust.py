@@ -8,13 +8,13 @@ them at each decision, not only for the one that was followed: full information.
 
 Hedge's bound (Freund and Schapire 1997, theorem 2), for decisions drawn from the weights and losses of 0..cap: over any
 number of decisions it loses at most ``cap (rate L_e + ln(1 / prior_e)) / (1 - exp(-rate cap))`` for every adviser e and
-its loss L_e. With the rate 0.6, the cap 8 and a prior of 0.5 that is 5.6 packets + 4.8 L_e: to find out a faultless
-adviser costs six packets of estimated loss, however many decisions a mission has. That bound is plain Hedge's, of
-estimated losses and of draws. What is flown is the best candidate and the weights are shared, so it is a guide to the
-constants and no promise of lost packets. The fixed share (Herbster and Warmuth 1998), to the prior (Bousquet and
-Warmuth 2002, to the start vector), keeps every adviser alive, so that one that turns good is found again, and where all
-do alike the prior comes back. An adviser that is silent keeps its odds against the others (sleeping experts: Freund,
-Schapire, Singer and Warmuth 1997).
+its loss L_e. With the rate 0.6, the cap 8 and the planner's prior, 0.6, that is 4.1 packets + 4.8 L_e: to find out a
+faultless adviser costs four packets of estimated loss, however many decisions a mission has; with a prior of 0.1, 19.
+That bound is plain Hedge's, of estimated losses and of draws. What is flown is the best candidate and the weights are
+shared, so it is a guide to the constants and no promise of lost packets. The fixed share (Herbster and Warmuth 1998),
+to the prior (Bousquet and Warmuth 2002, to the start vector), keeps every adviser alive, so that one that turns good is
+found again, and where all do alike the prior comes back. An adviser that is silent keeps its odds against the others
+(sleeping experts: Freund, Schapire, Singer and Warmuth 1997).
 
 ``l(a)`` is the critic's regret of a candidate, corrected by what really happened. After action b was flown, with the
 probability q(b) behind it, the surprise ``s = c - E[c | b]`` is added where an adviser had advised b, as a doubly
