@@ -18,7 +18,7 @@ import time
 from service.llm.answer import NoDecision
 from service.llm.upstream import Upstream
 from service.mission import Mission
-from service.orders import BadOrders, admissible, read, shown
+from service.orders import BadOrders, read, shown
 from shared.guidance import Guidance, Impossible
 from shared.scenario import Scenario
 
@@ -91,13 +91,13 @@ async def understood(note: str, scenario: Scenario, upstream: Upstream) -> Guida
         Impossible: the same, where the first one asks for what the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
-    orders, examples = admissible(note), shown(note)
+    examples = shown(note)
     faults: list[BadOrders | Impossible] = []
     begun = time.monotonic()
     for attempt in range(_ATTEMPTS):
         temperature = _TEMPERATURE if attempt else 0.0
         async with asyncio.timeout(_ANSWER_S):
-            text = await upstream.ask_orders(note, examples, orders, temperature=temperature, seed=attempt)
+            text = await upstream.ask_orders(note, examples, temperature=temperature, seed=attempt)
         try:
             guidance = read(text, note)
             guidance.check(scenario)

@@ -109,17 +109,16 @@ class Upstream:
         """
         return await self._decide(label_body(self.model, system, user, self.constraint, labels, self.logprobs))
 
-    async def ask_orders(
-        self, note: str, examples: Sequence[tuple[str, str]], orders: Sequence[str], *, temperature: float, seed: int
-    ) -> str:
-        """An operator's note as some of these orders, where the server can be held to them.
+    async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
+        """An operator's note as orders that it allows, where the server can be held to them.
 
         The embedded model has one slot: a decision that asks it meanwhile goes first, a few times.
 
         Raises:
+            BadOrders: the note has nothing to ask about.
             NoDecision: no answer, with the reason.
         """
-        held = constrain_orders(self.constraint, orders)
+        held = constrain_orders(self.constraint, note)
         body = rewriting_body(self.model, INSTRUCTION, examples, note, held, temperature, seed)
         for _ in range(_STEPS_BACK if self._embedded is not None else 0):
             await self._silence()

@@ -1,13 +1,16 @@
 """The README is true: its curl works as pasted, its tables are the code's."""
 
+import json
 import re
 import subprocess
+import time
 from pathlib import Path
 
 import httpx
 import pytest
 
 from service.settings import Settings
+from shared.guidance import GuidanceStatus
 from shared.wire import DecideResponse, Reason
 from tests.e2e.processes import serving_edge
 
@@ -15,13 +18,36 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 
 
+DECIDE, GUIDE = (block.strip() for block in re.findall(r"```sh\n(curl .*?)```", README, re.DOTALL))
+
+
+def pasted(command: str, url: str) -> str:
+    """What a curl prints."""
+    at_edge = command.replace("http://localhost:8000", url)
+    return subprocess.run(["bash", "-c", f"{at_edge} --silent"], capture_output=True, text=True, check=True).stdout
+
+
 def test_the_curl_works_as_pasted() -> None:
-    [command] = re.findall(r"```sh\n(curl .*?)```", README, re.DOTALL)
     with serving_edge() as (url, _):
-        pasted = command.strip().replace("http://localhost:8000", url)
-        answered = subprocess.run(["bash", "-c", f"{pasted} --silent"], capture_output=True, text=True, check=True)
-    decision = DecideResponse.model_validate_json(answered.stdout)
+        decision = DecideResponse.model_validate_json(pasted(DECIDE, url))
     assert decision.sensor_id in (0, 1, 2)
+
+
+def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
+    put, get, confirm, own = re.split(r"\n(?=curl)", GUIDE)
+    with serving_edge() as (url, _):
+        json.loads(pasted(put, url))
+        deadline = time.monotonic() + 60
+        while (told := GuidanceStatus.model_validate_json(pasted(get, url))).status == "compiling":
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        assert told.status == "proposed" and told.guidance is not None, told.failure
+        assert [wish.model_dump() for wish in told.guidance.sensors] == [
+            {"sensor_id": 4, "weight": 1.0, "visit_every": 3}
+        ]
+        assert GuidanceStatus.model_validate_json(pasted(confirm, url)).status == "confirmed"
+        given = GuidanceStatus.model_validate_json(pasted(own, url))
+    assert (given.status, given.origin) == ("confirmed", "operator")
 
 
 def test_every_setting_and_its_default_is_in_the_table() -> None:

@@ -343,7 +343,7 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
 
     upstream._ask = ask  # type: ignore[method-assign]
     upstream._embedded = object()  # type: ignore[assignment]
-    note = asyncio.create_task(upstream.ask_orders(NOTE, [], [ORDERS], temperature=0.0, seed=0))
+    note = asyncio.create_task(upstream.ask_orders(NOTE, [], temperature=0.0, seed=0))
     await asyncio.sleep(0.01)
     await upstream.ask("static", "user", [0], 15)
     assert finished == ["decision"]
@@ -368,7 +368,7 @@ async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.Mon
 
     upstream._ask = ask  # type: ignore[method-assign]
     upstream._embedded = object()  # type: ignore[assignment]
-    note = asyncio.create_task(upstream.ask_orders(NOTE, [], [ORDERS], temperature=0.0, seed=0))
+    note = asyncio.create_task(upstream.ask_orders(NOTE, [], temperature=0.0, seed=0))
     while not note.done():
         await asyncio.sleep(0.005)
         await upstream.ask("static", "user", [0], 15)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import suppress
 
 import pytest
 
@@ -63,14 +64,48 @@ def test_every_constraint_allows_the_right_orders_and_no_other_number() -> None:
     orders = admissible(NOTE)
     assert set(ORDERS.split(", ")) <= set(orders)
     assert {int(n) for order in orders for n in re.findall(r"[0-9]+", order)} == {3, 4, 9}
-    grammar = constrain_orders("grammar", orders)["grammar"]
+    grammar = constrain_orders("grammar", NOTE)["grammar"]
     assert all(f'"{order}"' in grammar for order in orders)
-    regex = constrain_orders("structured_outputs", orders)["structured_outputs"]["regex"]
+    regex = constrain_orders("structured_outputs", NOTE)["structured_outputs"]["regex"]
     assert re.fullmatch(regex, ORDERS) and re.fullmatch(regex, "nothing")
     assert not re.fullmatch(regex, "visit sensor 5 every 3 steps")
-    schema = constrain_orders("json_schema", orders)["response_format"]["json_schema"]["schema"]
+    schema = constrain_orders("json_schema", NOTE)["response_format"]["json_schema"]["schema"]
     assert schema["properties"]["orders"]["items"]["enum"] == orders
-    assert constrain_orders("none", orders) == {}
+    assert constrain_orders("none", NOTE) == {}
+
+
+def derived(grammar: str) -> set[str]:
+    """All that a grammar without recursion allows."""
+    rules = dict(line.split(" ::= ", 1) for line in grammar.splitlines())
+
+    def said(rule: str) -> set[str]:
+        found = set()
+        for words, _, following in re.findall(r'\(("[^)]*")\)( \(", " (s\d+)\)\?)?', rules[rule]):
+            for order in re.findall(r'"([^"]*)"', words):
+                found |= {order} | ({f"{order}, {rest}" for rest in said(following)} if following else set())
+        return found
+
+    return said("s0") | {"nothing"}
+
+
+def test_the_grammar_uses_no_number_more_often_than_the_note() -> None:
+    note = "Suspected leak at sensor 4: visit it every third step."
+    said = derived(constrain_orders("grammar", note)["grammar"])
+    assert "visit sensor 4 every 3 steps" in said and "fly at most 3 m/s, do not fly at 4 m/s" in said
+    assert "visit sensor 4 every 3 steps, sensor 4 counts 3 times" not in said
+    for text in said:
+        with suppress(BadOrders):
+            read(text, note)
+            continue
+        # Nothing is refused for its numbers.
+        assert re.search("fly at (most|least).*fly at", text), text
+    twice = derived(constrain_orders("grammar", "Sensor 3 every 3 steps, it counts 5 times.")["grammar"])
+    assert "visit sensor 3 every 3 steps, sensor 3 counts 5 times" in twice
+
+
+def test_a_note_with_many_numbers_gets_a_small_grammar() -> None:
+    grammar = constrain_orders("grammar", " ".join(map(str, range(10))))["grammar"]
+    assert grammar.count("::=") == 2
 
 
 def test_every_worked_example_stands_up_to_its_own_checks() -> None:
