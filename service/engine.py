@@ -232,7 +232,9 @@ class Engine:
         """Begin to plan for UAVs of this step, where their mission's mode may need it; the LLM is asked meanwhile."""
         if mission.planner is None or mission.mode == "value":
             return None
-        seconds = min(self._settings.planner_ms / 1e3, deadline - _RESERVE_S - time.perf_counter())
+        left = deadline - _RESERVE_S - time.perf_counter()
+        # In mode `guided` the LLM is asked after it, and is to have at least as much.
+        seconds = min(self._settings.planner_ms / 1e3, left / 2 if mission.mode == "guided" else left)
         taken = mission.reserved(step, uavs[0])
         task = asyncio.create_task(mission.planner.plan(uavs, taken, seconds, self._planning))
         self._plans.add(task)

@@ -296,7 +296,7 @@ def test_without_the_llm_the_others_decide(edge: Edge, report: Report, fault: st
         answer = client.post("/decide", json=report()).json()
     assert (answer["source"], answer["reason"], answer["model"]) == ("policy", reason, None)
     assert answer["guided"]["candidates"][0]["llm"] is None
-    assert answer["guided"]["trust"] == {"llm": 0.2, "planner": 0.6, "value": 0.1, "policy": 0.1}
+    assert answer["guided"]["trust"] == {"llm": 0.02, "planner": 0.96, "value": 0.01, "policy": 0.01}
 
 
 @pytest.mark.parametrize(("paid", "rises"), [(0.0, True), (1.0, False)])
