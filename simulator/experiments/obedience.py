@@ -58,6 +58,7 @@ EXPERIMENT = Experiment(
         Drawing("obedience", "bars", _OBEYED, "Visit deadlines met at the sensor named, steps at allowed velocities."),
         Drawing("obedience_losses", "bars", LOSSES, "What obeying costs: losses of a mission."),
     ),
+    when_quick="no_llm",
     reference="guided_nothing",
     pairs=(("llm_note", "llm_nothing"), ("value_structure", "value_nothing"), ("policy_structure", "policy_nothing")),
     paired_measures=(*_OBEYED, "lost_packets"),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from simulator.site import Site
 
 # So that `all --quick` ends within 15 minutes on two cores, an LLM's decision taking three quarters of a second.
-QUICK_STEPS = 4
+QUICK_STEPS = 3
 QUICK_SEEDS, QUICK_LLM_SEEDS = 5, 2
 
 
