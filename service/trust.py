@@ -8,8 +8,8 @@ them at each decision, not only for the one that was followed: full information.
 
 Hedge's bound (Freund and Schapire 1997, theorem 2), for decisions drawn from the weights and losses of 0..cap: over any
 number of decisions it loses at most ``cap (rate L_e + ln(1 / prior_e)) / (1 - exp(-rate cap))`` for every adviser e and
-its loss L_e. With the rate 0.6, the cap 8 and the planner's prior, 0.96, that is 0.3 packets + 4.8 L_e; with a prior of
-0.02, 32 packets: so much estimated loss it costs to find out a faultless adviser, however many decisions a mission has.
+its loss L_e. With the rate 0.6, the cap 8 and a prior of 0.2 that is 13 packets + 4.8 L_e: so much estimated loss it
+costs to find out a faultless adviser, however many decisions a mission has; with a prior of 0.8, 1.8 packets.
 That bound is plain Hedge's, of estimated losses and of draws. What is flown is the best candidate and the weights are
 shared, so it is a guide to the constants and no promise of lost packets. The fixed share (Herbster and Warmuth 1998),
 to the prior (Bousquet and Warmuth 2002, to the start vector), keeps every adviser alive, so that one that turns good is

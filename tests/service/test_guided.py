@@ -14,7 +14,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
 from service.candidates import GuidedTemplate, velocities
-from service.critic import Situation, judge
+from service.critic import Judgement, Situation, judge
 from service.guided import LLM, Deliberation, trust_of
 from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
@@ -165,6 +165,20 @@ def planned(mission: Mission, view: View) -> tuple[int, int]:
     return action
 
 
+@pytest.mark.parametrize(("lost", "flown"), [(0.0, True), (7.0, True), (9.0, False)])
+def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, flown: bool) -> None:
+    mission = guided(planner="on")
+    view, _ = deliberation(mission)
+    plan = planned(mission, view)
+    made = Deliberation.of(mission, view)
+    place = made.offer.actions.index(plan)
+    losses = np.zeros(len(made.offer.actions))
+    losses[place] = lost
+    verdict = made.conclude(trust_of(mission, "stub"), Judgement(losses, losses), None, calibrated=False)
+    assert verdict is not None
+    assert (verdict.action == plan) == flown
+
+
 @pytest.mark.parametrize("answer", ["worst", "random"])
 def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
     mission = guided(planner="on")
@@ -296,7 +310,7 @@ def test_without_the_llm_the_others_decide(edge: Edge, report: Report, fault: st
         answer = client.post("/decide", json=report()).json()
     assert (answer["source"], answer["reason"], answer["model"]) == ("policy", reason, None)
     assert answer["guided"]["candidates"][0]["llm"] is None
-    assert answer["guided"]["trust"] == {"llm": 0.02, "planner": 0.96, "value": 0.01, "policy": 0.01}
+    assert answer["guided"]["trust"] == {"llm": 0.2, "planner": 0.6, "value": 0.1, "policy": 0.1}
 
 
 @pytest.mark.parametrize(("paid", "rises"), [(0.0, True), (1.0, False)])
