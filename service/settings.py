@@ -82,9 +82,9 @@ class Settings(BaseSettings):
     # Tokens of the embedded model's context; the settings are refused where the longest prompt would not fit.
     llm_context: int = Field(4096, ge=512, le=131_072)
 
-    # Who decides by default: `llm` (the paper's method), `guided` (the LLM among other advisers), `value` (what the
+    # Who decides by default: `guided` (the LLM among other advisers), `llm` (the paper's method), `value` (what the
     # modules learned) or `policy` (the planner); with the last two no LLM is started.
-    mode: Mode = "llm"
+    mode: Mode = "guided"
     # Whether the LLM-free policy plans (extra `planner`) or looks one step ahead.
     planner: Literal["on", "off"] = "on"
     # Milliseconds that one search for a plan may take; the best plan until then counts.

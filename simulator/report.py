@@ -39,7 +39,8 @@ def policy_labels(summary: Summary) -> dict[str, str]:
 def llm_notice(summary: Summary) -> str | None:
     """A warning when the LLM was to decide and too often did not; ``None`` when there is nothing to warn of."""
     by = summary.by_source
-    if summary.mode != "llm" or summary.policy != "edge" or by.llm + by.guided >= LLM_SHARE * summary.decisions:
+    asks = summary.mode in ("llm", "guided")
+    if not asks or summary.policy != "edge" or by.llm + by.guided >= LLM_SHARE * summary.decisions:
         return None
     owners = [
         f"{words} {count}"

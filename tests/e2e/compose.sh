@@ -113,7 +113,7 @@ by_source = summary["by_source"]
 print("       ", {key: summary[key] for key in ("decisions", "by_source", "by_reason", "lost_packets", "rtt_ms")})
 if (summary["decisions"], sum(by_source.values())) != (90, 90):
     sys.exit("FAIL: not 90 decisions")
-if by_source["onboard"] or not by_source["llm"]:
+if by_source["onboard"] or not by_source["guided"]:
     sys.exit("FAIL: the edge left decisions unanswered, or its LLM took none")
 PYTHON
 say "the simulator flew 90 decisions and ended with exit code 0"
@@ -179,7 +179,7 @@ spec = json.load(u.urlopen("http://127.0.0.1:8000/openapi.json"))
 body = spec["paths"]["/decide"]["post"]["requestBody"]["content"]["application/json"]["examples"]["paper"]["value"]
 request = u.Request("http://127.0.0.1:8000/decide", json.dumps(body).encode(), {"Content-Type": "application/json"})
 print(json.load(u.urlopen(request))["source"])')
-[[ $source == llm ]] || fail "with no network the decision came from '$source'"
+[[ $source == guided ]] || fail "with no network the decision came from '$source'"
 say "with no network the LLM was ready in $((SECONDS - begin)) s and took a decision"
 start_offline
 sleep 0.3

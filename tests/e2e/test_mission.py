@@ -9,7 +9,7 @@ from tests.e2e.processes import run, serving_edge
 
 def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
     # The deadline is generous because this tests what is decided, not how fast the machine is.
-    with serving_edge(AICVDS_DEADLINE_MS="30000") as (url, _):
+    with serving_edge(AICVDS_MODE="llm", AICVDS_DEADLINE_MS="30000") as (url, _):
         flown = run("simulate", "--edge", url, "--steps", "6", "--seed", "2", "--out", str(tmp_path / "out"))
         options = ("--top-k", "3", "--demonstrations", "2", "--selection", "similar", "--out", str(tmp_path / "again"))
         again = run("replay", str(tmp_path / "out"), "--edge", url, *options)

@@ -19,7 +19,7 @@ Report = Callable[..., dict[str, Any]]
 @pytest.fixture(scope="module")
 def loaded() -> Iterator[httpx.Client]:
     with ExitStack() as stack:
-        url = stack.enter_context(serving(create_app(Settings(deadline_ms=30_000))))
+        url = stack.enter_context(serving(create_app(Settings(mode="llm", deadline_ms=30_000))))
         client = stack.enter_context(httpx.Client(base_url=url, timeout=60))
         ready = wait_for(client, "ready")
         assert ready["constraint"] == "grammar"
