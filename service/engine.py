@@ -229,7 +229,7 @@ class Engine:
         return answer
 
     def _plan(self, mission: Mission, uavs: list[int], step: int, deadline: float) -> asyncio.Task[None] | None:
-        """Begin to plan for UAVs of this step, where their mission's mode may need it; the LLM is asked meanwhile."""
+        """Begin to plan for UAVs of this step, where their mission's mode may need it."""
         if mission.planner is None or mission.mode == "value":
             return None
         left = deadline - _RESERVE_S - time.perf_counter()

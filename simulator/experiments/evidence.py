@@ -33,6 +33,11 @@ def seeds_flown(result: Result, *names: str) -> int:
     return min(len(result.seeds_of.get(name, result.seeds)) for name in names)
 
 
+def flew_all(result: Result, name: str) -> bool:
+    """Whether a scheme flew every world of the result; the means of two that did not cannot be compared."""
+    return len(result.seeds_of.get(name, result.seeds)) == len(result.seeds)
+
+
 def difference(result: Result, scheme: str, reference: str, measure: str) -> Paired:
     """``scheme``'s measure less ``reference``'s, over the worlds that both flew.
 

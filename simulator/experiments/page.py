@@ -17,7 +17,7 @@ from shared.scenario import Scenario
 from simulator.commandline import command_main
 from simulator.experiments import claims, jain
 from simulator.experiments.catalogue import EXPERIMENTS
-from simulator.experiments.evidence import ZERO
+from simulator.experiments.evidence import ZERO, flew_all
 from simulator.experiments.plots import draw, label_of, measured
 from simulator.experiments.result import Figure, Interval, Result
 from simulator.experiments.tables import cell, measure_tables, pair_tables, row_label
@@ -133,9 +133,13 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
 
 @dataclass(frozen=True)
 class Evenness:
-    """One scheme's Jain's index of visits served and of visits scheduled, and its lost packets."""
+    """One scheme's Jain's index of visits served and of visits scheduled, and its lost packets.
+
+    ``on_all_seeds``: whether it flew every world of the result, so that its mean can be put beside others'.
+    """
 
     label: str
+    on_all_seeds: bool
     served: Interval
     scheduled: Interval | None
     lost: Interval | None
@@ -164,6 +168,7 @@ class Fairness:
         by_name = {
             name: Evenness(
                 row_label(result, name),
+                flew_all(result, name),
                 served,
                 measured(result, name, "jain_scheduled"),
                 measured(result, name, "lost_packets"),
@@ -185,9 +190,14 @@ class Fairness:
         )
 
     @property
+    def most_even(self) -> Evenness | None:
+        """The most even of the schemes that flew all worlds; ``None`` where there is none."""
+        return next((row for row in self.rows if row.on_all_seeds), None)
+
+    @property
     def least_lossy(self) -> Evenness | None:
-        """The scheme that lost the fewest packets; ``None`` where losses were not measured."""
-        known = [(row.lost.mean, position) for position, row in enumerate(self.rows) if row.lost]
+        """That of them which lost the fewest packets; ``None`` where losses were not measured."""
+        known = [(row.lost.mean, place) for place, row in enumerate(self.rows) if row.lost and row.on_all_seeds]
         return self.rows[min(known)[1]] if known else None
 
 
@@ -213,21 +223,22 @@ def swap(values: Mapping[str, tuple[float, float]]) -> Swap | None:
 
 
 def late_and_whole(result: Result | None) -> dict[str, tuple[float, float]]:
-    """By scheme's label, lost packets in the last third of a mission and in all of it."""
+    """By scheme's label, lost packets in a mission's last third and in all of it, of those that flew all worlds."""
     curves = {
         label_of(result, name): found["lost_packets_per_step"].mean
         for name, found in (result.curves if result else {}).items()
-        if result and "lost_packets_per_step" in found
+        if result and "lost_packets_per_step" in found and flew_all(result, name)
     }
     return {label: (sum(mean[-(len(mean) // 3) :]), sum(mean)) for label, mean in curves.items()}
 
 
 def packets_and_events(result: Result | None) -> dict[str, tuple[float, float]]:
-    """By scheme's label, lost packets and loss events of a mission."""
+    """By scheme's label, lost packets and loss events of a mission, of those that flew all worlds."""
     return {
         label_of(result, name): (packets.mean, events.mean)
         for name in (result.schemes if result else ())
         if result
+        and flew_all(result, name)
         and (packets := measured(result, name, "lost_packets"))
         and (events := measured(result, name, "events"))
     }

@@ -57,7 +57,7 @@ def test_the_shipped_checkpoint_keeps_the_sensor_that_matters(
     shipped = recall(initial_modules("pretrained", features, 15, seed=0), taught, k)
     random = recall(initial_modules("random", features, 15, seed=0), taught, k)
     assert shipped >= least
-    assert shipped > random + 0.05
+    assert shipped > random + 0.1
 
 
 @pytest.mark.parametrize("features", ["paper", "reach"])

@@ -13,7 +13,7 @@ import pytest
 
 from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.running import listening
-from tests.service.test_upstream import misbehaving, wait_for
+from tests.service.stub_llm import misbehaving, wait_for
 
 
 def test_help_names_every_command() -> None:

@@ -11,7 +11,7 @@ import pytest
 from service.app import create_app
 from service.settings import Settings, usable_cores
 from tests.running import serving
-from tests.service.test_upstream import wait_for
+from tests.service.stub_llm import wait_for
 
 Report = Callable[..., dict[str, Any]]
 

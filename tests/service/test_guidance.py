@@ -8,8 +8,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from fastapi import FastAPI, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from service.asked import Asked
@@ -26,8 +25,8 @@ from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import MissionSpec
 from tests.running import serving
 from tests.service.making import PAPER, attended, mission, uav
+from tests.service.stub_llm import StubLlm, said, wait_for
 from tests.service.test_api import fields
-from tests.service.test_upstream import PROBE, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -38,30 +37,21 @@ ORDERS = "visit sensor 3 every 3 steps"
 OWN = {"sensors": [{"sensor_id": 1, "weight": 4.0, "visit_every": 2}], "max_velocity": 5, "forbidden_velocities": [0]}
 
 
-class Scribe:
-    """An LLM server that obeys a grammar; it says ``orders`` of a note, when it is let, and else an answer."""
+class Scribe(StubLlm):
+    """Says ``orders`` of a note, one after another where it is asked again, and else its answer."""
 
     def __init__(self, *orders: str, answer: str = "0 7") -> None:
-        self.orders, self.answer = list(orders), answer
+        super().__init__(answer)
+        self.orders = list(orders)
         self.asked: list[dict[str, Any]] = []
         self.delay_s = 0.0
-        self.app = FastAPI()
-        self.app.get("/v1/models")(self.models)
-        self.app.post("/v1/chat/completions")(self.complete)
 
-    async def models(self) -> dict[str, Any]:
-        return {"data": [{"id": "stub-1"}]}
-
-    async def complete(self, request: Request) -> Response:
-        body = await request.json()
-        text = self.answer
-        if body["messages"][-1]["content"] == "Say hello.":
-            text = f"{PROBE} 0"
-        elif body["messages"][0]["content"].startswith("Rewrite"):
-            self.asked.append(body)
-            await asyncio.sleep(self.delay_s)
-            text = self.orders[min(len(self.asked), len(self.orders)) - 1]
-        return JSONResponse({"choices": [{"message": {"content": text}}]})
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+        if probed or not body["messages"][0]["content"].startswith("Rewrite"):
+            return await super().respond(body, probed)
+        self.asked.append(body)
+        await asyncio.sleep(self.delay_s)
+        return said(self.orders[min(len(self.asked), len(self.orders)) - 1])
 
 
 def guidance(client: httpx.Client, status: str) -> dict[str, Any]:

@@ -10,8 +10,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from fastapi import FastAPI, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 
 from service.candidates import GuidedTemplate, velocities
 from service.critic import Judgement, Situation, judge
@@ -27,7 +26,7 @@ from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
 from tests.running import listening, serving
 from tests.service.making import PAPER, attended, uav
-from tests.service.test_upstream import FAULTS, misbehaving, wait_for
+from tests.service.stub_llm import FAULTS, StubLlm, misbehaving, said, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -248,29 +247,20 @@ def test_what_others_got_meanwhile_is_not_flown() -> None:
     assert made.conclude(trust, judgement, None, calibrated=False, gone=everything) is None
 
 
-class Chooser:
-    """A server that says one label, with probabilities if it tells any; it favours A where the rows say nothing."""
+class Chooser(StubLlm):
+    """Says one label whatever it is asked, with probabilities if it tells any; A where the rows say nothing."""
 
     def __init__(self, answer: str, tells: bool) -> None:
-        self.answer, self.tells = answer, tells
-        self.bodies: list[dict[str, Any]] = []
-        self.app = FastAPI()
-        self.app.get("/v1/models")(self.models)
-        self.app.post("/v1/chat/completions")(self.complete)
+        super().__init__(answer)
+        self.tells = tells
 
-    async def models(self) -> dict[str, Any]:
-        return {"data": [{"id": "stub-1"}]}
-
-    async def complete(self, request: Request) -> Response:
-        body = await request.json()
-        self.bodies.append(body)
-        empty = "N/A" in body["messages"][-1]["content"] or "?" in body["messages"][-1]["content"]
-        text = "A" if empty else self.answer
-        choice: dict[str, Any] = {"message": {"content": text}}
-        if self.tells and body.get("logprobs"):
-            told = [{"token": text, "logprob": -0.1}, {"token": "B", "logprob": -2.5}]
-            choice["logprobs"] = {"content": [{"token": text, "logprob": -0.1, "top_logprobs": told}]}
-        return JSONResponse({"choices": [choice], "usage": {"prompt_tokens": 300, "completion_tokens": 1}})
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+        text = "A" if set("?/") & set(body["messages"][-1]["content"]) else self.answer
+        usage = {"prompt_tokens": 300, "completion_tokens": 1}
+        if not (self.tells and body.get("logprobs")):
+            return said(text, usage)
+        likeliest = [{"token": text, "logprob": -0.1}, {"token": "B", "logprob": -2.5}]
+        return said(text, usage, logprobs={"content": [{"token": text, "logprob": -0.1, "top_logprobs": likeliest}]})
 
 
 @pytest.mark.parametrize("tells", [True, False])

@@ -9,51 +9,30 @@ from typing import Any
 
 import httpx
 import pytest
-import zstandard
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
-from tests.running import Handler, listening, serving
+from tests.running import listening, serving
+from tests.service.stub_llm import FAULTS, PROBE, StubLlm, misbehaving, said, saying, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
 
-PROBE = "7301"
 
-
-class Model:
-    """An OpenAI-compatible server that obeys some of the ways to constrain an answer, and counts its calls."""
+class Model(StubLlm):
+    """Obeys one of the ways to constrain an answer; ``refuses`` the requests that have another."""
 
     def __init__(self, obeys: str, answer: str = "0 7", refuses: bool = False) -> None:
-        self.obeys, self.answer, self.refuses = obeys, answer, refuses
-        self.bodies: list[dict[str, Any]] = []
-        self.app = FastAPI()
-        self.app.get("/v1/models")(self.models)
-        self.app.post("/v1/chat/completions")(self.complete)
+        super().__init__(answer)
+        self.obeys, self.refuses = obeys, refuses
 
-    async def models(self) -> dict[str, Any]:
-        return {"data": [{"id": "stub-1"}]}
-
-    async def complete(self, request: Request) -> Response:
-        body = await request.json()
-        self.bodies.append(body)
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
         ways = {"grammar", "structured_outputs", "response_format"} & body.keys()
         if self.refuses and ways - {self.obeys}:
             return JSONResponse({"error": "unknown field"}, status_code=400)
-        text = self.answer
-        if body["messages"][-1]["content"] == "Say hello.":
-            text = PROBE + " 0" if self.obeys in ways else "hello"
         usage = {"prompt_tokens": 300, "completion_tokens": 4, "prompt_tokens_details": {"cached_tokens": 250}}
-        return JSONResponse({"choices": [{"message": {"content": text}}], "usage": usage})
-
-
-def wait_for(client: httpx.Client, llm: str) -> dict[str, Any]:
-    for _ in range(1200):
-        ready: dict[str, Any] = client.get("/readyz").json()
-        if ready["llm"] == llm:
-            return ready
-        time.sleep(0.05)
-    raise AssertionError(f"the LLM never became {llm}: {ready}")
+        hello = f"{PROBE} 0" if self.obeys in ways else "hello"
+        return said(hello if probed else self.answer, usage)
 
 
 @pytest.mark.parametrize(
@@ -95,87 +74,6 @@ def test_an_answer_is_checked_whatever_the_server_promised(edge: Edge, report: R
     assert (answer["source"], answer["reason"]) == ("policy", reason)
     assert answer["sensor_id"] in [0, 1, 2, 3]
     assert f'aicvds_llm_requests_total{{outcome="{reason}"}} 1.0' in metrics
-
-
-async def _head(reader: asyncio.StreamReader) -> dict[str, Any]:
-    head = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
-    length = next((int(line.split(":")[1]) for line in head.split("\r\n") if line.startswith("content-length:")), 0)
-    body: dict[str, Any] = json.loads(await reader.readexactly(length) or b"{}")
-    return body
-
-
-def misbehaving(fault: Handler) -> Handler:
-    """A server that passes the probe, so that the edge trusts it, and then does what ``fault`` does."""
-
-    async def handler(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        while True:
-            body = await _head(reader)
-            asked = body.get("messages", [{}])[-1].get("content", "")
-            if body and asked != "Say hello." and asked != "0,50,-90,1,100\n":
-                await fault(reader, writer)
-                return
-            text = f"{PROBE} 0" if asked == "Say hello." else "0 0"
-            answer = json.dumps({"choices": [{"message": {"content": text}}], "data": [{"id": "stub-1"}]}).encode()
-            writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%s" % (len(answer), answer))
-            await writer.drain()
-
-    return handler
-
-
-async def silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    await reader.read()
-
-
-async def dripping(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: 1000\r\n\r\n")
-    while True:
-        writer.write(b" ")
-        await writer.drain()
-        await asyncio.sleep(0.05)
-
-
-async def resetting(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    writer.transport.abort()
-
-
-async def endless(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    writer.write(b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n")
-    while True:
-        writer.write(b"10000\r\n" + b"x" * 0x10000 + b"\r\n")
-        await writer.drain()
-
-
-def saying(status: bytes, body: bytes) -> Handler:
-    async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(b"HTTP/1.1 %s\r\ncontent-length: %d\r\nconnection: close\r\n\r\n%s" % (status, len(body), body))
-        await writer.drain()
-
-    return fault
-
-
-async def _compressed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """A few kilobytes that would unpack to half a gigabyte."""
-    bomb = zstandard.compress(b" " * 500_000_000)
-    writer.write(b"HTTP/1.1 200 OK\r\ncontent-encoding: zstd\r\ncontent-length: %d\r\n\r\n%s" % (len(bomb), bomb))
-    await writer.drain()
-
-
-FAULTS: dict[str, tuple[Handler, str]] = {
-    "silent": (silent, "llm_timeout"),
-    "dripping": (dripping, "llm_timeout"),
-    "resetting": (resetting, "llm_error"),
-    "endless": (endless, "llm_error"),
-    "429": (saying(b"429 Too Many Requests", b"{}"), "llm_status"),
-    "500": (saying(b"500 Oops", b"oops"), "llm_status"),
-    "redirect": (saying(b"302 Found", b""), "llm_status"),
-    "html": (saying(b"200 OK", b"<html>hello</html>"), "llm_error"),
-    "truncated": (saying(b"200 OK", b'{"choices": [{"mess'), "llm_error"),
-    "empty object": (saying(b"200 OK", b"{}"), "llm_error"),
-    "a list": (saying(b"200 OK", b"[1]"), "llm_error"),
-    "no text": (saying(b"200 OK", b'{"choices": [{"message": {"content": null}}]}'), "llm_error"),
-    "compressed": (_compressed, "llm_error"),
-    "not http": (saying(b"", b"\x00\x01"), "llm_error"),
-}
 
 
 @pytest.fixture(params=FAULTS)

@@ -22,8 +22,8 @@ from simulator.experiments.plan import plan
 from simulator.experiments.schemes import OFF, over_edge
 from simulator.site import Site
 from tests.running import serving
+from tests.service.stub_llm import wait_for
 from tests.service.test_guidance import Scribe
-from tests.service.test_upstream import wait_for
 from tests.simulator.experiments.flying_tiny import TINY, decided, declared, flown, setup
 
 Edge = Callable[..., httpx.Client]

@@ -151,6 +151,24 @@ def test_two_schemes_that_swap_ranks_are_found_and_told(tmp_path: Path) -> None:
     assert "EOF loses fewer packets than AIC-VDS (30.0 to 180) in more events (50.0 to 20.0)" in text
 
 
+def test_means_of_fewer_worlds_are_not_put_beside_the_others(tmp_path: Path) -> None:
+    """The easiest ten worlds make any scheme look good."""
+    few = {"seeds_of": {"guided": list(range(10))}, "curves": {"guided": zero_from(20, before=9.0)}}
+    made = result(
+        "fairness",
+        {
+            "eof": {"jain": 0.8, "lost_packets": 30.0, "events": 20.0},
+            "guided": {"jain": interval(0.9, seeds=10), "lost_packets": interval(10.0, seeds=10), "events": 40.0},
+            "random": {"jain": 0.7, "lost_packets": 615.0, "events": 90.0},
+        },
+        **few,
+    )
+    assert list(late_and_whole(made)) == []
+    assert "guided" not in packets_and_events(made) and "EOF" in packets_and_events(made)
+    text = " ".join(page(kept(tmp_path, made)).split())
+    assert "the most even is EOF (0.800, 30.0 packets lost); the fewest packets are lost by EOF (30.0)" in text
+
+
 def test_schemes_that_rank_alike_are_not_said_to_swap() -> None:
     assert swap({"llm": (1.0, 2.0), "eof": (2.0, 3.0)}) is None
     assert swap(late_and_whole(None)) is None
