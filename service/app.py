@@ -50,7 +50,7 @@ def create_app(settings: Settings) -> FastAPI:
             yield {"engine": engine, "upstream": upstream, "metrics": metrics}
         finally:
             await engine.compiler.close()
-            await engine.labels.close()
+            await engine.asking.close()
             await upstream.close()
             await asyncio.to_thread(engine.close)
 

@@ -2,12 +2,13 @@
 
 A candidate's label is a letter. A row of the prompt shows a sensor's first letter; the letters after it stand for
 its faster velocities. Always as many a row, so that the letters' places in the prompt, and with them what the LLM
-favours a letter or a place by, are the same for a mission's life.
+favours a letter or a place by, are the same for a mission's life. Where several UAVs are asked about at once, each
+has rows of its own whose letters begin with A, and the rows name the sensor, which two UAVs must not share.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from string import ascii_uppercase
 from typing import Self
@@ -19,6 +20,7 @@ from service.features import State
 from service.prompt import Prompt, Template, note_block
 from service.reach import Reach, distances_ahead
 from service.rows import Cells, cells, full_cells
+from shared.channel import FloatArray
 from shared.scenario import Scenario
 
 # OpenAI and vLLM tell the probabilities of at most 20 tokens.
@@ -28,12 +30,12 @@ _MOST_PACES = 4
 _NEARLY = 0.9
 
 _STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
-At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.
+At each waypoint you choose{each} one sensor to collect from and the velocity for the next {step_s:g} seconds.
 
 Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost.
 
-Each row is one sensor, {order}: a letter, then
-queue,age,velocity
+{listed}Each row is one sensor, {order}: a letter, then
+{number}queue,age,velocity
 queue: packets waiting. age: steps since its last visit. velocity: the fastest, in m/s, at which the UAV can collect; \
 the slowest before it where that is not 0.
 {letters}
@@ -41,8 +43,17 @@ the slowest before it where that is not 0.
 Rules:
 1. Prefer a full queue, then a long age.
 2. Fly slowly to stay near full queues, fast when there is little to collect.
+{apart}
+{note}{experiences}Answer with {answer} and nothing else."""
 
-{note}{experiences}Answer with one letter and nothing else."""
+_ALONE = {"each": "", "listed": "", "number": "", "apart": "", "answer": "one letter"}
+_TOGETHER = {
+    "each": " for every UAV",
+    "listed": "Each UAV has rows of its own, under its number. ",
+    "number": "sensor,",
+    "apart": "3. Never choose the same sensor for two UAVs.\n",
+    "answer": "one letter for each UAV, in their order, each on a line of its own,",
+}
 
 _EXPERIENCES = "Past decisions are queue,age>velocity:cost, where 0 is the best cost.\n\n"
 # Rows that say nothing of any sensor.
@@ -79,14 +90,16 @@ class GuidedTemplate(Template):
             if self.paces > 1
             else "The letter is the sensor at its fastest velocity."
         )
-        self.static = _STATIC.format(
-            step_s=scenario.step_s,
-            capacity=scenario.queue_capacity,
-            order=order,
-            letters=letters,
-            note=note_block(note),
-            experiences=_EXPERIENCES if experiences else "",
-        )
+        said = {
+            "step_s": scenario.step_s,
+            "capacity": scenario.queue_capacity,
+            "order": order,
+            "letters": letters,
+            "note": note_block(note),
+            "experiences": _EXPERIENCES if experiences else "",
+        }
+        self.static = _STATIC.format(**said, **_ALONE)
+        self.static_together = _STATIC.format(**said, **_TOGETHER)
 
     def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
         """Such as ``52,3>7:0``, the cost in tenths."""
@@ -95,18 +108,43 @@ class GuidedTemplate(Template):
     def offer(self, offer: Offer, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()) -> Prompt:
         """The prompt for one decision, the offer's rows in their order."""
         last = "".join(nearest)
-        whole = "".join(",".join(full_cells(state, row).values()) + "\n" for row in range(len(state.ids)))
         return Prompt(
             static=self.static,
             experiences="".join(experiences),
             state=last + offer.rows,
-            state_uncompressed=last + whole,
+            state_uncompressed=last + _whole(state),
         )
 
-    def content_free(self) -> list[str]:
-        """User messages with as many rows as there can be, none of which says anything."""
+    def together(
+        self, offers: Mapping[int, tuple[Offer, State]], experiences: Sequence[str], nearest: Sequence[str] = ()
+    ) -> dict[int, Prompt]:
+        """Each UAV's share of one prompt about several, by number.
+
+        The static block and the experiences are the first one's; the user message is the shares' in order.
+        """
+        shares = {
+            uav: Prompt("", "", _list(uav, offer.numbered_rows()), _list(uav, _whole(state)))
+            for uav, (offer, state) in offers.items()
+        }
+        uav, first = next(iter(shares.items()))
+        last = "".join(nearest)
+        shares[uav] = Prompt(
+            static=self.static_together,
+            experiences="".join(experiences),
+            state=last + first.state,
+            state_uncompressed=last + first.state_uncompressed,
+        )
+        return shares
+
+    def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
+        """User messages with as many rows as there can be, none of which says anything; of several UAVs, by number."""
         heads = ascii_uppercase[: self.rows * self.paces : self.paces]
-        return ["".join(f"{letter}{nothing}\n" for letter in heads) for nothing in _CONTENT_FREE]
+        if not uavs:
+            return ["".join(f"{letter}{nothing}\n" for letter in heads) for nothing in _CONTENT_FREE]
+        return [
+            "".join(_list(uav, "".join(f"{letter}?,{nothing}\n" for letter in heads)) for uav in uavs)
+            for nothing in _CONTENT_FREE
+        ]
 
     @property
     def labels(self) -> list[str]:
@@ -152,9 +190,15 @@ class Offer:
         known = dict.fromkeys(self.actions)
         return Offer(list(known | dict.fromkeys(added)), self.labels, self.rows)
 
-    def spread(self, by_label: dict[str, float]) -> list[float]:
-        """Probabilities of labels as those of actions."""
-        probabilities = [0.0] * len(self.actions)
+    def numbered_rows(self) -> str:
+        """The rows with the sensor's ID after the letter."""
+        return "".join(
+            f"{row[0]}{self.actions[self.labels[row[0]]][0]},{row[1:]}" for row in self.rows.splitlines(keepends=True)
+        )
+
+    def spread(self, by_label: Mapping[str, float]) -> FloatArray:
+        """Probabilities of labels as those of actions, ``(n,)``."""
+        probabilities = np.zeros(len(self.actions))
         for label, probability in by_label.items():
             probabilities[self.labels[label]] += probability
         return probabilities
@@ -171,6 +215,14 @@ def velocities(reach: Reach, row: int, count: int) -> list[int]:
     packets = reach.packets[:, row]
     good = np.flatnonzero(packets >= _NEARLY * packets.max())
     return [int(level) for level in np.rint(np.linspace(good[0], good[-1], count))]
+
+
+def _whole(state: State) -> str:
+    return "".join(",".join(full_cells(state, row).values()) + "\n" for row in range(len(state.ids)))
+
+
+def _list(uav: int, rows: str) -> str:
+    return f"UAV {uav}\n{rows}"
 
 
 def _span(speeds: Sequence[int]) -> str:

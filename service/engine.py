@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import threading
 import time
 import uuid
-from collections.abc import Awaitable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from service.candidates import GuidedTemplate
+from service.asking import Asking, Word
 from service.compiler import Compiler
 from service.guided import LLM, Deliberation, trust_of
 from service.learner import Sample
 from service.llm.answer import NoDecision, check_answer
-from service.llm.calibration import LabelReader
 from service.llm.client import Completion
 from service.llm.upstream import Upstream
 from service.metrics import Metrics
@@ -49,8 +46,8 @@ log = logging.getLogger(__name__)
 _SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
 # Kept back from the LLM's time for checking, answering and the way through the event loop.
 _RESERVE_S = 0.02
-# After SIGTERM, so that every UAV is answered before the process is killed.
-_HURRY_S = 4.0
+# Of a batch's time, what the LLM may take that is asked about all of its UAVs at once.
+_TOGETHER_SHARE = 0.75
 # Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
 _MAX_LESSONS = 256
 
@@ -100,7 +97,7 @@ class Engine:
     def __init__(self, settings: Settings, upstream: Upstream, counter: TokenCounter, metrics: Metrics) -> None:
         self._settings = settings
         self._upstream = upstream
-        self.labels = LabelReader(upstream)
+        self.asking = Asking(upstream, metrics)
         self.compiler = Compiler(upstream)
         self._counter = counter
         self._metrics = metrics
@@ -108,16 +105,7 @@ class Engine:
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._plans: set[asyncio.Task[None]] = set()
         self._room = threading.Semaphore(_MAX_LESSONS)
-        self._waiting: set[asyncio.Timeout] = set()
-        self._closing = False
         self.missions = Missions(settings, metrics)
-
-    def hurry(self) -> None:
-        """Closing time: the policy answers whoever still waits for the LLM in a few seconds."""
-        self._closing = True
-        ends = asyncio.get_running_loop().time() + _HURRY_S
-        for limit in self._waiting:
-            limit.reschedule(min(limit.when() or ends, ends))
 
     def close(self) -> None:
         """Finish the lesson and the plans in hand, and drop those that are queued."""
@@ -136,13 +124,15 @@ class Engine:
         return await self._decide(mission, request, request.step, deadline_ms, watch, plan)
 
     async def decide_batch(self, request: BatchRequest) -> list[DecideResponse]:
-        """A fleet's decisions in the order asked; each gets an equal share of the time that is left.
+        """A fleet's decisions in the order asked.
 
         All that the UAVs report is known before the first decides, and one plan serves them all, until a UAV is told
-        something else than it: then the rest is planned again.
+        something else than it: then the rest is planned again. The LLM is asked about all at once where it can be,
+        while the plan is made; else about one after the other, each with an equal share of the time that is left.
         """
         watch = Stopwatch()
         total_ms = request.deadline_ms or self._settings.deadline_ms
+        ends = watch.started + total_ms / 1e3
         answers: list[DecideResponse] = []
         mission = self.missions.checked(request)
         # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
@@ -152,12 +142,20 @@ class Engine:
             mission.observe(uav, request.step)
         waiting = [uav.uav_id for uav in request.uavs]
         plan: asyncio.Task[None] | None = None
+        words: dict[int, Word] = {}
+        if together := self.asking.may_ask_together(mission, len(waiting)):
+            plan = self._plan(mission, waiting, request.step, ends)
+            views = [View.of(mission, uav, request.step) for uav in request.uavs]
+            for view in views:
+                view.attend(mission)
+            words = await self.asking.words(mission, views, watch.started + _TOGETHER_SHARE * total_ms / 1e3)
+            watch.lap("llm")
         for turn, uav in enumerate(request.uavs):
-            left_ms = total_ms - (time.perf_counter() - watch.started) * 1e3
-            share_ms = max(1, int(left_ms / (len(request.uavs) - turn)))
-            own = Stopwatch()
+            own = Stopwatch() if turn else watch
+            left_ms = (ends - own.started) * 1e3
+            share_ms = max(1, int(left_ms if together else left_ms / (len(request.uavs) - turn)))
             plan = plan or self._plan(mission, waiting[turn:], request.step, own.started + share_ms / 1e3)
-            answer = await self._decide(mission, uav, request.step, share_ms, own, plan)
+            answer = await self._decide(mission, uav, request.step, share_ms, own, plan, words.get(uav.uav_id))
             if mission.planner is None or mission.planner.action(uav.uav_id) != (answer.sensor_id, answer.velocity):
                 plan = None
             answers.append(answer)
@@ -177,6 +175,7 @@ class Engine:
         deadline_ms: int,
         watch: Stopwatch,
         plan: asyncio.Task[None] | None,
+        word: Word | None = None,
     ) -> DecideResponse:
         attempt = mission.attempt(step, uav.uav_id)
         deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
@@ -189,7 +188,7 @@ class Engine:
         watch.lap("attend")
         deliberation = Deliberation.of(mission, view) if mission.mode == "guided" and view.rows else None
         if deliberation is not None:
-            prompt = deliberation.prompt
+            prompt = word.prompt if word else deliberation.prompt
         else:
             prompt = mission.template.prompt(
                 view.state, view.shown(mission), mission.experiences, view.nearest(mission)
@@ -197,7 +196,7 @@ class Engine:
         tokens = self._count(prompt)
         watch.lap("prompt")
         if deliberation is not None:
-            choice = await self._weigh(mission, view, deliberation, deadline, watch)
+            choice = await self._weigh(mission, view, deliberation, word, deadline, watch)
         else:
             choice = await self._choose(mission, view, prompt, deadline, watch, plan)
         levels = mission.scenario.max_velocity + 1
@@ -261,7 +260,11 @@ class Engine:
             if mission.mode == "value":
                 (sensor, velocity), reason = view.by_value(mission), "mode_value"
             else:
-                completion = await self._ask(mission, view, prompt, deadline, watch)
+                try:
+                    levels = mission.scenario.max_velocity + 1
+                    completion = await self.asking.pair(prompt, view.offered, levels, deadline)
+                finally:
+                    watch.lap("llm")
                 sensor, velocity = check_answer(completion.text, view.offered, mission.scenario.max_velocity + 1)
                 if not mission.guidance.obeyed.allows(velocity):
                     raise NoDecision("answer_velocity", f"the operator forbids {velocity} m/s")
@@ -291,55 +294,35 @@ class Engine:
         return sensor, velocity
 
     async def _weigh(
-        self, mission: Mission, view: View, deliberation: Deliberation, deadline: float, watch: Stopwatch
+        self,
+        mission: Mission,
+        view: View,
+        deliberation: Deliberation,
+        word: Word | None,
+        deadline: float,
+        watch: Stopwatch,
     ) -> Choice:
         """Mode ``guided``: the LLM's word weighed with the others' and with the critic, which thinks while it is asked.
 
-        Without the LLM the others decide: source ``policy``, with the reason.
+        ``word`` is there where it has been asked already. Without one the others decide: source ``policy``, with the
+        reason.
         """
-        template, labels = deliberation.prompt.static, list(deliberation.offer.labels)
         thinking = asyncio.create_task(asyncio.to_thread(deliberation.judge))
-        completion: Completion | None = None
-        told: dict[str, float] | None = None
-        reason: Reason | None = None
         try:
-            asked = self.labels.ask(template, deliberation.prompt.user, labels)
-            completion = await self._within(asked, deadline, watch)
-            told = self.labels.read(completion, template, labels)
-        except NoDecision as error:
-            log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
-            reason = error.reason
+            word = word or await self.asking.word(mission, deliberation.offer, deliberation.prompt, deadline)
+            watch.lap("llm")
         finally:
             judgement = await thinking
         watch.lap("judge")
-        self._metrics.llm_requests.labels(reason or "ok").inc()
         trust = trust_of(mission, self._upstream.model)
-        known = self.labels.bias(template) is not None and self._upstream.logprobs
         gone = mission.reserved(view.step, view.uav_id)
-        verdict = deliberation.conclude(trust, judgement, told, calibrated=known, gone=gone)
-        if told is not None and isinstance(mission.template, GuidedTemplate):
-            self.labels.calibrate(template, mission.template.content_free(), mission.template.labels)
+        told = word.of(deliberation.offer.actions)
+        verdict = deliberation.conclude(trust, judgement, told, calibrated=word.calibrated, gone=gone)
         if verdict is None:
             sensor, velocity = self._by_policy(mission, view)
-            return Choice(sensor, velocity, "answer_reserved", completion)
+            return Choice(sensor, velocity, "answer_reserved", word.completion)
         self._metrics.llm_trust.observe(trust.weights[LLM])
-        return Choice(*verdict.action, reason, completion, verdict.told, verdict.advice)
-
-    async def _ask(self, mission: Mission, view: View, prompt: Prompt, deadline: float, watch: Stopwatch) -> Completion:
-        levels = mission.scenario.max_velocity + 1
-        return await self._within(self._upstream.ask(prompt.static, prompt.user, view.offered, levels), deadline, watch)
-
-    async def _within(self, asked: Awaitable[Completion], deadline: float, watch: Stopwatch) -> Completion:
-        limit = asyncio.timeout(min(deadline - time.perf_counter(), _HURRY_S if self._closing else math.inf))
-        try:
-            async with limit:
-                self._waiting.add(limit)
-                return await asked
-        except TimeoutError:
-            raise NoDecision("llm_timeout", "no answer within the deadline") from None
-        finally:
-            self._waiting.discard(limit)
-            watch.lap("llm")
+        return Choice(*verdict.action, word.reason, word.completion, verdict.told, verdict.advice)
 
     def _apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         result: Literal["applied", "duplicate"] = "duplicate"

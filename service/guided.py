@@ -67,13 +67,8 @@ class Deliberation:
     @classmethod
     def of(cls, mission: Mission, view: View) -> Self:
         """For a mission of mode ``guided`` and a view with at least one row."""
-        template = mission.template
-        if not isinstance(template, GuidedTemplate):
-            raise TypeError(f"mission {mission.mission_id} flies in mode {mission.mode}, not guided")
-        shown = Offer.of(view.state, view.shown(mission), view.uav_id, template, mission.scenario)
-        if (asked := view.asked) is not None:
-            rows = {int(sensor): row for row, sensor in enumerate(view.state.ids)}
-            shown = shown.flown_as(lambda sensor, velocity: asked.nearest(rows[sensor], velocity))
+        template = template_of(mission)
+        shown = offered(mission, view)
         proposed = {expert: action for expert in EXPERTS if (action := expert.proposal(mission, view)) is not None}
         offer = shown.with_actions(list(proposed.values()))
         reserved = mission.reserved(view.step, view.uav_id)
@@ -115,7 +110,7 @@ class Deliberation:
         self,
         trust: Trust,
         judgement: Judgement,
-        llm: dict[str, float] | None,
+        llm: FloatArray | None,
         *,
         calibrated: bool,
         gone: Collection[int] = (),
@@ -123,14 +118,13 @@ class Deliberation:
         """Weigh the advice; None where every candidate's sensor is gone.
 
         Args:
-            llm: probabilities of the offer's labels; None where the LLM was silent.
+            llm: the LLM's probabilities of the offer's actions, ``(n,)``; None where it was silent.
             gone: sensors that others were given meanwhile.
         """
         spoken = dict(self.advised)
         if llm is not None:
-            told = np.asarray(self.offer.spread(llm))
             # What no label names is as likely as what the LLM ruled out.
-            spoken[LLM] = (1.0 - SMOOTHING) * told + SMOOTHING / len(told)
+            spoken[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
         weights = trust.among(spoken)
         mixture = np.sum([weights[name] * p for name, p in spoken.items()], axis=0)
         regret = self._regret(judgement.lost)
@@ -161,6 +155,23 @@ class Deliberation:
         return Verdict(
             self.offer.actions[best], Guided(trust=shares, calibrated=calibrated, candidates=weighed), advice
         )
+
+
+def template_of(mission: Mission) -> GuidedTemplate:
+    """The mission's prompt; raises ``TypeError`` where it flies in another mode."""
+    if not isinstance(mission.template, GuidedTemplate):
+        raise TypeError(f"mission {mission.mission_id} flies in mode {mission.mode}, not guided")
+    return mission.template
+
+
+def offered(mission: Mission, view: View) -> Offer:
+    """What the LLM may choose from, at velocities that the operator allows; the view has at least one row."""
+    shown = Offer.of(view.state, view.shown(mission), view.uav_id, template_of(mission), mission.scenario)
+    asked = view.asked
+    if asked is None:
+        return shown
+    rows = {int(sensor): row for row, sensor in enumerate(view.state.ids)}
+    return shown.flown_as(lambda sensor, velocity: asked.nearest(rows[sensor], velocity))
 
 
 def trust_of(mission: Mission, model: str | None) -> Trust:

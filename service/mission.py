@@ -112,7 +112,8 @@ class Mission:
                 note=spec.note,
             )
         )
-        self._check_prompt(settings)
+        self._context = settings.llm_context
+        self._check_prompt()
         self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
         self.decisions = 0
         self.feedback = 0
@@ -181,16 +182,26 @@ class Mission:
         if uav.outcome is not None:
             self.find(uav.outcome.decision_id, f"{at}outcome.decision_id")
 
-    def _check_prompt(self, settings: Settings) -> None:
-        """Refuse a prompt that the LLM's context cannot hold; without an LLM nobody reads it."""
-        style, rows = self.spec.prompt, self.scenario.sensors
-        if self.attends:
-            rows = min(rows, self.top_k)
+    def holds(self, uavs: int) -> bool:
+        """Whether the LLM's context is large enough for a prompt about so many UAVs at once."""
+        return self._prompt_needs(uavs) <= self._context
+
+    def _prompt_needs(self, uavs: int = 1) -> int:
+        """Tokens that a prompt may take at most."""
         lines = self._experience_limit + (NEAREST if self._selection == "similar" else 0)
+        style, rows = self.spec.prompt, self._rows * uavs
         needed = prompt_tokens(style.format, rows, lines, self.features, self.template.demonstrations)
         # No tokenizer makes more tokens than bytes.
-        needed += len(note_block(self.spec.note).encode())
-        if self.asks and needed > settings.llm_context:
+        return needed + len(note_block(self.spec.note).encode())
+
+    @property
+    def _rows(self) -> int:
+        return min(self.scenario.sensors, self.top_k) if self.attends else self.scenario.sensors
+
+    def _check_prompt(self) -> None:
+        """Refuse a prompt that the LLM's context cannot hold; without an LLM nobody reads it."""
+        style = self.spec.prompt
+        if self.asks and not self.holds(1):
             shown = f"{self._experience_limit} experiences"
             lower = "prompt.experiences"
             if style.demonstrations:
@@ -198,8 +209,8 @@ class Mission:
                 lower += ", prompt.demonstrations"
             raise Refused(
                 "prompt",
-                f"{shown} and {rows} sensors as {style.format} need up to {needed} tokens "
-                f"and AICVDS_LLM_CONTEXT is {settings.llm_context}: raise it, or lower {lower} or top_k",
+                f"{shown} and {self._rows} sensors as {style.format} need up to {self._prompt_needs()} tokens "
+                f"and AICVDS_LLM_CONTEXT is {self._context}: raise it, or lower {lower} or top_k",
             )
 
     def find(self, decision_id: str, field: str = "decision_id") -> Literal["pending", "applied"]:

@@ -87,7 +87,7 @@ def _serve(listener: socket.socket) -> int:
     class Server(uvicorn.Server):
         async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
             if (engine := getattr(app.state, "engine", None)) is not None:
-                engine.hurry()
+                engine.asking.hurry()
             await super().shutdown(sockets)
 
     Server(config).run(sockets=[listener])

@@ -11,6 +11,7 @@ from shared.wire import Reason
 
 Constraint = Literal["grammar", "structured_outputs", "json_schema", "none"]
 
+_JOINED = r' "\n" '
 _PLAIN = re.compile(r"([0-9]{1,5}) ([0-9]{1,2})")
 
 
@@ -40,29 +41,32 @@ def constrain(constraint: Constraint, sensor_ids: Sequence[int], velocities: int
     return {}
 
 
-def constrain_label(constraint: Constraint, labels: Sequence[str]) -> dict[str, Any]:
-    """The request fields that hold a server to one of some labels, each a single token.
+def constrain_labels(constraint: Constraint, lists: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """The request fields that hold a server to one label of each list, each a single token and on a line of its own.
 
-    OpenAI's ``json_schema`` could only name the label within an object, not in the first token: such a server is left
+    OpenAI's ``json_schema`` could only name a label within an object, not as a token of its own: such a server is left
     free, and the labels are found among its likeliest tokens.
     """
     if constraint == "grammar":
-        return {"grammar": f"root ::= {_alternatives(list(labels))}"}
+        choices = [_alternatives(list(labels)) for labels in lists]
+        return {"grammar": "root ::= " + (choices[0] if len(choices) == 1 else _JOINED.join(f"({c})" for c in choices))}
+    if constraint == "structured_outputs" and len(lists) == 1:
+        return {"structured_outputs": {"choice": list(lists[0])}}
     if constraint == "structured_outputs":
-        return {"structured_outputs": {"choice": list(labels)}}
+        return {"structured_outputs": {"regex": r"\n".join(f"({'|'.join(labels)})" for labels in lists)}}
     return {}
 
 
-def check_label(text: str, labels: Collection[str]) -> str:
-    """The label that a text is.
+def check_labels(text: str, lists: Sequence[Collection[str]]) -> list[str]:
+    """The label of each list that a text names, one a line.
 
     Raises:
-        NoDecision: it is none of those offered.
+        NoDecision: there are more or fewer, or one is none of those offered.
     """
-    label = text.strip()
-    if label not in labels:
+    labels = text.split()
+    if len(labels) != len(lists) or any(label not in offered for label, offered in zip(labels, lists, strict=True)):
         raise NoDecision("answer_format", repr(text[:80]))
-    return label
+    return labels
 
 
 def json_schema(sensor_ids: list[int], velocities: list[int]) -> dict[str, Any]:

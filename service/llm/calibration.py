@@ -14,7 +14,7 @@ import logging
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 
-from service.llm.answer import NoDecision, check_label
+from service.llm.answer import NoDecision, check_labels
 from service.llm.client import Completion
 from service.llm.upstream import Upstream
 
@@ -27,22 +27,33 @@ _LEAST_BIAS = 0.1
 _KEPT = 64
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
+# The model, the static block, and how many lists of labels.
+_Asked = tuple[str | None, str, int]
 
 
-def probabilities(completion: Completion, labels: Collection[str]) -> dict[str, float]:
-    """The LLM's probability of each label offered, summing to 1.
+def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
+    """The LLM's probability of each label offered, summing to 1, for each list that it was to name one of.
 
     A label that is not among the tokens told gets half of the least that is. Where the server tells no probabilities,
-    its answer gets 0.95 and all labels share the rest.
+    its answer gets 0.95 and all labels of the list share the rest.
 
     Raises:
         NoDecision: neither the tokens told nor the text name a label offered.
     """
-    told = {label: completion.first_token[label] for label in labels if label in completion.first_token}
-    if sum(told.values()) <= 0.0:
-        answer = check_label(completion.text, labels)
-        share = _SMOOTHING / len(labels)
-        return {label: share + (1.0 - _SMOOTHING) * (label == answer) for label in labels}
+    told = [
+        {label: place[label] for label in labels if label in place}
+        for place, labels in zip(completion.likeliest, lists, strict=False)
+    ]
+    if len(told) == len(lists) and all(sum(place.values()) > 0.0 for place in told):
+        return [_filled(place, labels) for place, labels in zip(told, lists, strict=True)]
+    answers = check_labels(completion.text, lists)
+    return [
+        {label: _SMOOTHING / len(labels) + (1.0 - _SMOOTHING) * (label == answer) for label in labels}
+        for answer, labels in zip(answers, lists, strict=True)
+    ]
+
+
+def _filled(told: Mapping[str, float], labels: Collection[str]) -> dict[str, float]:
     least = 0.5 * min(value for value in told.values() if value > 0.0)
     return _normalised({label: told.get(label) or least for label in labels})
 
@@ -55,36 +66,46 @@ def calibrated(told: Mapping[str, float], bias: Mapping[str, float]) -> dict[str
 
 
 class LabelReader:
-    """Asks one LLM for labels, and learns what it favours, for every mission of a service."""
+    """Asks one LLM for labels, and learns what it favours, for every mission of a service.
+
+    One question may have several lists of labels, of each of which the answer is to name one.
+    """
 
     def __init__(self, upstream: Upstream) -> None:
         self._upstream = upstream
-        self._bias: OrderedDict[tuple[str | None, str], dict[str, float]] = OrderedDict()
-        self._attempts: dict[tuple[str | None, str], int] = {}
+        self._bias: OrderedDict[_Asked, list[dict[str, float]]] = OrderedDict()
+        self._attempts: dict[_Asked, int] = {}
         self._task: asyncio.Task[None] | None = None
 
-    def bias(self, static: str) -> dict[str, float] | None:
-        """What the present model favours under a static block, once that is measured."""
-        return self._bias.get((self._upstream.model, static))
+    def bias(self, static: str, lists: int = 1) -> list[dict[str, float]] | None:
+        """What the present model favours under a static block, by list, once that is measured."""
+        return self._bias.get((self._upstream.model, static, lists))
 
-    async def ask(self, static: str, user: str, labels: Sequence[str]) -> Completion:
+    async def ask(self, static: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
         """One answer; raises :class:`NoDecision`. What it tells is for :meth:`read`."""
-        return await self._upstream.ask_label(static, user, labels)
+        return await self._upstream.ask_labels(static, user, lists)
 
-    def read(self, completion: Completion, static: str, labels: Collection[str]) -> dict[str, float]:
-        """The probabilities of the labels, without the bias where that is known; raises :class:`NoDecision`."""
-        told = probabilities(completion, labels)
-        bias = self.bias(static)
-        return calibrated(told, bias) if bias and completion.first_token else told
+    def read(self, completion: Completion, static: str, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
+        """The labels' probabilities by list, without the bias where that is known; raises :class:`NoDecision`."""
+        told = probabilities(completion, lists)
+        bias = self.bias(static, len(lists))
+        if bias is None or not completion.likeliest:
+            return told
+        return [calibrated(*pair) for pair in zip(told, bias, strict=True)]
 
-    def calibrate(self, static: str, texts: Sequence[str], labels: Sequence[str]) -> None:
-        """Measure the bias in the background, unless it is known, being measured, or cannot be."""
-        key = (self._upstream.model, static)
+    def calibrate(self, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
+        """Measure the bias in the background, unless it is known, being measured, or cannot be.
+
+        Args:
+            texts: user messages that say nothing.
+            lists: every label that a question under this static block can offer, by list.
+        """
+        key = (self._upstream.model, static, len(lists))
         busy = self._task is not None and not self._task.done()
         if busy or key in self._bias or not self._upstream.logprobs or self._attempts.get(key, 0) >= _ATTEMPTS:
             return
         self._attempts[key] = self._attempts.get(key, 0) + 1
-        self._task = asyncio.create_task(self._measure(key, texts, labels), name="calibration")
+        self._task = asyncio.create_task(self._measure(key, texts, lists), name="calibration")
 
     async def close(self) -> None:
         """Give up measuring."""
@@ -92,14 +113,17 @@ class LabelReader:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
-    async def _measure(self, key: tuple[str | None, str], texts: Sequence[str], labels: Sequence[str]) -> None:
+    async def _measure(self, key: _Asked, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
             async with asyncio.timeout(_TIMEOUT_S):
-                told = [probabilities(await self.ask(key[1], text, labels), labels) for text in texts]
+                told = [probabilities(await self.ask(key[1], text, lists), lists) for text in texts]
         except (NoDecision, TimeoutError) as error:
             log.warning("label bias not measured: %s", error)
             return
-        self._bias[key] = {label: sum(p[label] for p in told) / len(told) for label in labels}
+        self._bias[key] = [
+            {label: sum(answer[at][label] for answer in told) / len(told) for label in labels}
+            for at, labels in enumerate(lists)
+        ]
         while len(self._bias) > _KEPT:
             self._bias.popitem(last=False)
         if len(self._attempts) > 16 * _KEPT:

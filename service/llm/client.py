@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import httpx
 
-from service.llm.answer import Constraint, NoDecision, constrain, constrain_label
+from service.llm.answer import Constraint, NoDecision, constrain, constrain_labels
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES = 256 * 1024
@@ -19,6 +19,7 @@ _MAX_TOKENS = 10**9
 _NOT_UNDERSTOOD = (400, 404, 422)
 # The most likely tokens that OpenAI and vLLM tell.
 TOLD_TOKENS = 20
+_MOST_PLACES = 256
 
 
 class NotUnderstood(NoDecision):
@@ -33,14 +34,15 @@ class Unreachable(NoDecision):
 class Completion:
     """An answer's text and the server's ``usage``; ``None`` where it said nothing.
 
-    ``first_token`` holds the probabilities of the likeliest first tokens, empty where the server told none.
+    ``likeliest`` holds, for each token of the text that is not blank, the probabilities of the likeliest tokens in its
+    place; empty where the server told none.
     """
 
     text: str
     prompt_tokens: int | None
     cached_tokens: int | None
     completion_tokens: int | None
-    first_token: dict[str, float] = field(default_factory=dict)
+    likeliest: tuple[dict[str, float], ...] = ()
 
 
 class LLMClient:
@@ -87,7 +89,7 @@ class LLMClient:
         prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
         if prompt is not None and cached is not None:
             cached = min(cached, prompt)
-        return Completion(text, prompt, cached, completion, _first_token(answer["choices"][0]))
+        return Completion(text, prompt, cached, completion, _likeliest(answer["choices"][0]))
 
     async def _call(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
         content = bytearray()
@@ -141,10 +143,10 @@ def label_body(
     system: str,
     user: str,
     constraint: Constraint,
-    labels: Sequence[str],
+    lists: Sequence[Sequence[str]],
     logprobs: bool = True,
 ) -> dict[str, Any]:
-    """The request body for one token that is a label, with the likeliest tokens' probabilities if ``logprobs``.
+    """The request body for one label of each list, with the likeliest tokens' probabilities if ``logprobs``.
 
     llama.cpp tells its probabilities from before the grammar unless asked for those after sampling; after sampling at
     temperature 0 all but one are 0. So it samples at temperature 1 with nothing cut off: the text is then a draw, and
@@ -153,9 +155,10 @@ def label_body(
     body: dict[str, Any] = {
         "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
         "temperature": 0,
-        "max_tokens": 1,
+        # A token a label, and one for each end of a line between them.
+        "max_tokens": 2 * len(lists) - 1,
         "stream": False,
-        **constrain_label(constraint, labels),
+        **constrain_labels(constraint, lists),
     }
     if model:
         body["model"] = model
@@ -200,17 +203,20 @@ def rewriting_body(
     return body
 
 
-def _first_token(choice: Any) -> dict[str, float]:
-    """Probabilities of the likeliest first tokens: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
+def _likeliest(choice: Any) -> tuple[dict[str, float], ...]:
+    """A place's likeliest tokens with their probabilities: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
     try:
-        first = choice["logprobs"]["content"][0]
-        told = first.get("top_logprobs") or first.get("top_probs") or []
-        found: dict[str, float] = {}
-        for entry in told[: 4 * TOLD_TOKENS]:
-            probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
-            if isinstance(entry["token"], str) and 0.0 <= probability <= 1.0:
-                token = entry["token"].strip()
-                found[token] = min(1.0, found.get(token, 0.0) + float(probability))
-        return found
+        places = choice["logprobs"]["content"][:_MOST_PLACES]
+        return tuple(_probabilities(place) for place in places if place["token"].strip())
     except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
-        return {}
+        return ()
+
+
+def _probabilities(place: Any) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for entry in (place.get("top_logprobs") or place.get("top_probs") or [])[: 4 * TOLD_TOKENS]:
+        probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
+        if isinstance(entry["token"], str) and 0.0 <= probability <= 1.0:
+            token = entry["token"].strip()
+            found[token] = min(1.0, found.get(token, 0.0) + float(probability))
+    return found

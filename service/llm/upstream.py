@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from service.llm.answer import Constraint, NoDecision
+from service.llm.answer import Constraint, NoDecision, check_labels
 from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body, rewriting_body
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
@@ -30,6 +30,7 @@ _STEPS_BACK = 3
 _SILENCE_S = 0.5
 _PATIENCE_S = 10.0
 # No model says this of its own accord, so a server that answers it has obeyed the constraint.
+_PROBE_TEXT = "Say hello."
 _PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
 _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
 
@@ -57,6 +58,8 @@ class Upstream:
         self.constraint: Constraint = "none"
         # Whether the server tells the probabilities of tokens.
         self.logprobs = False
+        # Whether it answers for several UAVs at once.
+        self.together = False
         self._deciding = 0
         self._decided_at = -math.inf
         self._beside: asyncio.Task[Completion] | None = None
@@ -101,13 +104,13 @@ class Upstream:
         """
         return await self._decide(chat_body(self.model, system, user, self.constraint, sensor_ids, velocities))
 
-    async def ask_label(self, system: str, user: str, labels: Sequence[str]) -> Completion:
-        """One token that should be a label, with the likeliest tokens' probabilities where the server tells them.
+    async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
+        """A token a list that should be a label, with the likeliest tokens' probabilities where the server tells them.
 
         Raises:
             NoDecision: no answer, with the reason.
         """
-        return await self._decide(label_body(self.model, system, user, self.constraint, labels, self.logprobs))
+        return await self._decide(label_body(self.model, system, user, self.constraint, lists, self.logprobs))
 
     async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
         """An operator's note as orders that it allows, where the server can be held to them.
@@ -198,6 +201,7 @@ class Upstream:
                 self.model = next(iter(await self._client.models()), None)
             self.constraint = await self._probe(self._client)
             self.logprobs = await self._probe_logprobs(self._client)
+            self.together = await self._probe_together(self._client)
             template = Template(SCENARIOS["paper"], experiences=settings.experiences)
             first = chat_body(self.model, template.static, "0,50,-90,1,100\n", self.constraint, [0], 15)
             await self._client.complete(first)
@@ -220,12 +224,22 @@ class Upstream:
         return "none"
 
     async def _probe_logprobs(self, client: LLMClient) -> bool:
-        """Whether the server tells the probabilities of the first token: it may ignore or refuse the field."""
-        body = label_body(self.model, "Answer in words.", "Say hello.", self.constraint, ["A", "B"])
+        """Whether the server tells the probabilities of tokens: it may ignore or refuse the field."""
+        body = label_body(self.model, "Answer in words.", _PROBE_TEXT, self.constraint, [["A", "B"]])
         try:
-            return bool((await client.complete(body)).first_token)
+            return bool((await client.complete(body)).likeliest)
         except NotUnderstood:
             return False
 
+    async def _probe_together(self, client: LLMClient) -> bool:
+        """Whether the server names a label of each of two lists, which only one that obeys a constraint does."""
+        lists = [["A", "B"], ["C", "D"]]
+        body = label_body(self.model, "Answer in words.", _PROBE_TEXT, self.constraint, lists, self.logprobs)
+        try:
+            check_labels((await client.complete(body)).text, lists)
+        except NoDecision:
+            return False
+        return True
+
     def _probe_body(self, constraint: Constraint) -> dict[str, Any]:
-        return chat_body(self.model, "Answer in words.", "Say hello.", constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)
+        return chat_body(self.model, "Answer in words.", _PROBE_TEXT, constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)

@@ -82,6 +82,32 @@ def test_guided_asks_for_one_token_and_reads_little_anew(loaded: httpx.Client, r
     assert answer["guided"]["calibrated"]
 
 
+def test_a_fleets_step_takes_one_call(loaded: httpx.Client, report: Report) -> None:
+    """One letter a UAV and a line's end between them, each with the LLM's probabilities."""
+    loaded.put("/missions/fleet", json={"mode": "guided"})
+    for step in range(30):
+        uavs = [{k: report(step=step, uav_id=i)[k] for k in ("uav_id", "position", "sensors")} for i in range(3)]
+        body = {"mission_id": "fleet", "step": step, "uavs": uavs}
+        before = calls(loaded)
+        decisions = loaded.post("/decide/batch", json=body).json()["decisions"]
+        assert calls(loaded) == before + 1
+        assert [(d["source"], d["reason"]) for d in decisions] == [("guided", None)] * 3
+        assert len({d["sensor_id"] for d in decisions}) == 3
+        assert [d["tokens"]["completion"] for d in decisions] == [5, None, None]
+        if decisions[0]["guided"]["calibrated"]:
+            break
+        # The bias is measured beside the decisions, and the server has one slot.
+        time.sleep(1)
+    assert decisions[0]["guided"]["calibrated"]
+    assert decisions[0]["tokens"]["cached"] > decisions[0]["tokens"]["static"]
+
+
+def calls(client: httpx.Client) -> float:
+    """How often the LLM has decided."""
+    lines = client.get("/metrics").text.splitlines()
+    return sum(float(line.split()[-1]) for line in lines if line.startswith("aicvds_llm_requests_total"))
+
+
 def test_decisions_and_health_go_on_while_the_model_loads(report: Report) -> None:
     with serving(create_app(Settings())) as url, httpx.Client(base_url=url, timeout=10) as client:
         seen = set()

@@ -49,7 +49,7 @@ def deliberation(mission: Mission, step: int = 0) -> tuple[View, Deliberation]:
 
 
 def completion(text: str, **first_token: float) -> Completion:
-    return Completion(text, None, None, None, first_token)
+    return Completion(text, None, None, None, (first_token,) if first_token else ())
 
 
 def test_every_row_has_four_letters_whose_velocities_rise() -> None:
@@ -97,12 +97,27 @@ def test_calibration_takes_a_favourite_label_away() -> None:
 
 
 def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> None:
-    assert probabilities(completion("x", A=0.6, B=0.2, the=0.2), "AB") == pytest.approx({"A": 0.75, "B": 0.25})
+    def told(made: Completion, labels: str) -> dict[str, float]:
+        return probabilities(made, [labels])[0]
+
+    assert told(completion("x", A=0.6, B=0.2, the=0.2), "AB") == pytest.approx({"A": 0.75, "B": 0.25})
     # C was not among the likeliest tokens.
-    assert probabilities(completion("A", A=0.6, B=0.2), "ABC")["C"] == pytest.approx(0.1 / 0.9)
-    assert probabilities(completion(" B\n"), "AB") == pytest.approx({"A": 0.025, "B": 0.975})
+    assert told(completion("A", A=0.6, B=0.2), "ABC")["C"] == pytest.approx(0.1 / 0.9)
+    assert told(completion(" B\n"), "AB") == pytest.approx({"A": 0.025, "B": 0.975})
     with pytest.raises(NoDecision):
-        probabilities(completion("hello", the=1.0), "AB")
+        told(completion("hello", the=1.0), "AB")
+
+
+def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
+    places = ({"A": 0.9, "B": 0.1}, {"C": 0.5, "B": 0.2, "A": 0.3})
+    read = probabilities(Completion("A\nB", None, None, None, places), ["AB", "AB"])
+    assert read == [pytest.approx({"A": 0.9, "B": 0.1}), pytest.approx({"A": 0.6, "B": 0.4})]
+    # Of the second place no probabilities came: then the text counts, for both.
+    read = probabilities(Completion("A\nB", None, None, None, places[:1]), ["AB", "AB"])
+    assert [max(place, key=lambda label: place[label]) for place in read] == ["A", "B"]
+    for text in ("A", "A\nB\nA", "A\nC", ""):
+        with pytest.raises(NoDecision):
+            probabilities(completion(text), ["AB", "AB"])
 
 
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
@@ -190,7 +205,8 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
         labels = made.offer.labels
         worst = max(labels, key=lambda name: judgement.lost[labels[name]])
         told = worst if answer == "worst" else str(random.choice(list(labels)))
-        verdict = made.conclude(trust, judgement, {name: float(name == told) for name in labels}, calibrated=False)
+        word = made.offer.spread({name: float(name == told) for name in labels})
+        verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None and verdict.action == plan
         assert set(verdict.told.trust) == {"llm", "planner", "value", "policy"}
 
@@ -202,9 +218,8 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
         view, made = deliberation(mission, step)
         judgement = made.judge()
         label = answer(made, judgement.lost)
-        verdict = made.conclude(
-            trust, judgement, {name: float(name == label) for name in made.offer.labels}, calibrated=False
-        )
+        word = made.offer.spread({name: float(name == label) for name in made.offer.labels})
+        verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None
         decision_id = f"{step:032x}"
         trust.note(decision_id, verdict.advice)
@@ -229,7 +244,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     judgement = made.judge()
     worst = max(made.offer.labels, key=lambda name: judgement.lost[made.offer.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
-    told = {name: float(name == worst) for name in made.offer.labels}
+    told = made.offer.spread({name: float(name == worst) for name in made.offer.labels})
     verdict = made.conclude(trust_of(mission, "stub"), judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.offer.actions[made.offer.labels[worst]]

@@ -1,0 +1,155 @@
+"""Asking the LLM, within a deadline: of one UAV's decision, or of all UAVs of a step at once."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import Awaitable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.candidates import Offer
+from service.critic import Action
+from service.guided import offered, template_of
+from service.llm.answer import NoDecision
+from service.llm.calibration import LabelReader
+from service.llm.client import Completion
+from service.llm.upstream import Upstream
+from service.metrics import Metrics
+from service.mission import Mission
+from service.prompt import Prompt
+from service.view import View
+from shared.channel import FloatArray
+from shared.wire import Reason
+
+log = logging.getLogger(__name__)
+
+# After SIGTERM, so that every UAV is answered before the process is killed.
+_HURRY_S = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """What the LLM said of one UAV's candidates in mode ``guided``.
+
+    ``told`` holds the probabilities of the actions that it was asked about; None where it was silent, for the
+    ``reason``. Where several UAVs were asked about at once, ``prompt`` is this one's share, and the whole call's static
+    block, experiences and ``completion`` are with the first.
+    """
+
+    prompt: Prompt
+    told: dict[Action, float] | None
+    reason: Reason | None
+    completion: Completion | None
+    calibrated: bool
+
+    def of(self, actions: Sequence[Action]) -> FloatArray | None:
+        """Its probabilities of these actions, ``(n,)``; None where it said nothing of any."""
+        if self.told is None:
+            return None
+        found = np.array([self.told.get(action, 0.0) for action in actions])
+        return found / found.sum() if found.sum() > 0.0 else None
+
+
+class Asking:
+    """Asks one LLM for every mission of a service."""
+
+    def __init__(self, upstream: Upstream, metrics: Metrics) -> None:
+        self._upstream = upstream
+        self._metrics = metrics
+        self._labels = LabelReader(upstream)
+        self._waiting: set[asyncio.Timeout] = set()
+        self._closing = False
+
+    def hurry(self) -> None:
+        """Closing time: who still waits for the LLM does so for a few seconds more."""
+        self._closing = True
+        ends = asyncio.get_running_loop().time() + _HURRY_S
+        for limit in self._waiting:
+            limit.reschedule(min(limit.when() or ends, ends))
+
+    async def close(self) -> None:
+        """Give up what goes on in the background."""
+        await self._labels.close()
+
+    async def pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: float) -> Completion:
+        """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``. Deadlines are of ``time.perf_counter``."""
+        return await self._within(self._upstream.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
+
+    async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
+        """Mode ``guided``: what the LLM says of one UAV's candidates."""
+        template = template_of(mission)
+        lists = [list(offer.labels)]
+        completion, told, reason = await self._heard(mission, prompt.static, prompt.user, lists, deadline)
+        calibrated = self._knows(prompt.static, lists)
+        if told is None:
+            return Word(prompt, None, reason, completion, calibrated)
+        self._labels.calibrate(prompt.static, template.content_free(), [template.labels])
+        return Word(prompt, _by_action(offer, told[0]), None, completion, calibrated)
+
+    def may_ask_together(self, mission: Mission, uavs: int) -> bool:
+        """Whether one call can decide for so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
+        able = self._upstream.status == "ready" and self._upstream.together
+        return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
+
+    async def words(self, mission: Mission, views: Sequence[View], deadline: float) -> dict[int, Word]:
+        """Mode ``guided``: what the LLM says of every UAV's candidates, by UAV, asked in one call.
+
+        A server whose answer cannot be read is asked about one UAV at a time from then on.
+        """
+        template = template_of(mission)
+        asked = {view.uav_id: (view, offered(mission, view)) for view in views if view.rows}
+        if not asked:
+            return {}
+        nearest = dict.fromkeys(line for view, _ in asked.values() for line in view.nearest(mission))
+        prompts = template.together(
+            {uav: (offer, view.state) for uav, (view, offer) in asked.items()}, mission.experiences, list(nearest)
+        )
+        static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())
+        lists = [list(offer.labels) for _, offer in asked.values()]
+        completion, told, reason = await self._heard(mission, static, user, lists, deadline)
+        if reason == "answer_format":
+            log.warning("the LLM does not decide for several UAVs at once: asked about one at a time from now on")
+            self._upstream.together = False
+        calibrated = self._knows(static, lists)
+        if told is not None:
+            self._labels.calibrate(static, template.content_free(list(asked)), [template.labels] * len(asked))
+        words = {}
+        for place, (uav, (_, offer)) in enumerate(asked.items()):
+            by_action = None if told is None else _by_action(offer, told[place])
+            words[uav] = Word(prompts[uav], by_action, reason, None if place else completion, calibrated)
+        return words
+
+    async def _heard(
+        self, mission: Mission, static: str, user: str, lists: Sequence[Sequence[str]], deadline: float
+    ) -> tuple[Completion | None, list[dict[str, float]] | None, Reason | None]:
+        completion, told, reason = None, None, None
+        try:
+            completion = await self._within(self._labels.ask(static, user, lists), deadline)
+            told = self._labels.read(completion, static, lists)
+        except NoDecision as error:
+            log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
+            reason = error.reason
+        self._metrics.llm_requests.labels(reason or "ok").inc()
+        return completion, told, reason
+
+    def _knows(self, static: str, lists: Sequence[Sequence[str]]) -> bool:
+        return self._labels.bias(static, len(lists)) is not None and self._upstream.logprobs
+
+    async def _within(self, asked: Awaitable[Completion], deadline: float) -> Completion:
+        limit = asyncio.timeout(min(deadline - time.perf_counter(), _HURRY_S if self._closing else math.inf))
+        try:
+            async with limit:
+                self._waiting.add(limit)
+                return await asked
+        except TimeoutError:
+            raise NoDecision("llm_timeout", "no answer within the deadline") from None
+        finally:
+            self._waiting.discard(limit)
+
+
+def _by_action(offer: Offer, told: dict[str, float]) -> dict[Action, float]:
+    return dict(zip(offer.actions, offer.spread(told).tolist(), strict=True))
