@@ -5,6 +5,7 @@ from __future__ import annotations
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
 from simulator.experiments.schemes import (
+    CHANCE,
     PLANNER,
     Scheme,
     at_full_speed,
@@ -21,7 +22,8 @@ _POLICIES = ("madqn", "mappo", PLANNER, "eof", "wqcs", "max_gain", "nearest", "r
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    ours = [llm(), guided(), value_as_written(), value(), edge_policy(), edge_planner()]
+    draws = guided("guided_chance", "guided, LLM draws", backing=CHANCE)
+    ours = [llm(), guided(), draws, value_as_written(), value(), edge_policy(), edge_planner()]
     return [*ours, *locals_there_are(*_POLICIES), at_full_speed("eof")]
 
 
@@ -36,8 +38,10 @@ EXPERIMENT = Experiment(
         Drawing("scenarios_events", "bars", ("events",), "Loss events (Eq. 5) of a mission by scenario."),
     ),
     reference="eof",
+    pairs=(("guided", "wqcs"), ("guided_chance", "wqcs")),
     where="everywhere",
     notes=(
+        "`LLM draws` answers a uniform draw of the letters offered: what mode guided brings whatever the LLM.",
         "The modules' start, MADQN and MAPPO were trained on the scenario `paper` alone; elsewhere they are out of it. "
         "A network made for other numbers of sensors and UAVs cannot fly there and is left out.",
         "In lossy_uplink a request that was lost three times is decided on board by EOF, and counts as the scheme's.",
