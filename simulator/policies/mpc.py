@@ -20,15 +20,15 @@ class RecedingHorizon:
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission; the seed is not used."""
         self._scenario = scenario
-        self._belief = FleetBelief(scenario)
-        self._planner = Planner(scenario, self._belief)
+        self.belief = FleetBelief(scenario)
+        self._planner = Planner(scenario, self.belief)
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
         step = int(observation["step"][0])
         self._planner.begin(step)
-        self._belief.locate(uav, step, observation["position"].tolist(), float(observation["progress"][0]))
-        self._belief.hear(
+        self.belief.locate(uav, step, observation["position"].tolist(), float(observation["progress"][0]))
+        self.belief.hear(
             ids=np.arange(len(observation["queue"])),
             places=observation["sensor_position"],
             beacon=observation["last_heard"],
@@ -38,7 +38,7 @@ class RecedingHorizon:
         sensor, velocity = self._planned(uav, taken)
         if sensor < 0 or sensor in taken:
             sensor = longest_silent(observation, taken)
-        self._belief.tell(uav, step, sensor, velocity)
+        self.belief.tell(uav, step, sensor, velocity)
         return sensor, velocity
 
     def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:

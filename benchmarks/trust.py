@@ -1,0 +1,168 @@
+"""Whether a good LLM comes to be trusted within one mission: the planner off, and an LLM that answers as it would.
+
+    python benchmarks/trust.py --seeds 30
+
+Flies every world twice over HTTP: by the edge's planner (mode `policy`), and in mode `guided` without it, where the
+LLM's place is taken by one that names what the planner would do, as far as it is offered. Prints what both lose with
+95% bootstrap intervals over worlds, their ratio, and the LLM's weight among the advisers as a mission goes on; writes
+the same as JSON. Goal: at most 1.10 times the planner. One world takes half a minute.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+import uvicorn
+from rich.console import Console
+from rich.progress import track
+
+from service.app import create_app
+from service.asking import Asking, Word
+from service.candidates import Offer
+from service.critic import Action
+from service.engine import Engine
+from service.llm.upstream import Upstream
+from service.metrics import Metrics
+from service.mission import Mission
+from service.prompt import Prompt
+from service.settings import Settings
+from shared.scenario import Scenario, scenario_named
+from shared.wire import Mode
+from simulator.client import EdgeClient
+from simulator.experiments.intervals import interval, paired
+from simulator.mission import Choice, EdgePilot, fly
+from simulator.policies.mpc import RecedingHorizon
+from simulator.site import Site
+from simulator.world import Observation
+
+GOAL = 1.10
+# Of the probability, what the LLM leaves to the other letters.
+_DOUBT = 0.05
+
+
+@dataclass(frozen=True)
+class Trusted:
+    """Fly worlds by the planner, and by an LLM that answers as the planner would."""
+
+    seeds: int = 30
+    """Worlds: seeds --first to --first + N - 1."""
+    first: int = 0
+    """The first seed."""
+    scenario: str = "paper"
+    """Their scenario."""
+    out: Path = Path("runs/trust.json")
+    """Where to write the figures."""
+
+
+class Echo(Asking):
+    """Asks nobody: its word is for ``answer``, or the nearest to it that is offered."""
+
+    def __init__(self, upstream: Upstream, metrics: Metrics) -> None:
+        super().__init__(upstream, metrics)
+        self.answer: Action = (0, 0)
+
+    async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
+        """Nearly sure of the velocity nearest to the answer's for its sensor; of the first letter without it."""
+        sensor, velocity = self.answer
+        letters = list(offer.labels)
+        there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
+        said = min(there, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
+        told = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == said) for letter in letters}
+        by_action = dict(zip(offer.actions, offer.spread(told).tolist(), strict=True))
+        return Word(prompt, by_action, None, None, calibrated=False)
+
+
+class Pilot(EdgePilot):
+    """Lets a planner of its own hear what the edge hears, and gives its answer to the LLM before the edge asks it."""
+
+    def __init__(self, client: EdgeClient, scenario: Scenario, seed: int, echo: Echo) -> None:
+        super().__init__(client, f"echo-{seed}", scenario, seed)
+        self.planner = RecedingHorizon()
+        self.planner.reset(scenario, seed)
+        self._echo = echo
+        self.trust: list[float] = []
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The edge's choice."""
+        self._echo.answer = self.planner.decide(uav, observation, taken)
+        choice = super().decide(uav, observation, taken)
+        self.planner.belief.tell(uav, int(observation["step"][0]), choice.sensor, choice.velocity)
+        guided = None if choice.exchange is None else choice.exchange.response.guided
+        if guided is not None:
+            self.trust.append(guided.trust["llm"])
+        return choice
+
+
+@contextmanager
+def edge() -> Iterator[tuple[str, Engine]]:
+    """A real edge on a free loopback port, without an LLM: its base URL and its engine."""
+    app = create_app(Settings(mode="policy"))
+    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    try:
+        yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", app.state.engine
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def flown(url: str, site: Site, seed: int, echo: Echo, mode: Mode) -> tuple[int, list[float]]:
+    """Packets lost in one world, and the LLM's weight at each decision."""
+    with EdgeClient(url, timeout_s=60.0) as client:
+        pilot = Pilot(client, site.scenario, seed, echo) if mode == "guided" else None
+        flying = pilot or EdgePilot(client, f"planner-{seed}", site.scenario, seed)
+        flying.spec = flying.spec.model_copy(update={"mode": mode, "planner": "off" if pilot else "on"})
+        client.put_mission(f"{'echo' if pilot else 'planner'}-{seed}", flying.spec)
+        flight = fly(site, flying, seed)
+    return sum(tally.lost_packets for tally in flight.tally), pilot.trust if pilot else []
+
+
+def main(args: Trusted) -> int:
+    """Fly, print, write."""
+    console = Console()
+    site = Site(scenario_named(args.scenario))
+    seeds = range(args.first, args.first + args.seeds)
+    lost: dict[str, list[int]] = {"planner": [], "echo": []}
+    trust: list[list[float]] = []
+    with edge() as (url, engine):
+        engine.asking = echo = Echo(engine._upstream, engine._metrics)
+        for seed in track(seeds, "Flying", console=console):
+            lost["planner"].append(flown(url, site, seed, echo, "policy")[0])
+            total, weights = flown(url, site, seed, echo, "guided")
+            lost["echo"].append(total)
+            trust.append(weights)
+    compared = paired("echo", "planner", "lost_packets", lost["echo"], lost["planner"])
+    steps = [1, 10, 30, 60, min(map(len, trust))]
+    at = {str(n): sum(weights[n - 1] for weights in trust) / len(trust) for n in steps}
+    for name, packets in lost.items():
+        found = interval(packets)
+        console.print(f"{name}: {found.mean:.1f} [{found.low:.1f}, {found.high:.1f}] packets lost a mission")
+    for pair in compared:
+        console.print(f"{pair.kind}: {pair.mean:.2f} [{pair.low:.2f}, {pair.high:.2f}]")
+    console.print("the LLM's weight at decision " + ", ".join(f"{n}: {weight:.2f}" for n, weight in at.items()))
+    found_all = {
+        "scenario": args.scenario,
+        "seeds": list(seeds),
+        "lost_packets": lost,
+        "compared": [pair.model_dump() for pair in compared],
+        "trust_at_decision": at,
+        "goal": GOAL,
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found_all, indent=2) + "\n")
+    console.print(f"Wrote {args.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(tyro.cli(Trusted, description=__doc__)))
