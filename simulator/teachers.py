@@ -54,7 +54,7 @@ class Planner(RecedingHorizon):
 
     def flown(self, uav: int, step: int, action: Action) -> None:
         """Plans go on from this."""
-        self._belief.tell(uav, step, *action)
+        self.belief.tell(uav, step, *action)
 
 
 class Clairvoyant:
