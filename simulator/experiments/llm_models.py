@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import CHANCE, Scheme, edge_policy, guided, llm, local, over_edge, value
+from simulator.experiments.schemes import ASKED, CHANCE, Scheme, edge_policy, guided, local, over_edge, value
+
+_DEMONSTRATIONS = 6
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    given = [over_edge(f"llm_{path.stem}", path.stem, backing=str(path)) for path in setup.models]
-    asked = llm().model_copy(update={"label": "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"})
+    embedded = "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"
+    asked = [*((f"llm_{path.stem}", path.stem, str(path)) for path in setup.models), ("llm", embedded, ASKED)]
+    shown = {"demonstrations": _DEMONSTRATIONS}
+    of_llms = [
+        scheme
+        for name, label, backing in asked
+        for scheme in (
+            over_edge(name, label, backing=backing),
+            over_edge(f"{name}_shown", f"{label}, {_DEMONSTRATIONS} demonstrations", backing=backing, prompt=shown),
+        )
+    ]
     chance = over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE)
-    return [*given, asked, chance, guided(), value(), edge_policy(), local("eof"), local("random")]
+    return [*of_llms, chance, guided(), value(), edge_policy(), local("eof"), local("random")]
 
 
 EXPERIMENT = Experiment(
     name="llm-models",
     title="By the LLM asked",
-    summary="each --model GGUF and the embedded LLM, beside no LLM and uniform draws in its place",
+    summary="each --model GGUF and the embedded LLM, with demonstrations and without, beside uniform draws and no LLM",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "rtt_p50", "llm_decided_pct"),
     drawings=(
@@ -28,6 +39,7 @@ EXPERIMENT = Experiment(
     notes=(
         "Only models at hand are measured: SmolLM2-135M is the one that ships; give others with --model FILE.gguf. "
         "What a larger model would do is not known from this.",
+        "Demonstrations are worked examples in the static block, solved by the planner on training worlds.",
         "Uniform draws: same attention, same k, same checks, an answer drawn uniformly among those allowed. An LLM "
         "that does not beat it adds nothing.",
     ),
