@@ -158,8 +158,17 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
     ended = run("experiment", "llm-models", "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
     result = result_in(tmp_path, "llm-models")
-    assert list(result.schemes) == ["llm", "llm_chance", "guided", "value_reach", "edge_policy", "eof", "random"]
-    for asked in ("llm", "llm_chance"):
+    assert list(result.schemes) == [
+        "llm",
+        "llm_shown",
+        "llm_chance",
+        "guided",
+        "value_reach",
+        "edge_policy",
+        "eof",
+        "random",
+    ]
+    for asked in ("llm", "llm_shown", "llm_chance"):
         assert result.schemes[asked]["llm_decided_pct"].mean > 60
     for unasked in ("value_reach", "edge_policy"):
         assert result.schemes[unasked]["llm_decided_pct"].mean == 0
