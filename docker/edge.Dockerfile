@@ -1,6 +1,6 @@
 # The edge: the decision service, its LLM and its token vocabulary. At run time it fetches nothing.
 #   docker build -f docker/edge.Dockerfile -t aicvds-edge .
-#   docker run --rm -p 127.0.0.1:8000:8000 aicvds-edge
+#   docker run --rm -p 127.0.0.1:8000:8000 -e AICVDS_ANONYMOUS=on aicvds-edge
 #
 # --build-arg TORCH_INDEX=…  the address of PyTorch's CPU index, as its "Get Started" selector prints it after
 #                            --index-url; without it torch comes from the ordinary index (on x86: the CUDA build,

@@ -14,6 +14,8 @@ from fastapi.openapi.utils import get_openapi
 
 from service import problems
 from service.engine import Engine
+from service.guard import CarefulHeaders, Guard
+from service.keys import Keys
 from service.learner import rehearse
 from service.limits import BodyLimit
 from service.llm.upstream import Upstream
@@ -33,7 +35,11 @@ class State(TypedDict):
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """One edge service; its LLM begins to load when the application starts."""
+    """One edge service; its LLM begins to load when the application starts.
+
+    Raises:
+        BadKeys: the file of keys that the settings name cannot be used.
+    """
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[State]:
@@ -62,6 +68,9 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.include_router(router)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    if settings.keys is not None:
+        app.add_middleware(Guard, keys=Keys(settings.keys))
+    app.add_middleware(CarefulHeaders)
     problems.install(app)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import socket
 import sys
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ class Serve:
     """
 
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 for every interface (put it behind something that authenticates)."""
+    """Address to listen on; 0.0.0.0 for every interface. Any but loopback needs AICVDS_KEYS, or AICVDS_ANONYMOUS=on."""
     port: Annotated[int, tyro.conf.arg(metavar="0-65535")] = 8000
     """Port to listen on; 0 picks a free one."""
 
@@ -49,12 +50,12 @@ def main(argv: list[str]) -> int:
             f"aicvds serve: running on http://{host}:{listener.getsockname()[1]}, loading", file=sys.stderr, flush=True
         )
         with listener:
-            return _serve(listener)
+            return _serve(listener, args.host)
     except KeyboardInterrupt:
         return 130
 
 
-def _serve(listener: socket.socket) -> int:
+def _serve(listener: socket.socket, host: str) -> int:
     from service.settings import Settings, unknown_variables
 
     try:
@@ -67,16 +68,26 @@ def _serve(listener: socket.socket) -> int:
     for name in unknown_variables():
         print(f"aicvds serve: {name} is no setting and changes nothing", file=sys.stderr)
 
+    if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
+        return _refused(
+            f"whoever reaches {host} could fly this fleet. Make a key with `aicvds keys add NAME --file keys.json` and "
+            "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
+        )
+
     import logging
 
     import uvicorn
 
     from service.app import create_app
+    from service.keys import BadKeys
 
     logging.basicConfig(level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # httpx logs every request at level info, address included.
     logging.getLogger("httpx").setLevel(logging.WARNING)
-    app = create_app(settings)
+    try:
+        app = create_app(settings)
+    except BadKeys as error:
+        return _refused(f"AICVDS_KEYS: {error}")
     config = uvicorn.Config(
         app,
         log_level=settings.log_level,
@@ -92,6 +103,13 @@ def _serve(listener: socket.socket) -> int:
 
     Server(config).run(sockets=[listener])
     return 0
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def _refused(fault: str) -> int:

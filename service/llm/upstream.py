@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from service.candidates import GuidedTemplate
 from service.llm.answer import Constraint, NoDecision, check_labels
 from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body, rewriting_body
 from service.llm.embedded import EmbeddedServer, LoadFailed
@@ -202,10 +203,18 @@ class Upstream:
             self.constraint = await self._probe(self._client)
             self.logprobs = await self._probe_logprobs(self._client)
             self.together = await self._probe_together(self._client)
-            template = Template(SCENARIOS["paper"], experiences=settings.experiences)
-            first = chat_body(self.model, template.static, "0,50,-90,1,100\n", self.constraint, [0], 15)
-            await self._client.complete(first)
+            await self._client.complete(self._first_body())
         return self._client
+
+    def _first_body(self) -> dict[str, Any]:
+        """A question under the static block of a mission that nobody has set otherwise."""
+        settings, paper = self._settings, SCENARIOS["paper"]
+        if settings.mode == "guided":
+            guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
+            text = guided.content_free()[0]
+            return label_body(self.model, guided.static, text, self.constraint, [guided.labels], self.logprobs)
+        template = Template(paper, experiences=settings.experiences)
+        return chat_body(self.model, template.static, "0,50,-90,1,100\n", self.constraint, [0], 15)
 
     async def _probe(self, client: LLMClient) -> Constraint:
         """The first way of constraining that the server really obeys: it may ignore an unknown field silently."""

@@ -151,7 +151,7 @@ settings=$(docker run --rm --network none --entrypoint python "$edge_image" -c '
 from service.settings import Settings
 print(*(f"AICVDS_{name.upper()}" for name in Settings.model_fields if name != "cache_dir"))')
 for name in $settings; do
-  grep -q "^      - $name$" docker-compose.yml || fail "docker-compose.yml does not pass $name on"
+  grep -Eq "^      - $name(=.*)?$" docker-compose.yml || fail "docker-compose.yml does not pass $name on"
   grep -q "^#$name=" .env.example || fail ".env.example does not tell of $name"
 done
 say "both run as a plain user and hold only their own; every setting is passed on and told of"
@@ -164,7 +164,7 @@ compose down --volumes >/dev/null 2>&1
 # --- without a network -----------------------------------------------------------------------------------------------
 start_offline() { # as locked up as the compose file has it, and with no network at all
   docker rm --force "$OFFLINE" >/dev/null 2>&1 || true
-  docker run --detach --name "$OFFLINE" --network none --read-only --tmpfs /tmp --cap-drop ALL \
+  docker run --detach --name "$OFFLINE" --env AICVDS_ANONYMOUS=on --network none --read-only --tmpfs /tmp --cap-drop ALL \
     --security-opt no-new-privileges:true "$edge_image" >/dev/null
 }
 start_offline

@@ -19,11 +19,11 @@ from tests.service.stub_llm import misbehaving, wait_for
 def test_help_names_every_command() -> None:
     shown = run("--help")
     assert shown.returncode == 0
-    for command in ("serve", "simulate", "demo", "model"):
+    for command in ("serve", "simulate", "demo", "keys", "model"):
         assert command in shown.stdout
 
 
-@pytest.mark.parametrize("command", ["serve", "simulate", "demo", "model"])
+@pytest.mark.parametrize("command", ["serve", "simulate", "demo", "keys", "model"])
 def test_every_command_explains_itself(command: str) -> None:
     shown = run(command, "--help")
     assert shown.returncode == 0, shown.stderr
@@ -38,6 +38,9 @@ def test_every_command_explains_itself(command: str) -> None:
         (["serve"], {"AICVDS_TOP_K": "0"}, "AICVDS_TOP_K"),
         (["serve"], {"AICVDS_LLM_URL": "localhost:8080"}, "AICVDS_LLM_URL"),
         (["model", "fly"], {}, "aicvds model fetch"),
+        (["serve", "--port", "0"], {"AICVDS_KEYS": "/no/keys.json"}, "AICVDS_KEYS: /no/keys.json: No such file"),
+        (["serve", "--port", "0", "--host", "0.0.0.0"], {}, "aicvds keys add"),
+        (["serve", "--port", "0", "--host", "0.0.0.0"], {"AICVDS_ANONYMOUS": "off"}, "AICVDS_ANONYMOUS=on"),
     ],
 )
 def test_bad_use_is_one_clear_line_and_exit_2(args: list[str], env: dict[str, str], said: str) -> None:
@@ -45,6 +48,17 @@ def test_bad_use_is_one_clear_line_and_exit_2(args: list[str], env: dict[str, st
     assert ended.returncode == 2
     assert said in ended.stderr + ended.stdout
     assert "Traceback" not in ended.stderr
+
+
+def test_other_addresses_are_served_with_keys_or_when_told_to(tmp_path: Path) -> None:
+    keys = str(tmp_path / "keys.json")
+    key = run("keys", "add", "fleet", "--file", keys).stdout.strip()
+    for env in ({"AICVDS_KEYS": keys}, {"AICVDS_ANONYMOUS": "on"}):
+        with started("serve", "--port", "0", "--host", "0.0.0.0", AICVDS_MODE="policy", **env) as process:
+            port = output_until(process, r"running on http://0\.0\.0\.0:(\d+)")[1]
+            url = f"http://127.0.0.1:{port}/metrics"
+            assert httpx.get(url, timeout=30).status_code == (401 if "AICVDS_KEYS" in env else 200)
+            assert httpx.get(url, timeout=30, headers={"Authorization": f"Bearer {key}"}).status_code == 200
 
 
 def test_a_busy_port_is_one_clear_line() -> None:

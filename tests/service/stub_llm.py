@@ -69,7 +69,7 @@ def misbehaving(fault: Handler) -> Handler:
         while True:
             body = await _head(reader)
             asked = body.get("messages", [{}])[-1].get("content", "")
-            if body and asked != "Say hello." and asked != "0,50,-90,1,100\n":
+            if body and asked not in ("Say hello.", "0,50,-90,1,100\n") and "N/A" not in asked:
                 await fault(reader, writer)
                 return
             text = f"{PROBE} 0" if asked == "Say hello." else "0 0"

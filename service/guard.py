@@ -1,0 +1,100 @@
+"""The guard before the door: who asks, whether that key may, and how often; and headers that keep browsers careful."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+
+from limits import RateLimitItemPerMinute
+from limits.aio.storage import MemoryStorage
+from limits.aio.strategies import SlidingWindowCounterRateLimiter
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Send
+from starlette.types import Scope as Asked
+
+from service.keys import Key, Keys, Scope
+from service.problems import problem_response
+
+# What says nothing of missions: probes of containers and load balancers carry no key.
+_OPEN = frozenset(("/healthz", "/readyz"))
+_CAREFUL = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+    "X-Frame-Options": "DENY",
+}
+
+
+def scope_of(method: str, path: str) -> Scope | None:
+    """What a key must be allowed for a request; None where none is needed, or any will do for reading."""
+    if path in _OPEN or method in ("GET", "HEAD"):
+        return None
+    return "admin" if path.startswith("/missions") else "decide"
+
+
+class Guard:
+    """Pure ASGI middleware. Answers 401 without a known key, 403 where it may not, 429 with ``Retry-After`` too often.
+
+    Nothing of the body is read before. Keys come as ``Authorization: Bearer KEY``.
+    """
+
+    def __init__(self, app: ASGIApp, keys: Keys) -> None:
+        self.app = app
+        self._keys = keys
+        self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
+
+    async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["path"] in _OPEN:
+            await self.app(scope, receive, send)
+            return
+        key = self._keys.find(_presented(scope["headers"]))
+        needed = scope_of(scope["method"], scope["path"])
+        if key is None:
+            refusal = problem_response(401, "give a key that is known as `Authorization: Bearer KEY`")
+            refusal.headers["WWW-Authenticate"] = "Bearer"
+        elif needed is not None and needed not in key.scopes:
+            refusal = problem_response(403, f"key {key.name} may not do this: it lacks the scope {needed}")
+        elif (wait_s := await self._wait(key)) is not None:
+            refusal = problem_response(429, f"key {key.name} may ask {key.per_minute} times a minute")
+            refusal.headers["Retry-After"] = str(wait_s)
+        else:
+            await self.app(scope, receive, send)
+            return
+        # The rest of what is sent is not waited for.
+        refusal.headers["Connection"] = "close"
+        await refusal(scope, receive, send)
+
+    async def _wait(self, key: Key) -> int | None:
+        """Seconds until the key may ask again; None where it may now, which then counts."""
+        rate = RateLimitItemPerMinute(key.per_minute)
+        if await self._rates.hit(rate, key.name):
+            return None
+        stats = await self._rates.get_window_stats(rate, key.name)
+        return max(1, math.ceil(stats.reset_time - time.time()))
+
+
+class CarefulHeaders:
+    """Pure ASGI middleware: answers are not cached, not framed, and not taken for another content type."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
+        async def careful(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _CAREFUL.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        await self.app(scope, receive, careful if scope["type"] == "http" else send)
+
+
+def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:
+    """The bearer token, empty where there is none or more than one."""
+    given = [value for name, value in headers if name.lower() == b"authorization"]
+    if len(given) != 1:
+        return ""
+    scheme, _, token = given[0].decode("latin-1").partition(" ")
+    return token.strip() if scheme.lower() == "bearer" else ""
