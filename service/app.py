@@ -45,8 +45,8 @@ def create_app(settings: Settings) -> FastAPI:
     async def lifespan(app: FastAPI) -> AsyncIterator[State]:
         # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
         torch.set_num_threads(1)
-        upstream = Upstream(settings)
         metrics = Metrics()
+        upstream = Upstream(settings, metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         await asyncio.to_thread(rehearse)
         engine = Engine(settings, upstream, counter, metrics)

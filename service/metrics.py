@@ -29,6 +29,9 @@ class Metrics:
             "aicvds_overhead_seconds", "The edge's own share: all but the LLM", registry=r, buckets=_OVERHEAD_BUCKETS
         )
         self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
+        self.llm_breaker_opened = Counter(
+            "aicvds_llm_breaker_opened", "Times the LLM was left alone for failing again and again", registry=r
+        )
         self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
         self.llm_trust = Histogram(
             "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_TRUST_BUCKETS

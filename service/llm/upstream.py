@@ -6,12 +6,13 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.candidates import GuidedTemplate
 from service.llm.answer import Constraint, NoDecision, check_labels
+from service.llm.breaker import Breaker
 from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body, rewriting_body
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
@@ -19,7 +20,7 @@ from service.orders import INSTRUCTION, constrain_orders
 from service.prompt import Template
 from service.settings import Settings
 from shared.scenario import SCENARIOS
-from shared.wire import Readiness
+from shared.wire import Readiness, Reason
 
 log = logging.getLogger(__name__)
 
@@ -46,11 +47,14 @@ class Upstream:
     """Brings the LLM up in the background and keeps trying while a remote one is down.
 
     ``/healthz`` and decisions by the policy go on meanwhile. States: ``loading``, ``ready``, ``unavailable``
-    (with the reason in ``detail``), and ``off`` where the service was told to do without.
+    (with the reason in ``detail``), and ``off`` where the service was told to do without. A server that fails again and
+    again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.breaker`; ``on_open`` hears of it.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, on_open: Callable[[], None] = lambda: None) -> None:
         self._settings = settings
+        self._on_open = on_open
+        self._breaker = Breaker()
         self._status = _Status("off" if settings.mode in ("value", "policy") else "loading")
         self._client: LLMClient | None = None
         self._embedded: EmbeddedServer | None = None
@@ -82,10 +86,10 @@ class Upstream:
             detail=self._status.detail,
         )
 
-    def start(self) -> None:
-        """Begin loading or probing, unless the LLM is off."""
+    def start(self, pause_s: float = 0.0) -> None:
+        """Begin loading or probing after a pause, unless the LLM is off."""
         if self.status != "off":
-            self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up")
+            self._task = asyncio.create_task(self._bring_up(pause_s), name="llm-bring-up")
 
     async def close(self) -> None:
         """Stop trying, close connections, free the embedded model."""
@@ -140,11 +144,35 @@ class Upstream:
         self._deciding += 1
         if self._beside is not None:
             self._beside.cancel()
+        begun = time.monotonic()
         try:
-            return await self._ask(body)
+            answer = await self._ask(body)
+        except NotUnderstood:
+            # That says something of this request, and nothing of the server.
+            raise
+        except NoDecision as error:
+            self._failed(error.reason)
+            raise
+        except asyncio.CancelledError:
+            # Who has hardly waited, by a deadline of his own, tells nothing of the server.
+            if time.monotonic() - begun >= self._settings.deadline_ms / 2e3:
+                self._failed("llm_timeout")
+            raise
+        else:
+            self._breaker.answered()
+            return answer
         finally:
             self._deciding -= 1
             self._decided_at = time.monotonic()
+
+    def _failed(self, reason: Reason) -> None:
+        if self.status != "ready" or not self._breaker.failed():
+            return
+        pause_s = self._breaker.pause_s
+        self._status = _Status("unavailable", f"failed too often, the last time by {reason}: left alone {pause_s:g} s")
+        log.warning("LLM %s", self._status.detail)
+        self._on_open()
+        self.start(pause_s)
 
     async def _silence(self) -> None:
         """Wait until no decision has been asked for a while, but not for ever."""
@@ -165,7 +193,8 @@ class Upstream:
                 self.start()
             raise
 
-    async def _bring_up(self) -> None:
+    async def _bring_up(self, pause_s: float) -> None:
+        await asyncio.sleep(pause_s)
         while True:
             try:
                 client = await self._connect()
