@@ -102,9 +102,7 @@ class Situation:
         flown = np.arange(horizon * scenario.max_velocity + 1) * scenario.step_s
         links = {i: belief.links(i, flown).astype(np.float64) for i in (uav, *others)}
         reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links.values()], axis=0))
-        room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.rate, 1e-9)
-        room = np.where(np.isfinite(guidance.every(scenario.sensors)), -np.inf, room)
-        kept = np.sort(reached[np.argsort(room[reached], kind="stable")[:_MOST_SENSORS]])
+        kept = _most_pressing(belief, scenario, step, guidance, reached)
         decided = belief.decided(step)
         # Nothing can be collected from a flat sensor, so nothing that is lost there tells candidates apart.
         queue = np.where(belief.battery > 0, belief.base, 0.0)
@@ -117,12 +115,6 @@ class Situation:
             age[sensor], unknown[sensor] = 0, False
             if links[other][velocity, sensor] > 0:
                 visited[sensor] = step
-        place = {int(sensor): row for row, sensor in enumerate(kept)}
-        planned = {
-            i: np.array([(place.get(j, -1), v) for j, v in actions[:horizon]], dtype=np.int64).reshape(-1, 2)
-            for i, actions in (course or {}).items()
-            if i in links
-        }
         return cls(
             scenario=scenario,
             uav=uav,
@@ -137,11 +129,26 @@ class Situation:
             links={i: table[:, kept] for i, table in links.items()},
             told={i: decided[i][1] for i in others if i in decided},
             reserved=np.isin(kept, list(reserved)),
-            course=planned,
+            course={i: _placed(kept, actions[:horizon]) for i, actions in (course or {}).items() if i in links},
             guidance=guidance,
             step=step,
             visited=visited,
         )
+
+
+def _most_pressing(
+    belief: FleetBelief, scenario: Scenario, step: int, guidance: Guidance, reached: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Of the sensors in reach those that overflow soonest, and before them those that the operator wants visited."""
+    room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.rate, 1e-9)
+    room = np.where(np.isfinite(guidance.every(scenario.sensors)), -np.inf, room)
+    return np.sort(reached[np.argsort(room[reached], kind="stable")[:_MOST_SENSORS]])
+
+
+def _placed(kept: NDArray[np.int64], actions: Sequence[Action]) -> NDArray[np.int64]:
+    """A plan's actions with sensors as places in ``kept``, ``(steps, 2)``."""
+    place = {int(sensor): row for row, sensor in enumerate(kept)}
+    return np.array([(place.get(j, -1), v) for j, v in actions], dtype=np.int64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)

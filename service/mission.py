@@ -14,7 +14,7 @@ from service.demonstrations import solved
 from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
 from service.guidance import OperatorGuidance
-from service.learner import Learner, Sample
+from service.learner import Learner, Modules, Sample
 from service.planner import Planner, can_plan
 from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template, note_block
@@ -71,8 +71,8 @@ class Mission:
 
     def __init__(self, mission_id: str, spec: MissionSpec, settings: Settings) -> None:
         try:
-            named = isinstance(spec.scenario, str)
-            self.scenario: Scenario = scenario_named(spec.scenario) if named else spec.scenario  # type: ignore[arg-type, assignment]
+            named = spec.scenario
+            self.scenario: Scenario = scenario_named(named) if isinstance(named, str) else named
         except ValueError as error:
             raise Refused("scenario", str(error)) from None
         self.mission_id = mission_id
@@ -88,30 +88,8 @@ class Mission:
         self._selection = spec.prompt.selection or settings.selection
         # Mode `value` has nothing else to decide by.
         self.attends = spec.attention == "on" or self.mode == "value"
-        ranked = self.attends and spec.prompt.order == "score"
-        levels = self.scenario.max_velocity + 1
-        modules = initial_modules(spec.init, self.features, levels, spec.seed)
-        self.template = (
-            GuidedTemplate(
-                self.scenario,
-                rows=self.top_k if self.attends else self.scenario.sensors,
-                experiences=self._experience_limit,
-                ranked=ranked,
-                note=spec.note,
-            )
-            if self.mode == "guided"
-            else Template(
-                self.scenario,
-                spec.prompt,
-                self.features,
-                experiences=self._experience_limit,
-                ranked=ranked,
-                demonstrations=solved(
-                    spec, self.features, self.scenario, modules, self.top_k if self.attends else None
-                ),
-                note=spec.note,
-            )
-        )
+        modules = initial_modules(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
+        self.template = self._template(modules)
         self._context = settings.llm_context
         self._check_prompt()
         self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
@@ -136,6 +114,19 @@ class Mission:
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         # Mode `guided`: by the LLM's name.
         self.trust: dict[str, Trust] = {}
+
+    def _template(self, modules: Modules) -> Template:
+        spec = self.spec
+        said: dict[str, Any] = {
+            "experiences": self._experience_limit,
+            "ranked": self.attends and spec.prompt.order == "score",
+            "note": spec.note,
+        }
+        if self.mode == "guided":
+            return GuidedTemplate(self.scenario, rows=self.top_k if self.attends else self.scenario.sensors, **said)
+        kept = self.top_k if self.attends else None
+        examples = solved(spec, self.features, self.scenario, modules, kept)
+        return Template(self.scenario, spec.prompt, self.features, demonstrations=examples, **said)
 
     def obey(self, answer: GuidanceAnswer) -> None:
         """The operator's word on the guidance; raises as :meth:`OperatorGuidance.answer`."""
