@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 
 # After SIGTERM, so that every UAV is answered before the process is killed.
 _HURRY_S = 4.0
+# Calls about several UAVs that may run late in a row before they are asked about one by one.
+_LATE = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +49,15 @@ class Word:
     calibrated: bool
 
     def of(self, actions: Sequence[Action]) -> FloatArray | None:
-        """Its probabilities of these actions, ``(n,)``; None where it said nothing of any."""
-        if self.told is None:
-            return None
-        found = np.array([self.told.get(action, 0.0) for action in actions])
+        """Its probabilities of these actions, ``(n,)``; None where it said nothing of any.
+
+        A velocity that is not among them, because the operator forbade it meanwhile, counts as the sensor's nearest.
+        """
+        found = np.zeros(len(actions))
+        for (sensor, velocity), probability in (self.told or {}).items():
+            there = [i for i, action in enumerate(actions) if action[0] == sensor]
+            if there:
+                found[min(there, key=lambda i: abs(actions[i][1] - velocity))] += probability
         return found / found.sum() if found.sum() > 0.0 else None
 
 
@@ -61,6 +68,7 @@ class Asking:
         self._upstream = upstream
         self._metrics = metrics
         self._labels = LabelReader(upstream)
+        self._late = 0
         self._waiting: set[asyncio.Timeout] = set()
         self._closing = False
 
@@ -92,13 +100,14 @@ class Asking:
 
     def may_ask_together(self, mission: Mission, uavs: int) -> bool:
         """Whether one call can decide for so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
-        able = self._upstream.status == "ready" and self._upstream.together
+        able = self._upstream.status == "ready" and uavs <= self._upstream.most_together
         return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
 
     async def words(self, mission: Mission, views: Sequence[View], deadline: float) -> dict[int, Word]:
         """Mode ``guided``: what the LLM says of every UAV's candidates, by UAV, asked in one call.
 
-        A server whose answer cannot be read is asked about one UAV at a time from then on.
+        Where that fails before the deadline, nothing is returned, and the LLM is asked about so many UAVs no more until
+        it is probed again; after two timeouts in a row neither.
         """
         template = template_of(mission)
         asked = {view.uav_id: (view, offered(mission, view)) for view in views if view.rows}
@@ -111,9 +120,13 @@ class Asking:
         static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())
         lists = [list(offer.labels) for _, offer in asked.values()]
         completion, told, reason = await self._heard(mission, static, user, lists, deadline)
-        if reason == "answer_format":
-            log.warning("the LLM does not decide for several UAVs at once: asked about one at a time from now on")
-            self._upstream.together = False
+        self._late = self._late + 1 if reason == "llm_timeout" else 0
+        if reason is not None and (self._late == 0 or self._late >= _LATE):
+            log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", len(asked), reason)
+            self._upstream.most_together = len(asked) - 1
+            self._late = 0
+        if reason is not None and reason != "llm_timeout":
+            return {}
         calibrated = self._knows(static, lists)
         if told is not None:
             self._labels.calibrate(static, template.content_free(list(asked)), [template.labels] * len(asked))

@@ -46,8 +46,11 @@ log = logging.getLogger(__name__)
 _SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
 # Kept back from the LLM's time for checking, answering and the way through the event loop.
 _RESERVE_S = 0.02
-# Of a batch's time, what the LLM may take that is asked about all of its UAVs at once.
-_TOGETHER_SHARE = 0.75
+# Of a batch's time, the most that the LLM may take which is asked about all of its UAVs at once, and the least that it
+# is asked for: what it leaves is for weighing one UAV's candidates after the other's, reckoned twice.
+_TOGETHER_MOST, _TOGETHER_LEAST = 0.75, 0.25
+# A UAV's own share, seconds, until it is known, and how many decisions it is learned over.
+_OWN_S, _OWN_MEMORY = 0.03, 20
 # Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
 _MAX_LESSONS = 256
 
@@ -61,14 +64,35 @@ class Stopwatch:
     _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
-        """End a stage."""
+        """End a stage, or one more part of it."""
         now = time.perf_counter()
-        self.stages[stage] = round((now - self._last) * 1e3, 3)
+        self.stages[stage] = round(self.stages.get(stage, 0.0) + (now - self._last) * 1e3, 3)
         self._last = now
 
     def total(self) -> dict[str, float]:
         """The stages and their total."""
         return {**self.stages, "total": round((time.perf_counter() - self.started) * 1e3, 3)}
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One UAV's turn to be told: its attempt at this step, its time, and what has been begun for it.
+
+    ``word`` is there where the LLM has been asked about it already.
+    """
+
+    uav: UavState
+    step: int
+    attempt: int
+    deadline_ms: int
+    watch: Stopwatch
+    plan: asyncio.Task[None] | None
+    word: Word | None = None
+
+    @property
+    def deadline(self) -> float:
+        """When to have checked and answered, of ``time.perf_counter``."""
+        return self.watch.started + self.deadline_ms / 1e3 - _RESERVE_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +128,7 @@ class Engine:
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._plans: set[asyncio.Task[None]] = set()
+        self._own_s = _OWN_S
         self._room = threading.Semaphore(_MAX_LESSONS)
         self.missions = Missions(settings, metrics)
 
@@ -121,14 +146,15 @@ class Engine:
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
         mission.observe(request, request.step)
         plan = self._plan(mission, [request.uav_id], request.step, watch.started + deadline_ms / 1e3)
-        return await self._decide(mission, request, request.step, deadline_ms, watch, plan)
+        attempt = mission.attempt(request.step, request.uav_id)
+        return await self._decide(mission, Turn(request, request.step, attempt, deadline_ms, watch, plan))
 
     async def decide_batch(self, request: BatchRequest) -> list[DecideResponse]:
         """A fleet's decisions in the order asked.
 
         All that the UAVs report is known before the first decides, and one plan serves them all, until a UAV is told
         something else than it: then the rest is planned again. The LLM is asked about all at once where it can be,
-        while the plan is made; else about one after the other, each with an equal share of the time that is left.
+        while the plan is made; else about one after the other. Each UAV has an equal share of the time that is left.
         """
         watch = Stopwatch()
         total_ms = request.deadline_ms or self._settings.deadline_ms
@@ -141,21 +167,29 @@ class Engine:
         for uav in request.uavs:
             mission.observe(uav, request.step)
         waiting = [uav.uav_id for uav in request.uavs]
+        # Before the LLM is asked: a batch that is sent again meanwhile is the later attempt.
+        attempts = {uav: mission.attempt(request.step, uav) for uav in waiting}
         plan: asyncio.Task[None] | None = None
         words: dict[int, Word] = {}
-        if together := self.asking.may_ask_together(mission, len(waiting)):
+        llm_s = min(_TOGETHER_MOST * total_ms / 1e3, total_ms / 1e3 - 2 * len(waiting) * self._own_s)
+        enough = llm_s >= _TOGETHER_LEAST * total_ms / 1e3
+        if enough and self.asking.may_ask_together(mission, len(waiting)):
             plan = self._plan(mission, waiting, request.step, ends)
             views = [View.of(mission, uav, request.step) for uav in request.uavs]
             for view in views:
                 view.attend(mission)
-            words = await self.asking.words(mission, views, watch.started + _TOGETHER_SHARE * total_ms / 1e3)
+            watch.lap("attend")
+            words = await self.asking.words(mission, views, watch.started + llm_s)
             watch.lap("llm")
         for turn, uav in enumerate(request.uavs):
             own = Stopwatch() if turn else watch
-            left_ms = (ends - own.started) * 1e3
-            share_ms = max(1, int(left_ms if together else left_ms / (len(request.uavs) - turn)))
-            plan = plan or self._plan(mission, waiting[turn:], request.step, own.started + share_ms / 1e3)
-            answer = await self._decide(mission, uav, request.step, share_ms, own, plan, words.get(uav.uav_id))
+            now = time.perf_counter()
+            share_s = (ends - now) / (len(request.uavs) - turn)
+            deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
+            plan = plan or self._plan(mission, waiting[turn:], request.step, now + share_s)
+            word = words.get(uav.uav_id)
+            its = Turn(uav, request.step, attempts[uav.uav_id], deadline_ms, own, plan, word)
+            answer = await self._decide(mission, its)
             if mission.planner is None or mission.planner.action(uav.uav_id) != (answer.sensor_id, answer.velocity):
                 plan = None
             answers.append(answer)
@@ -167,20 +201,10 @@ class Engine:
         mission = self.missions.get(request.mission_id)
         return FeedbackResponse(decision_id=request.decision_id, result=self._apply(mission, request))
 
-    async def _decide(
-        self,
-        mission: Mission,
-        uav: UavState,
-        step: int,
-        deadline_ms: int,
-        watch: Stopwatch,
-        plan: asyncio.Task[None] | None,
-        word: Word | None = None,
-    ) -> DecideResponse:
-        attempt = mission.attempt(step, uav.uav_id)
-        deadline = watch.started + deadline_ms / 1e3 - _RESERVE_S
+    async def _decide(self, mission: Mission, turn: Turn) -> DecideResponse:
+        uav, step, watch, word = turn.uav, turn.step, turn.watch, turn.word
         if mission.mode == "guided":
-            await _until(plan, deadline)
+            await _until(turn.plan, turn.deadline)
             watch.lap("plan")
         view = View.of(mission, uav, step)
         watch.lap("augment")
@@ -196,9 +220,9 @@ class Engine:
         tokens = self._count(prompt)
         watch.lap("prompt")
         if deliberation is not None:
-            choice = await self._weigh(mission, view, deliberation, word, deadline, watch)
+            choice = await self._weigh(mission, view, deliberation, turn)
         else:
-            choice = await self._choose(mission, view, prompt, deadline, watch, plan)
+            choice = await self._choose(mission, view, prompt, turn)
         levels = mission.scenario.max_velocity + 1
         # Whoever decided, and whatever was confirmed meanwhile: what the operator forbids is not flown.
         choice = replace(choice, velocity=mission.guidance.obeyed.nearest(choice.velocity, levels))
@@ -218,13 +242,15 @@ class Engine:
             top_k=view.candidates,
             guided=choice.guided,
             tokens=self._with_usage(tokens, choice.completion),
-            deadline_ms=deadline_ms,
+            deadline_ms=turn.deadline_ms,
             latency_ms=watch.total(),
         )
-        mission.commit(pending, attempt)
+        mission.commit(pending, turn.attempt)
         if choice.advice is not None:
             trust_of(mission, self._upstream.model).note(decision_id, choice.advice)
         self._metrics.record_decision(answer)
+        waited_ms = watch.stages.get("llm", 0.0) + watch.stages.get("plan", 0.0)
+        self._own_s += ((answer.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
         return answer
 
     def _plan(self, mission: Mission, uavs: list[int], step: int, deadline: float) -> asyncio.Task[None] | None:
@@ -232,7 +258,7 @@ class Engine:
         if mission.planner is None or mission.mode == "value":
             return None
         left = deadline - _RESERVE_S - time.perf_counter()
-        # In mode `guided` the LLM is asked after it, and is to have at least as much.
+        # In mode `guided` what comes after it, the LLM's answer mostly, is to have at least as much.
         seconds = min(self._settings.planner_ms / 1e3, left / 2 if mission.mode == "guided" else left)
         taken = mission.reserved(step, uavs[0])
         task = asyncio.create_task(mission.planner.plan(uavs, taken, seconds, self._planning))
@@ -240,15 +266,7 @@ class Engine:
         task.add_done_callback(self._plans.discard)
         return task
 
-    async def _choose(
-        self,
-        mission: Mission,
-        view: View,
-        prompt: Prompt,
-        deadline: float,
-        watch: Stopwatch,
-        plan: asyncio.Task[None] | None,
-    ) -> Choice:
+    async def _choose(self, mission: Mission, view: View, prompt: Prompt, turn: Turn) -> Choice:
         """The LLM's choice or the learned values', as the mission's mode says; the policy's where neither has one."""
         completion: Completion | None = None
         reason: Reason | None = None
@@ -262,9 +280,9 @@ class Engine:
             else:
                 try:
                     levels = mission.scenario.max_velocity + 1
-                    completion = await self.asking.pair(prompt, view.offered, levels, deadline)
+                    completion = await self.asking.pair(prompt, view.offered, levels, turn.deadline)
                 finally:
-                    watch.lap("llm")
+                    turn.watch.lap("llm")
                 sensor, velocity = check_answer(completion.text, view.offered, mission.scenario.max_velocity + 1)
                 if not mission.guidance.obeyed.allows(velocity):
                     raise NoDecision("answer_velocity", f"the operator forbids {velocity} m/s")
@@ -273,8 +291,8 @@ class Engine:
                 raise NoDecision("answer_reserved", f"sensor {sensor} was given away meanwhile")
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
-            await _until(plan, deadline)
-            watch.lap("plan")
+            await _until(turn.plan, turn.deadline)
+            turn.watch.lap("plan")
             sensor, velocity = self._by_policy(mission, view)
             reason = error.reason
         if mission.asks and reason != "no_candidate":
@@ -293,27 +311,20 @@ class Engine:
             sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
         return sensor, velocity
 
-    async def _weigh(
-        self,
-        mission: Mission,
-        view: View,
-        deliberation: Deliberation,
-        word: Word | None,
-        deadline: float,
-        watch: Stopwatch,
-    ) -> Choice:
+    async def _weigh(self, mission: Mission, view: View, deliberation: Deliberation, turn: Turn) -> Choice:
         """Mode ``guided``: the LLM's word weighed with the others' and with the critic, which thinks while it is asked.
 
-        ``word`` is there where it has been asked already. Without one the others decide: source ``policy``, with the
-        reason.
+        Without one the others decide: source ``policy``, with the reason.
         """
         thinking = asyncio.create_task(asyncio.to_thread(deliberation.judge))
+        word = turn.word
         try:
-            word = word or await self.asking.word(mission, deliberation.offer, deliberation.prompt, deadline)
-            watch.lap("llm")
+            if word is None:
+                word = await self.asking.word(mission, deliberation.offer, deliberation.prompt, turn.deadline)
+                turn.watch.lap("llm")
         finally:
             judgement = await thinking
-        watch.lap("judge")
+        turn.watch.lap("judge")
         trust = trust_of(mission, self._upstream.model)
         gone = mission.reserved(view.step, view.uav_id)
         told = word.of(deliberation.offer.actions)
@@ -322,7 +333,9 @@ class Engine:
             sensor, velocity = self._by_policy(mission, view)
             return Choice(sensor, velocity, "answer_reserved", word.completion)
         self._metrics.llm_trust.observe(trust.weights[LLM])
-        return Choice(*verdict.action, word.reason, word.completion, verdict.told, verdict.advice)
+        # All that it said something of may have been given away.
+        reason = word.reason or ("answer_reserved" if told is None else None)
+        return Choice(*verdict.action, reason, word.completion, verdict.told, verdict.advice)
 
     def _apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         result: Literal["applied", "duplicate"] = "duplicate"

@@ -1,10 +1,11 @@
-"""Reading an LLM's choice among labels: probabilities of the first token, less what it favours whatever is asked.
+"""Reading an LLM's choice among labels: the probabilities of its tokens, less what it favours whatever is asked.
 
 Language models favour labels for their name and for their place in the prompt (Zheng et al. 2024, "Large Language
 Models Are Not Robust Multiple Choice Selectors"). Contextual calibration (Zhao et al. 2021, "Calibrate Before Use")
 asks the same prompt with content that says nothing, takes the mean of the answers for the bias b, and divides:
 ``p'(a) = p(a) / b(a)``, renormalised over the labels offered. A label's place in the prompt is fixed by its name, so
-one bias covers both. It is measured once for a model and a static block, in the background after the first decision.
+one bias covers both. It is measured once for a model, a static block and a number of lists, in the background after the
+first decision. Of several lists, the later ones' bias is that after the letters which the model drew for the earlier.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ log = logging.getLogger(__name__)
 _SMOOTHING = 0.05
 # Of the uniform probability: a label that the content-free prompts hardly ever drew is not multiplied without bound.
 _LEAST_BIAS = 0.1
+# Less than any probability that means something, and far from where halving or dividing loses it.
+_TINY = 1e-12
 _KEPT = 64
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
@@ -40,9 +43,11 @@ def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> l
     Raises:
         NoDecision: neither the tokens told nor the text name a label offered.
     """
+    # Between several labels stand the ends of lines; a single one stands first, whatever was drawn.
+    places = completion.places if len(lists) == 1 else [place for place in completion.places if place.token.strip()]
     told = [
-        {label: place[label] for label in labels if label in place}
-        for place, labels in zip(completion.likeliest, lists, strict=False)
+        {label: place.likeliest[label] for label in labels if label in place.likeliest}
+        for place, labels in zip(places, lists, strict=False)
     ]
     if len(told) == len(lists) and all(sum(place.values()) > 0.0 for place in told):
         return [_filled(place, labels) for place, labels in zip(told, lists, strict=True)]
@@ -54,7 +59,7 @@ def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> l
 
 
 def _filled(told: Mapping[str, float], labels: Collection[str]) -> dict[str, float]:
-    least = 0.5 * min(value for value in told.values() if value > 0.0)
+    least = max(_TINY, 0.5 * min(value for value in told.values() if value > 0.0))
     return _normalised({label: told.get(label) or least for label in labels})
 
 
@@ -89,7 +94,7 @@ class LabelReader:
         """The labels' probabilities by list, without the bias where that is known; raises :class:`NoDecision`."""
         told = probabilities(completion, lists)
         bias = self.bias(static, len(lists))
-        if bias is None or not completion.likeliest:
+        if bias is None or not completion.places:
             return told
         return [calibrated(*pair) for pair in zip(told, bias, strict=True)]
 

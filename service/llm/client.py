@@ -13,13 +13,15 @@ import httpx
 from service.llm.answer import Constraint, NoDecision, constrain, constrain_labels
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
-_MAX_RESPONSE_BYTES = 256 * 1024
+_MAX_RESPONSE_BYTES, _BYTES_A_PLACE = 256 * 1024, 8 * 1024
 _MAX_TOKENS = 10**9
 # What servers answer to a field that they do not know; anything else says nothing about the field.
 _NOT_UNDERSTOOD = (400, 404, 422)
 # The most likely tokens that OpenAI and vLLM tell.
 TOLD_TOKENS = 20
 _MOST_PLACES = 256
+# The temperature at which several labels are drawn one after the other.
+_COOL = 0.2
 
 
 class NotUnderstood(NoDecision):
@@ -31,18 +33,31 @@ class Unreachable(NoDecision):
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """One token of an answer, and the probabilities of the likeliest tokens in its place, blanks stripped."""
+
+    token: str
+    likeliest: dict[str, float]
+
+    def untempered(self, temperature: float) -> Place:
+        """What the probabilities would be at temperature 1: ``q^T``, renormalised."""
+        raised = {token: q**temperature for token, q in self.likeliest.items()}
+        total = sum(raised.values())
+        return Place(self.token, {token: p / total for token, p in raised.items()} if total else {})
+
+
+@dataclass(frozen=True, slots=True)
 class Completion:
     """An answer's text and the server's ``usage``; ``None`` where it said nothing.
 
-    ``likeliest`` holds, for each token of the text that is not blank, the probabilities of the likeliest tokens in its
-    place; empty where the server told none.
+    ``places`` are those of the text's tokens; empty where the server told no probabilities.
     """
 
     text: str
     prompt_tokens: int | None
     cached_tokens: int | None
     completion_tokens: int | None
-    likeliest: tuple[dict[str, float], ...] = ()
+    places: tuple[Place, ...] = ()
 
 
 class LLMClient:
@@ -76,7 +91,9 @@ class LLMClient:
 
     async def complete(self, body: dict[str, Any]) -> Completion:
         """One chat completion of a whole request body; raises :class:`NoDecision`."""
-        answer = await self._call("POST", "chat/completions", body)
+        # Each token may come with its place's likeliest.
+        most = max(_MAX_RESPONSE_BYTES, _BYTES_A_PLACE * body.get("max_tokens", 1))
+        answer = await self._call("POST", "chat/completions", body, most)
         try:
             text = answer["choices"][0]["message"]["content"]
             usage = answer.get("usage") or {}
@@ -89,9 +106,9 @@ class LLMClient:
         prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
         if prompt is not None and cached is not None:
             cached = min(cached, prompt)
-        return Completion(text, prompt, cached, completion, _likeliest(answer["choices"][0]))
+        return Completion(text, prompt, cached, completion, _places(answer["choices"][0]))
 
-    async def _call(self, method: str, path: str, body: dict[str, Any] | None) -> Any:
+    async def _call(self, method: str, path: str, body: dict[str, Any] | None, most: int = _MAX_RESPONSE_BYTES) -> Any:
         content = bytearray()
         try:
             async with self._http.stream(method, path, json=body) as response:
@@ -99,8 +116,8 @@ class LLMClient:
                     raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
                 async for chunk in response.aiter_raw():
                     content += chunk
-                    if len(content) > _MAX_RESPONSE_BYTES:
-                        raise NoDecision("llm_error", f"{self.base_url}: more than {_MAX_RESPONSE_BYTES} bytes")
+                    if len(content) > most:
+                        raise NoDecision("llm_error", f"{self.base_url}: more than {most} bytes")
         except httpx.ConnectError as error:
             raise Unreachable("llm_error", f"{self.base_url}: {type(error).__name__}") from error
         except (httpx.HTTPError, httpx.InvalidURL, UnicodeError) as error:
@@ -150,7 +167,8 @@ def label_body(
 
     llama.cpp tells its probabilities from before the grammar unless asked for those after sampling; after sampling at
     temperature 0 all but one are 0. So it samples at temperature 1 with nothing cut off: the text is then a draw, and
-    the probabilities are exactly the model's among the labels.
+    the probabilities are exactly the model's among the labels. A later label is told given those drawn before it; so of
+    several it draws at a low temperature, nearly always the likeliest, and :meth:`Place.untempered` undoes that.
     """
     body: dict[str, Any] = {
         "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
@@ -167,7 +185,8 @@ def label_body(
     if logprobs:
         body |= {"logprobs": True, "top_logprobs": TOLD_TOKENS}
         if constraint == "grammar":
-            body |= {"post_sampling_probs": True, "samplers": ["temperature"], "temperature": 1}
+            body |= {"post_sampling_probs": True, "samplers": ["temperature"]}
+            body["temperature"] = draw_temperature(lists)
     return body
 
 
@@ -203,20 +222,30 @@ def rewriting_body(
     return body
 
 
-def _likeliest(choice: Any) -> tuple[dict[str, float], ...]:
-    """A place's likeliest tokens with their probabilities: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
+def draw_temperature(lists: Sequence[Sequence[str]]) -> float:
+    """At which llama.cpp draws the labels of so many lists."""
+    return 1.0 if len(lists) == 1 else _COOL
+
+
+def _places(choice: Any) -> tuple[Place, ...]:
+    """The answer's places as far as they can be read: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
+    found: list[Place] = []
     try:
-        places = choice["logprobs"]["content"][:_MOST_PLACES]
-        return tuple(_probabilities(place) for place in places if place["token"].strip())
-    except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
-        return ()
+        for place in choice["logprobs"]["content"][:_MOST_PLACES]:
+            likeliest = _probabilities(place.get("top_logprobs") or place.get("top_probs") or [])
+            found.append(Place(str(place.get("token", "")), likeliest))
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+        pass
+    return tuple(found) if any(place.likeliest for place in found) else ()
 
 
-def _probabilities(place: Any) -> dict[str, float]:
+def _probabilities(told: Any) -> dict[str, float]:
     found: dict[str, float] = {}
-    for entry in (place.get("top_logprobs") or place.get("top_probs") or [])[: 4 * TOLD_TOKENS]:
+    for entry in told[: 4 * TOLD_TOKENS]:
         probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
-        if isinstance(entry["token"], str) and 0.0 <= probability <= 1.0:
+        # Neither holds for what is not a number.
+        known = 0.0 <= probability <= 1.0 and not math.isnan(entry.get("logprob", 0.0))
+        if isinstance(entry["token"], str) and known:
             token = entry["token"].strip()
             found[token] = min(1.0, found.get(token, 0.0) + float(probability))
     return found

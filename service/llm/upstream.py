@@ -7,13 +7,22 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from service.candidates import GuidedTemplate
 from service.llm.answer import Constraint, NoDecision, check_labels
 from service.llm.breaker import Breaker
-from service.llm.client import Completion, LLMClient, NotUnderstood, Unreachable, chat_body, label_body, rewriting_body
+from service.llm.client import (
+    Completion,
+    LLMClient,
+    NotUnderstood,
+    Unreachable,
+    chat_body,
+    draw_temperature,
+    label_body,
+    rewriting_body,
+)
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
 from service.orders import INSTRUCTION, constrain_orders
@@ -25,7 +34,8 @@ from shared.wire import Readiness, Reason
 log = logging.getLogger(__name__)
 
 _RETRY_S = 5.0
-_PROBE_TIMEOUT_S = 60.0
+_PROBE_TIMEOUT_S, _TOGETHER_TIMEOUT_S = 60.0, 15.0
+_ANY_NUMBER = 1000
 # What is no decision gives way to one so often, and waits so long for so much silence between them: each spoils the
 # other's prefix cache. In a mission decisions come seconds apart.
 _STEPS_BACK = 3
@@ -63,8 +73,8 @@ class Upstream:
         self.constraint: Constraint = "none"
         # Whether the server tells the probabilities of tokens.
         self.logprobs = False
-        # Whether it answers for several UAVs at once.
-        self.together = False
+        # UAVs that it may be asked about at once.
+        self.most_together = 1
         self._deciding = 0
         self._decided_at = -math.inf
         self._beside: asyncio.Task[Completion] | None = None
@@ -115,7 +125,10 @@ class Upstream:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        return await self._decide(label_body(self.model, system, user, self.constraint, lists, self.logprobs))
+        answer = await self._decide(label_body(self.model, system, user, self.constraint, lists, self.logprobs))
+        if self.constraint != "grammar" or (temperature := draw_temperature(lists)) == 1.0:
+            return answer
+        return replace(answer, places=tuple(place.untempered(temperature) for place in answer.places))
 
     async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
         """An operator's note as orders that it allows, where the server can be held to them.
@@ -231,7 +244,7 @@ class Upstream:
                 self.model = next(iter(await self._client.models()), None)
             self.constraint = await self._probe(self._client)
             self.logprobs = await self._probe_logprobs(self._client)
-            self.together = await self._probe_together(self._client)
+            self.most_together = _ANY_NUMBER if await self._probe_together(self._client) else 1
             await self._client.complete(self._first_body())
         return self._client
 
@@ -265,7 +278,7 @@ class Upstream:
         """Whether the server tells the probabilities of tokens: it may ignore or refuse the field."""
         body = label_body(self.model, "Answer in words.", _PROBE_TEXT, self.constraint, [["A", "B"]])
         try:
-            return bool((await client.complete(body)).likeliest)
+            return bool((await client.complete(body)).places)
         except NotUnderstood:
             return False
 
@@ -274,8 +287,13 @@ class Upstream:
         lists = [["A", "B"], ["C", "D"]]
         body = label_body(self.model, "Answer in words.", _PROBE_TEXT, self.constraint, lists, self.logprobs)
         try:
-            check_labels((await client.complete(body)).text, lists)
-        except NoDecision:
+            async with asyncio.timeout(_TOGETHER_TIMEOUT_S):
+                check_labels((await client.complete(body)).text, lists)
+        except NoDecision as error:
+            if isinstance(error, NotUnderstood) or error.reason == "answer_format":
+                return False
+            raise
+        except TimeoutError:
             return False
         return True
 

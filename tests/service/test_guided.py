@@ -17,7 +17,7 @@ from service.critic import Judgement, Situation, judge
 from service.guided import LLM, Deliberation, trust_of
 from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
-from service.llm.client import Completion
+from service.llm.client import Completion, Place
 from service.mission import Mission
 from service.reach import Reach
 from service.settings import Settings
@@ -49,7 +49,7 @@ def deliberation(mission: Mission, step: int = 0) -> tuple[View, Deliberation]:
 
 
 def completion(text: str, **first_token: float) -> Completion:
-    return Completion(text, None, None, None, (first_token,) if first_token else ())
+    return Completion(text, None, None, None, (Place(text, first_token),) if first_token else ())
 
 
 def test_every_row_has_four_letters_whose_velocities_rise() -> None:
@@ -109,15 +109,36 @@ def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> No
 
 
 def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
-    places = ({"A": 0.9, "B": 0.1}, {"C": 0.5, "B": 0.2, "A": 0.3})
+    likeliest = {"A": 0.9, "B": 0.1}, {"\n": 1.0}, {"C": 0.5, "B": 0.2, "A": 0.3}
+    places = tuple(Place(token, told) for token, told in zip(("A", "\n", "B"), likeliest, strict=True))
     read = probabilities(Completion("A\nB", None, None, None, places), ["AB", "AB"])
     assert read == [pytest.approx({"A": 0.9, "B": 0.1}), pytest.approx({"A": 0.6, "B": 0.4})]
-    # Of the second place no probabilities came: then the text counts, for both.
-    read = probabilities(Completion("A\nB", None, None, None, places[:1]), ["AB", "AB"])
+    # Of the second label no probabilities came: then the text counts, for both.
+    read = probabilities(Completion("A\nB", None, None, None, places[:2]), ["AB", "AB"])
     assert [max(place, key=lambda label: place[label]) for place in read] == ["A", "B"]
     for text in ("A", "A\nB\nA", "A\nC", ""):
         with pytest.raises(NoDecision):
             probabilities(completion(text), ["AB", "AB"])
+
+
+def test_a_single_label_is_read_where_it_should_stand_though_something_else_was_drawn() -> None:
+    """Servers that cannot be held to the labels begin with a line's end, say."""
+    (told,) = probabilities(Completion("\n", None, None, None, (Place("\n", {"": 0.6, "A": 0.3, "B": 0.1}),)), ["AB"])
+    assert told == pytest.approx({"A": 0.75, "B": 0.25})
+
+
+def test_a_certain_answer_leaves_no_label_without_a_bias() -> None:
+    (bias,) = probabilities(completion("E", E=1.0, F=5e-324), ["ABEF"])
+    assert min(bias.values()) > 0
+    corrected = calibrated({"A": 0.5, "B": 0.5}, bias)
+    assert corrected == pytest.approx({"A": 0.5, "B": 0.5})
+
+
+def test_a_low_temperature_is_undone() -> None:
+    p = {"A": 0.6, "B": 0.3, "C": 0.1}
+    cooled = {label: value**5 / sum(v**5 for v in p.values()) for label, value in p.items()}
+    assert Place("A", cooled).untempered(0.2).likeliest == pytest.approx(p)
+    assert Place("A", {}).untempered(0.2).likeliest == {}
 
 
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
