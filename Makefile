@@ -31,7 +31,7 @@ demo: install
 	$(BIN)/aicvds demo --out runs/demo
 
 test: install
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
 check: install
 	$(BIN)/ruff check .
