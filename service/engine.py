@@ -341,6 +341,10 @@ class Engine:
         result: Literal["applied", "duplicate"] = "duplicate"
         if mission.find(outcome.decision_id) == "pending":
             result = "applied"
+            if outcome.cost > mission.most_cost:
+                # Forged or mistaken: as the worst that can be, it spoils neither the modules nor the prompt.
+                self._metrics.costs_clipped.inc()
+                outcome = outcome.model_copy(update={"cost": mission.most_cost})
             sample = mission.apply(outcome)
             for trust in mission.trust.values():
                 trust.settle(outcome.decision_id, outcome.cost)

@@ -38,6 +38,9 @@ class Metrics:
         )
         self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
+        self.costs_clipped = Counter(
+            "aicvds_costs_clipped", "Outcomes whose cost was more than a step can cost", registry=r
+        )
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.missions = Gauge("aicvds_missions", "Missions held in memory", registry=r)

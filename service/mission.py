@@ -145,6 +145,11 @@ class Mission:
         return self.memory.block
 
     @property
+    def most_cost(self) -> float:
+        """More than any step can cost: Eq. 5 counts a failure a UAV and an overflow a sensor at most."""
+        return float(self.scenario.uavs + self.scenario.sensors)
+
+    @property
     def rates(self) -> FloatArray:
         """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
         rates: FloatArray = self._arrivals / self._exposure
@@ -157,7 +162,8 @@ class Mission:
             at: where in the request's body this UAV stands, such as ``uavs[1].``.
 
         Raises:
-            Refused: an unknown UAV or sensor, a queue past its capacity, or a beacon later than the step.
+            Refused: an unknown UAV or sensor, a queue past its capacity, a beacon later than the step, or an outcome of
+                another UAV's decision.
             NotFound: an outcome of a decision that this mission does not know.
         """
         if uav.uav_id >= self.scenario.uavs:
@@ -171,7 +177,12 @@ class Mission:
         if (latest := max((s for s in uav.sensors.last_seen if s is not None), default=0)) > step:
             raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if uav.outcome is not None:
-            self.find(uav.outcome.decision_id, f"{at}outcome.decision_id")
+            name = uav.outcome.decision_id
+            self.find(name, f"{at}outcome.decision_id")
+            if name in self._pending and (whose := self._pending[name].uav_id) != uav.uav_id:
+                raise Refused(
+                    f"{at}outcome.decision_id", f"decision {name} is UAV {whose}'s, who alone knows its outcome"
+                )
 
     def holds(self, uavs: int) -> bool:
         """Whether the LLM's context is large enough for a prompt about so many UAVs at once."""

@@ -3,6 +3,7 @@
 import gzip
 import json
 import socket
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -358,3 +359,32 @@ def test_the_modules_learn_from_feedback(edge: Edge, report: Report) -> None:
     assert status["learner_updates"] == status["feedback"] == 11
     assert status["learner_loss"] > 0
     assert "aicvds_learner_loss 0.0" not in client.get("/metrics").text
+
+
+def test_a_forged_cost_teaches_no_more_than_the_worst_that_can_be(edge: Edge, report: Report) -> None:
+    """Ten sensors that overflow and three transmissions that fail cost 13 by Eq. 5; 10,000 would drown all else."""
+    client = edge()
+    losses = []
+    for mission, cost in (("forged", 10_000), ("worst", 13)):
+        decision = client.post("/decide", json=report(mission_id=mission)).json()
+        outcome = {"decision_id": decision["decision_id"], "cost": cost}
+        client.post("/decide", json=report(mission_id=mission, step=1, outcome=outcome))
+        for _ in range(200):
+            status = client.get(f"/missions/{mission}").json()
+            if status["learner_updates"]:
+                break
+            time.sleep(0.02)
+        losses.append(status["learner_loss"])
+    assert losses[0] == pytest.approx(losses[1])
+    assert "aicvds_costs_clipped_total 1.0" in client.get("/metrics").text
+
+
+def test_only_the_uav_that_flew_a_decision_knows_its_outcome(edge: Edge, report: Report) -> None:
+    client = edge()
+    decision = client.post("/decide", json=report()).json()
+    outcome = {"decision_id": decision["decision_id"], "cost": 0.0}
+    refused = client.post("/decide", json=report(uav_id=1, outcome=outcome))
+    assert refused.status_code == 422
+    assert fields(refused) == ["outcome.decision_id"]
+    assert client.post("/decide", json=report(step=1, outcome=outcome)).status_code == 200
+    assert client.get("/missions/test").json()["feedback"] == 1
