@@ -76,8 +76,8 @@ class Compiler:
         mission.guidance.fail(f"{why}; give `guidance` of your own", self._upstream.model)
 
     async def _ready(self) -> None:
-        """Wait while the LLM loads."""
-        while self._upstream.status == "loading":
+        """Wait while the LLM loads, or recovers."""
+        while self._upstream.status != "ready" and self._upstream.coming:
             await asyncio.sleep(_POLL_S)
         if self._upstream.status != "ready":
             raise NoDecision("llm_unavailable", f"the LLM is {self._upstream.status}")

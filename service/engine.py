@@ -137,10 +137,10 @@ class Engine:
         self._planning.shutdown(wait=True, cancel_futures=True)
         self._learning.shutdown(wait=True, cancel_futures=True)
 
-    async def decide(self, request: DecideRequest) -> DecideResponse:
+    async def decide(self, request: DecideRequest, *, may_make: bool = True) -> DecideResponse:
         """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input."""
         watch = Stopwatch()
-        mission = self.missions.checked(request)
+        mission = self.missions.checked(request, may_make=may_make)
         if request.outcome is not None:
             self._apply(mission, request.outcome)
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
@@ -149,7 +149,7 @@ class Engine:
         attempt = mission.attempt(request.step, request.uav_id)
         return await self._decide(mission, Turn(request, request.step, attempt, deadline_ms, watch, plan))
 
-    async def decide_batch(self, request: BatchRequest) -> list[DecideResponse]:
+    async def decide_batch(self, request: BatchRequest, *, may_make: bool = True) -> list[DecideResponse]:
         """A fleet's decisions in the order asked.
 
         All that the UAVs report is known before the first decides, and one plan serves them all, until a UAV is told
@@ -160,7 +160,7 @@ class Engine:
         total_ms = request.deadline_ms or self._settings.deadline_ms
         ends = watch.started + total_ms / 1e3
         answers: list[DecideResponse] = []
-        mission = self.missions.checked(request)
+        mission = self.missions.checked(request, may_make=may_make)
         # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
         for outcome in (uav.outcome for uav in request.uavs if uav.outcome is not None):
             self._apply(mission, outcome)

@@ -10,6 +10,7 @@ from limits import RateLimitItemPerMinute
 from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
 from starlette.datastructures import MutableHeaders
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Send
 from starlette.types import Scope as Asked
 
@@ -18,6 +19,8 @@ from service.problems import problem_response
 
 # What says nothing of missions: probes of containers and load balancers carry no key.
 _OPEN = frozenset(("/healthz", "/readyz"))
+# Where the guard leaves the key's scopes for the routes.
+SCOPES = "aicvds.scopes"
 _CAREFUL = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -31,6 +34,12 @@ def scope_of(method: str, path: str) -> Scope | None:
     if path in _OPEN or method in ("GET", "HEAD"):
         return None
     return "admin" if path.startswith("/missions") else "decide"
+
+
+def may_make_missions(request: Request) -> bool:
+    """Whether who asks may make a mission by asking about one that there is not: with a key, only an admin."""
+    scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
+    return scopes is None or "admin" in scopes
 
 
 class Guard:
@@ -59,6 +68,7 @@ class Guard:
             refusal = problem_response(429, f"key {key.name} may ask {key.per_minute} times a minute")
             refusal.headers["Retry-After"] = str(wait_s)
         else:
+            scope[SCOPES] = key.scopes
             await self.app(scope, receive, send)
             return
         # The rest of what is sent is not waited for.

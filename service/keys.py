@@ -5,13 +5,16 @@ A key is 256 random bits, so a plain SHA-256 of it tells nobody the key; it is s
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import hmac
 import logging
 import os
 import secrets
+import stat
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -64,12 +67,19 @@ class KeyFile(BaseModel):
             raise BadKeys(f"{path}: {at}: {fault['msg']}") from None
 
     def write(self, path: Path) -> None:
-        """Replace the file as a whole, readable by its owner alone; raises ``BadKeys``."""
+        """Replace the file as a whole, readable by its owner alone; raises ``BadKeys``.
+
+        A file that is there keeps its owner, group and mode: the edge may be another user.
+        """
         part = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
                 file.write(self.model_dump_json(indent=1) + "\n")
+                if path.exists():
+                    found = path.stat()
+                    os.fchown(file.fileno(), found.st_uid, found.st_gid)
+                    os.fchmod(file.fileno(), stat.S_IMODE(found.st_mode))
             os.replace(part, path)
         except OSError as error:
             raise BadKeys(f"{path}: {error.strerror or error}") from None
@@ -92,6 +102,21 @@ class KeyFile(BaseModel):
         self.keys = left
 
 
+@contextmanager
+def editing(path: Path) -> Iterator[KeyFile]:
+    """The file's keys to change, written at the end; one edits at a time. Raises ``BadKeys``."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = path.with_name(f".{path.name}.lock").open("w")
+    except OSError as error:
+        raise BadKeys(f"{path}: {error.strerror or error}") from None
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        known = KeyFile.read(path) if path.exists() else KeyFile()
+        yield known
+        known.write(path)
+
+
 def hash_of(key: str) -> str:
     """SHA-256 of a key, in hexadecimal digits."""
     return hashlib.sha256(key.encode()).hexdigest()
@@ -106,6 +131,7 @@ class Keys:
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._path, self._clock = path, clock
+        self._told = ""
         self._changed = self._stamp()
         self._keys = KeyFile.read(path).keys
         self._looked = clock()
@@ -129,12 +155,15 @@ class Keys:
         stamp = self._stamp()
         if stamp == self._changed:
             return
-        self._changed = stamp
         try:
             self._keys = KeyFile.read(self._path).keys
         except BadKeys as error:
-            log.error("the keys known before go on to count: %s", error)
+            # Tried again every second, and told once.
+            if str(error) != self._told:
+                self._told = str(error)
+                log.error("the keys known before go on to count: %s", error)
         else:
+            self._changed, self._told = stamp, ""
             log.info("%d keys read again", len(self._keys))
 
     def _stamp(self) -> tuple[int, int, int] | None:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.table import Table
 
-from service.keys import BadKeys, KeyFile, Scope
+from service.keys import BadKeys, KeyFile, Scope, editing
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,8 @@ def main(argv: list[str]) -> int:
 
 
 def _add(asked: Add) -> int:
-    known = KeyFile.read(asked.file) if asked.file.exists() else KeyFile()
-    shown = known.add(asked.name, frozenset(asked.scopes), asked.per_minute)
-    known.write(asked.file)
+    with editing(asked.file) as known:
+        shown = known.add(asked.name, frozenset(asked.scopes), asked.per_minute)
     print(f"Key {asked.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
     print(shown)
     return 0
@@ -93,8 +92,7 @@ def _list(asked: List) -> int:
 
 
 def _remove(asked: Remove) -> int:
-    known = KeyFile.read(asked.file)
-    known.remove(asked.name)
-    known.write(asked.file)
+    with editing(asked.file) as known:
+        known.remove(asked.name)
     print(f"Key {asked.name} is removed", file=sys.stderr)
     return 0

@@ -24,14 +24,18 @@ class Missions:
         except KeyError:
             raise NotFound("mission_id", f"there is no mission {mission_id}") from None
 
-    def checked(self, request: DecideRequest | BatchRequest) -> Mission:
-        """The mission for a request that fits it; one with scenario ``paper`` is made on first use.
+    def checked(self, request: DecideRequest | BatchRequest, *, may_make: bool = True) -> Mission:
+        """The mission for a request that fits it; one with scenario ``paper`` is made on first use, where one may.
 
         Raises:
+            NotFound: there is no such mission, and none may be made.
             Refused: a UAV's report does not fit the mission's world; nothing was recorded.
         """
         mission_id = request.mission_id
-        mission = self._missions.get(mission_id) or Mission(mission_id, MissionSpec(), self._settings)
+        mission = self._missions.get(mission_id)
+        if mission is None and not may_make:
+            raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
+        mission = mission or Mission(mission_id, MissionSpec(), self._settings)
         if isinstance(request, DecideRequest):
             mission.check(request, request.step)
         else:

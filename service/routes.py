@@ -8,6 +8,7 @@ from fastapi import APIRouter, Body, Depends, Request, Response
 from prometheus_client import generate_latest
 
 from service.engine import Engine
+from service.guard import may_make_missions
 from service.llm.upstream import Upstream
 from service.metrics import Metrics
 from service.problems import documented
@@ -49,6 +50,7 @@ def _engine(request: Request) -> Engine:
 
 
 TheEngine = Annotated[Engine, Depends(_engine)]
+MayMake = Annotated[bool, Depends(may_make_missions)]
 
 
 @router.post("/decide", responses=documented(400, 404, 409, 413, 415, 422), tags=["decisions"])
@@ -56,17 +58,18 @@ async def decide(
     body: Annotated[DecideRequest, Body(openapi_examples={"paper": {"value": EXAMPLE}})],
     engine: TheEngine,
     response: Response,
+    may_make: MayMake,
 ) -> DecideResponse:
     """Which sensor to collect from, and how fast to fly the next step."""
-    answer = await engine.decide(body)
+    answer = await engine.decide(body, may_make=may_make)
     response.headers["Server-Timing"] = ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())
     return answer
 
 
 @router.post("/decide/batch", responses=documented(400, 404, 409, 413, 415, 422), tags=["decisions"])
-async def decide_batch(body: BatchRequest, engine: TheEngine) -> BatchResponse:
+async def decide_batch(body: BatchRequest, engine: TheEngine, may_make: MayMake) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
-    return BatchResponse(decisions=await engine.decide_batch(body))
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make))
 
 
 @router.post("/feedback", responses=documented(400, 404, 413, 415, 422), tags=["decisions"])

@@ -56,7 +56,8 @@ def usable_cores(cpu_max: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
 
 # Read by `aicvds simulate` and docker-compose.yml, often from the same .env file.
 _SIMULATORS = {
-    f"AICVDS_{name}" for name in ("API_KEY", "BIND", "BUILD_NETWORK", "PORT", "RUNS", "SCENARIO", "SEED", "USER")
+    f"AICVDS_{name}"
+    for name in ("API_KEY", "BIND", "BUILD_NETWORK", "KEYS_DIR", "PORT", "RUNS", "SCENARIO", "SEED", "USER")
 }
 
 

@@ -2,7 +2,8 @@
 
 Closed, calls go through. After three failures in a row it opens, and no decision is kept waiting. After a pause the LLM
 is probed beside the decisions, so that no UAV pays for the attempt; where the probe is answered it is half open: calls
-go through again, and the first failure opens it for twice as long, the first answer closes it.
+go through again, and the first failure opens it for twice as long, the first answer closes it. What counts as a failure
+is for :mod:`service.llm.upstream` to say.
 """
 
 from __future__ import annotations

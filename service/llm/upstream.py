@@ -65,6 +65,8 @@ class Upstream:
         self._settings = settings
         self._on_open = on_open
         self._breaker = Breaker()
+        self._answered_at = self._counted_at = -math.inf
+        self._waited_s = 0.0
         self._status = _Status("off" if settings.mode in ("value", "policy") else "loading")
         self._client: LLMClient | None = None
         self._embedded: EmbeddedServer | None = None
@@ -96,10 +98,15 @@ class Upstream:
             detail=self._status.detail,
         )
 
-    def start(self, pause_s: float = 0.0) -> None:
-        """Begin loading or probing after a pause, unless the LLM is off."""
+    def start(self) -> None:
+        """Begin loading or probing, unless the LLM is off."""
         if self.status != "off":
-            self._task = asyncio.create_task(self._bring_up(pause_s), name="llm-bring-up")
+            self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up")
+
+    @property
+    def coming(self) -> bool:
+        """Whether an LLM that is not ready may yet be, without anybody's doing."""
+        return self._task is not None and not self._task.done()
 
     async def close(self) -> None:
         """Stop trying, close connections, free the embedded model."""
@@ -125,7 +132,9 @@ class Upstream:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        answer = await self._decide(label_body(self.model, system, user, self.constraint, lists, self.logprobs))
+        body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
+        # Silence to a question about several UAVs says nothing of how questions about one fare.
+        answer = await self._decide(body, patient=len(lists) > 1)
         if self.constraint != "grammar" or (temperature := draw_temperature(lists)) == 1.0:
             return answer
         return replace(answer, places=tuple(place.untempered(temperature) for place in answer.places))
@@ -152,8 +161,8 @@ class Upstream:
                 return self._beside.result().text
         return (await self._ask(body)).text
 
-    async def _decide(self, body: dict[str, Any]) -> Completion:
-        """Ask for a decision: what is asked beside is given up for it."""
+    async def _decide(self, body: dict[str, Any], *, patient: bool = False) -> Completion:
+        """Ask for a decision: what is asked beside is given up for it. To be ``patient`` is not to count silence."""
         self._deciding += 1
         if self._beside is not None:
             self._beside.cancel()
@@ -167,16 +176,31 @@ class Upstream:
             self._failed(error.reason)
             raise
         except asyncio.CancelledError:
-            # Who has hardly waited, by a deadline of his own, tells nothing of the server.
-            if time.monotonic() - begun >= self._settings.deadline_ms / 2e3:
-                self._failed("llm_timeout")
+            if not patient:
+                self._in_vain(begun)
             raise
         else:
             self._breaker.answered()
+            self._answered_at, self._waited_s = time.monotonic(), 0.0
             return answer
         finally:
             self._deciding -= 1
             self._decided_at = time.monotonic()
+
+    def _in_vain(self, begun: float) -> None:
+        """Count silence: half of a deadline of it, with no answer between, is one failure.
+
+        Who has hardly waited, by a short deadline or in a fleet that shares one, counts for as long as he waited.
+        Several who waited side by side count once; who waited while another was answered stood in a queue.
+        """
+        if self._answered_at > begun:
+            return
+        now = time.monotonic()
+        self._waited_s += now - max(begun, self._counted_at)
+        self._counted_at = now
+        if self._waited_s >= self._settings.deadline_ms / 2e3:
+            self._waited_s = 0.0
+            self._failed("llm_timeout")
 
     def _failed(self, reason: Reason) -> None:
         if self.status != "ready" or not self._breaker.failed():
@@ -185,7 +209,7 @@ class Upstream:
         self._status = _Status("unavailable", f"failed too often, the last time by {reason}: left alone {pause_s:g} s")
         log.warning("LLM %s", self._status.detail)
         self._on_open()
-        self.start(pause_s)
+        self._task = asyncio.create_task(self._recover(), name="llm-recovery")
 
     async def _silence(self) -> None:
         """Wait until no decision has been asked for a while, but not for ever."""
@@ -206,8 +230,22 @@ class Upstream:
                 self.start()
             raise
 
-    async def _bring_up(self, pause_s: float) -> None:
-        await asyncio.sleep(pause_s)
+    async def _recover(self) -> None:
+        """After the breaker opened: pause, ask one short question, and so on until it is answered."""
+        while self._client is not None:
+            await asyncio.sleep(self._breaker.pause_s)
+            try:
+                async with asyncio.timeout(_PROBE_TIMEOUT_S):
+                    await self._client.complete(self._probe_body(self.constraint))
+            except (NoDecision, TimeoutError) as error:
+                self._breaker.failed()
+                log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
+            else:
+                self._status = _Status("ready")
+                log.info("LLM answers again: %s", self.model)
+                return
+
+    async def _bring_up(self) -> None:
         while True:
             try:
                 client = await self._connect()
@@ -245,7 +283,11 @@ class Upstream:
             self.constraint = await self._probe(self._client)
             self.logprobs = await self._probe_logprobs(self._client)
             self.most_together = _ANY_NUMBER if await self._probe_together(self._client) else 1
-            await self._client.complete(self._first_body())
+        try:
+            async with asyncio.timeout(_PROBE_TIMEOUT_S):
+                await self._client.complete(self._first_body())
+        except (NoDecision, TimeoutError) as error:
+            log.info("the static block was not read beforehand: %s", error)
         return self._client
 
     def _first_body(self) -> dict[str, Any]:

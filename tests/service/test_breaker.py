@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
 import pytest
+from fastapi.responses import JSONResponse, Response
 
 from service.llm.breaker import Breaker
-from tests.running import listening
-from tests.service.stub_llm import misbehaving, saying, wait_for
+from tests.running import listening, serving
+from tests.service.making import PAPER
+from tests.service.stub_llm import StubLlm, misbehaving, said, saying, silent, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -83,3 +87,77 @@ def test_a_request_that_is_not_understood_does_not_open_it(edge: Edge, report: R
         wait_for(client, "ready")
         reasons = {client.post("/decide", json=report(step=step)).json()["reason"] for step in range(6)}
         assert reasons == {"llm_status"}
+
+
+def test_a_fleet_that_shares_a_deadline_opens_it_too(edge: Edge, report: Report) -> None:
+    """Each waits a third of it, which is less than half."""
+    with listening(misbehaving(silent)) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=600)
+        wait_for(client, "ready")
+        for step in range(3):
+            states = [report(step=step, uav_id=i) for i in range(3)]
+            uavs = [{key: state[key] for key in ("uav_id", "position", "sensors")} for state in states]
+            decided = client.post("/decide/batch", json={"mission_id": "test", "step": step, "uavs": uavs})
+            assert {d["reason"] for d in decided.json()["decisions"]} <= {"llm_timeout", "llm_unavailable"}
+        assert client.get("/readyz").json()["llm"] == "unavailable"
+
+
+def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report) -> None:
+    """One slot, and more UAVs than it serves within the deadline: the last of every step are late, the LLM is well."""
+    slot = asyncio.Lock()
+
+    async def one_by_one(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        async with slot:
+            # Who has hung up is not served.
+            await asyncio.sleep(0.0 if reader.at_eof() else 0.15)
+        await ANSWER(reader, writer)
+
+    with listening(misbehaving(one_by_one)) as url, ThreadPoolExecutor(10) as pool:
+        client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=700)
+        client.put("/missions/test", json={"scenario": {**PAPER.model_dump(), "uavs": 10}, "planner": "off"})
+        wait_for(client, "ready")
+        for step in range(3):
+            states = [report(step=step, uav_id=i) for i in range(10)]
+            reasons = [answer.json()["reason"] for answer in pool.map(lambda s: client.post("/decide", json=s), states)]
+            assert None in reasons and "llm_unavailable" not in reasons
+        assert client.get("/readyz").json()["llm"] == "ready"
+
+
+def test_a_note_sent_while_it_is_open_is_compiled_when_it_is_well(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.llm.breaker._PAUSE_S", 3.0)
+
+    class Ill(StubLlm):
+        async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+            if body["messages"][0]["content"].startswith("Rewrite"):
+                return said("visit sensor 3 every 3 steps")
+            failing = body["messages"][-1]["content"] != "0,50,-90,1,100\n" and not probed
+            return JSONResponse({}, status_code=500) if failing else await super().respond(body, probed)
+
+    with serving(Ill().app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        for step in range(3):
+            client.post("/decide", json=report(step=step, mission_id="other"))
+        assert client.get("/readyz").json()["llm"] == "unavailable"
+        client.put("/missions/test", json={"note": "Visit sensor 3 every 3 steps."})
+        for _ in range(200):
+            if (told := client.get("/missions/test/guidance").json())["status"] != "compiling":
+                break
+            time.sleep(0.05)
+    assert told["status"] == "proposed", told
+
+
+def test_a_server_that_refuses_the_first_question_may_still_answer_others(edge: Edge, report: Report) -> None:
+    """Reading the static block beforehand only saves time."""
+
+    class Picky(StubLlm):
+        async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+            refused = body["messages"][-1]["content"] == "0,50,-90,1,100\n"
+            return JSONResponse({}, status_code=400) if refused else await super().respond(body, probed)
+
+    with serving(Picky().app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        assert client.post("/decide", json=report()).json()["source"] == "llm"

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import stat
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from service.keys import BadKeys, KeyFile, Keys, Scope
+from service.keys import BadKeys, KeyFile, Keys, Scope, editing
 from service.keys_command import main
 from shared.wire import DecideRequest
 from simulator.client import EdgeClient, EdgeRefused
@@ -70,6 +71,9 @@ def test_a_key_does_what_its_scopes_say(edge: Edge, report: Report, tmp_path: Pa
         refused = client.request(method, path, json=body, headers=bearer(keys["uav"]))
         assert refused.status_code == 403
         assert "lacks the scope admin" in refused.json()["detail"]
+    # Nor does it make a mission by asking about one that there is not.
+    refused = client.post("/decide", json=report(), headers=bearer(keys["uav"]))
+    assert refused.status_code == 404 and "scope admin" in refused.json()["detail"]
     assert client.put("/missions/test", json=note, headers=bearer(keys["operator"])).status_code == 200
     assert client.post("/decide", json=report(), headers=bearer(keys["operator"])).status_code == 403
     assert client.post("/decide", json=report(), headers=bearer(keys["uav"])).status_code == 200
@@ -79,7 +83,7 @@ def test_a_key_does_what_its_scopes_say(edge: Edge, report: Report, tmp_path: Pa
 
 def test_a_key_that_asks_too_often_is_told_to_wait(edge: Edge, report: Report, tmp_path: Path) -> None:
     file = KeyFile()
-    slow = file.add("slow", frozenset({"decide"}), per_minute=5)
+    slow = file.add("slow", frozenset({"decide", "admin"}), per_minute=5)
     other = file.add("other", frozenset({"decide"}), per_minute=5)
     file.write(tmp_path / "keys.json")
     client = edge(keys=tmp_path / "keys.json")
@@ -104,6 +108,41 @@ def test_a_key_taken_back_is_out_and_a_new_one_in_without_a_restart(tmp_path: Pa
         path.unlink() if broken is None else path.write_text(broken)
         now[0] += 2.0
         assert keys.find(second) is not None
+
+
+def test_a_file_that_cannot_be_read_for_a_while_is_read_when_it_can(tmp_path: Path, monkeypatch: Any) -> None:
+    """Neither chmod nor chown change what tells that a file is another."""
+    path, now = tmp_path / "keys.json", [0.0]
+    leaked = made(path, leaked=("decide",))["leaked"]
+    keys = Keys(path, clock=lambda: now[0])
+    made(path, other=("decide",))
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "read_bytes", lambda self: (_ for _ in ()).throw(PermissionError(13, "denied")))
+        now[0] = 2.0
+        assert keys.find(leaked) is not None
+    now[0] = 4.0
+    assert keys.find(leaked) is None
+
+
+def test_a_changed_file_keeps_its_mode(tmp_path: Path) -> None:
+    path = tmp_path / "keys.json"
+    made(path, fleet=("decide",))
+    path.chmod(0o644)
+    with editing(path) as known:
+        known.add("other", frozenset({"decide"}), 10)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+def test_two_that_edit_at_a_time_lose_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "keys.json"
+
+    def add(number: int) -> None:
+        with editing(path) as known:
+            known.add(f"key-{number}", frozenset({"decide"}), 10)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(add, range(40)))
+    assert len(KeyFile.read(path).keys) == 40
 
 
 def test_the_file_holds_no_key_and_is_its_owners_alone(tmp_path: Path) -> None:
