@@ -39,7 +39,7 @@ def test_three_failures_open_it_and_one_more_for_longer_until_an_answer_closes_i
 def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_well(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.breaker._PAUSE_S", 0.5)
+    monkeypatch.setattr("service.llm.breaker._PAUSE_S", 2.0)
     hangs = True
 
     async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
