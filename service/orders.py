@@ -28,8 +28,8 @@ _SEPARATOR = ", "
 _MOST_ORDERS = 6
 _MOST_NUMBERS = 10
 _MOST_RULES = 60
-# The most alike of the examples, the nearest last. A model of 135M parameters gets 10 of 15 notes right with them, and
-# 3 of 15 with twenty examples that are the same for every note.
+# The most alike of the examples, the nearest last. A model of 135M parameters gets 22 of 30 held-out notes right with
+# them, where the nearest example's orders with this note's numbers are right 17 times (benchmarks/notes.py).
 _SHOWN = 8
 
 _VISIT, _WEIGHT = "visit sensor # every # steps", "sensor # counts # times"
