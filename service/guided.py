@@ -2,8 +2,7 @@
 
 The candidates are the rows' sensors at a few velocities each, and what the advisers would do themselves. Adviser e (the
 LLM, the planner, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight
-w_e, and the critic expects a candidate to lose m(a) packets above the best, or above what the adviser wants who leads:
-the planner, and where there is none the LLM while most of the trust is its own. What is flown is
+w_e, and the critic expects a candidate to lose m(a) packets above the best, or above the plan's. What is flown is
 
     argmax_a  ln(sum_e w_e p_e(a)) - rate min(m(a), cap),    rate = 0.6 a packet, cap = 8 packets
 
@@ -41,8 +40,6 @@ _PRIOR = {LLM: 0.2, PLANNER: 0.6, "value": 0.1, "policy": 0.1}
 # from the worst. An LLM that answers as the planner would lost 17.4 packets with a prior of 0.8, 19.1 with 0.5, the
 # planner itself 16.1; one that names the worst 24.2 and 24.1 (20 worlds of scenario `paper`, seeds from 1000 on).
 _PRIOR_UNPLANNED = {LLM: 0.8, "value": 0.1, "policy": 0.1}
-# Above this weight the LLM leads where there is no planner.
-_BELIEVED = 0.5
 _TOLD = 5
 
 
@@ -96,19 +93,17 @@ class Deliberation:
         """What the critic expects of every candidate."""
         return judge(self.situation, self.offer.actions)
 
-    def _regret(self, lost: FloatArray, leader: FloatArray | None) -> FloatArray:
-        """Packets lost above the best candidate, or above the leading adviser's unless that is a disaster.
+    def _regret(self, lost: FloatArray) -> FloatArray:
+        """Packets lost above the best candidate, or above the plan's unless that is a disaster.
 
-        Who leads looks further than the critic, which flies look-ahead after the candidates and stops where it stops:
+        The plan looks further than the critic, which flies look-ahead after the candidates and stops where it stops:
         faulted for less than the cap, the planner was overruled in 3 of 46 worlds of scenario `paper`, each time while
-        most sensors were unheard of. One of these lost 96 packets instead of 22, one 0 instead of 7. An LLM that
-        answers as the planner would lost 17.4 packets so faulted and 15.7 when not, the planner 16.1 (20 worlds, seeds
-        from 1000 on).
+        most sensors were unheard of. One of these lost 96 packets instead of 22, one 0 instead of 7.
         """
         least = lost.min()
-        if leader is not None:
-            led = lost[leader.argmax()]
-            least = led if led - least < CAP else least
+        if PLANNER in self.advised:
+            planned = lost[self.advised[PLANNER].argmax()]
+            least = planned if planned - least < CAP else least
         return np.asarray(np.maximum(lost - least, 0.0))
 
     def conclude(
@@ -132,11 +127,8 @@ class Deliberation:
             spoken[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
         weights = trust.among(spoken)
         mixture = np.sum([weights[name] * p for name, p in spoken.items()], axis=0)
-        planned = self.advised.get(PLANNER)
-        regret = heeded = self._regret(judgement.lost, planned)
-        if planned is None and weights.get(LLM, 0.0) > _BELIEVED:
-            heeded = self._regret(judgement.lost, spoken[LLM])
-        score = np.log(mixture) - RATE * np.minimum(heeded, CAP)
+        regret = self._regret(judgement.lost)
+        score = np.log(mixture) - RATE * np.minimum(regret, CAP)
         free = ~np.isin([sensor for sensor, _ in self.offer.actions], list(gone))
         if not free.any():
             return None

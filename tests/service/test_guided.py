@@ -21,7 +21,6 @@ from service.llm.client import Completion, Place
 from service.mission import Mission
 from service.reach import Reach
 from service.settings import Settings
-from service.trust import Trust
 from service.view import View
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
@@ -213,25 +212,6 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
     verdict = made.conclude(trust_of(mission, "stub"), Judgement(losses, losses), None, calibrated=False)
     assert verdict is not None
     assert (verdict.action == plan) == flown
-
-
-@pytest.mark.parametrize(("lost", "weight", "flown"), [(7.0, 0.8, True), (9.0, 0.8, False), (7.0, 0.3, False)])
-def test_an_llm_that_is_believed_leads_where_there_is_no_planner(lost: float, weight: float, flown: bool) -> None:
-    """As a plan is, it is overruled only where the critic sees a disaster; once it is found out, for less."""
-    mission = guided(planner="off")
-    _, made = deliberation(mission)
-    label = next(iter(made.offer.labels))
-    place = made.offer.labels[label]
-    losses = np.zeros(len(made.offer.actions))
-    losses[place] = lost
-    word = made.offer.spread({name: float(name == label) for name in made.offer.labels})
-    rest = (1.0 - weight) / 2
-    trust = Trust({LLM: weight, "value": rest, "policy": rest})
-    verdict = made.conclude(trust, Judgement(losses, losses), word, calibrated=False)
-    assert verdict is not None
-    assert (verdict.action == made.offer.actions[place]) == flown
-    # Trust learns from all that the critic sees.
-    assert verdict.advice.regret[LLM] == pytest.approx(min(lost, 8.0), rel=0.1)
 
 
 @pytest.mark.parametrize("answer", ["worst", "random"])
