@@ -96,7 +96,7 @@ class Asking:
         if told is None:
             return Word(prompt, None, reason, completion, calibrated)
         self._labels.calibrate(prompt.static, template.content_free(), [template.labels])
-        return Word(prompt, _by_action(offer, told[0]), None, completion, calibrated)
+        return Word(prompt, by_action(offer, told[0]), None, completion, calibrated)
 
     def may_ask_together(self, mission: Mission, uavs: int) -> bool:
         """Whether one call can decide for so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
@@ -132,8 +132,8 @@ class Asking:
             self._labels.calibrate(static, template.content_free(list(asked)), [template.labels] * len(asked))
         words = {}
         for place, (uav, (_, offer)) in enumerate(asked.items()):
-            by_action = None if told is None else _by_action(offer, told[place])
-            words[uav] = Word(prompts[uav], by_action, reason, None if place else completion, calibrated)
+            heard = None if told is None else by_action(offer, told[place])
+            words[uav] = Word(prompts[uav], heard, reason, None if place else completion, calibrated)
         return words
 
     async def _heard(
@@ -164,5 +164,6 @@ class Asking:
             self._waiting.discard(limit)
 
 
-def _by_action(offer: Offer, told: dict[str, float]) -> dict[Action, float]:
+def by_action(offer: Offer, told: dict[str, float]) -> dict[Action, float]:
+    """Probabilities of an offer's labels as those of its actions."""
     return dict(zip(offer.actions, offer.spread(told).tolist(), strict=True))
