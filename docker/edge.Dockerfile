@@ -18,7 +18,7 @@ COPY pyproject.toml ./
 # No source yet, so this installs an empty aic-vds with all that it requires, and outlives every edit of the source.
 # Torch's C++ headers and test programs are a fifth of it, and nothing here compiles. OR-Tools brings pandas.
 RUN touch README.md LICENSE \
- && pip install --constraint constraints.txt '.[service,planner]' \
+ && pip install --constraint constraints.txt '.[service,planner,postgres]' \
  && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test pandas/tests
 
 # These files alone, so that an edit elsewhere does not bring the model again.
@@ -50,7 +50,9 @@ COPY --from=application /wheels /tmp/wheels
 RUN python -m pip --python /opt/aicvds/bin/python install \
     --quiet --no-cache-dir --no-index --no-deps --force-reinstall /tmp/wheels/*.whl \
  && rm -r /tmp/wheels
-ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model
+# A named volume mounted here takes this owner. Without one, and with a read-only root, missions are kept nowhere.
+RUN install --directory --owner=aicvds --group=aicvds /store
+ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none
 USER 10001:10001
 EXPOSE 8000
 # Healthy: it decides, and its LLM is no longer on its way (ready, off, or known to be unavailable).

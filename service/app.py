@@ -22,6 +22,7 @@ from service.llm.upstream import Upstream
 from service.metrics import Metrics
 from service.routes import router
 from service.settings import Settings
+from service.store import Store
 from service.tokens import TokenCounter
 from shared.wire import Problem
 
@@ -34,8 +35,11 @@ class State(TypedDict):
     metrics: Metrics
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     """One edge service; its LLM begins to load when the application starts.
+
+    Args:
+        store: where missions outlive the process, closed when the application ends; None: nowhere.
 
     Raises:
         BadKeys: the file of keys that the settings name cannot be used.
@@ -49,7 +53,7 @@ def create_app(settings: Settings) -> FastAPI:
         upstream = Upstream(settings, metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         await asyncio.to_thread(rehearse)
-        engine = Engine(settings, upstream, counter, metrics)
+        engine = Engine(settings, upstream, counter, metrics, store)
         app.state.engine = engine
         upstream.start()
         try:
@@ -59,6 +63,8 @@ def create_app(settings: Settings) -> FastAPI:
             await engine.asking.close()
             await upstream.close()
             await asyncio.to_thread(engine.close)
+            if store is not None:
+                store.close()
 
     app = FastAPI(
         title="AIC-VDS edge",

@@ -64,7 +64,7 @@ class Compiler:
                 await self._ready()
                 if mission.guidance.status != "compiling":
                     return
-                mission.guidance.propose(await understood(note, mission.scenario, self._upstream), self._upstream.model)
+                mission.understand(await understood(note, mission.scenario, self._upstream), self._upstream.model)
                 return
         except (BadOrders, Impossible, NoDecision) as error:
             why = str(error)
@@ -73,7 +73,7 @@ class Compiler:
         except Exception as error:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             why = f"{type(error).__name__}: see the log"
-        mission.guidance.fail(f"{why}; give `guidance` of your own", self._upstream.model)
+        mission.misunderstand(f"{why}; give `guidance` of your own", self._upstream.model)
 
     async def _ready(self) -> None:
         """Wait while the LLM loads, or recovers."""

@@ -4,28 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 import time
 import uuid
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+
+from pydantic import TypeAdapter
 
 from service.asking import Asking, Word
 from service.compiler import Compiler
-from service.guided import LLM, Deliberation, trust_of
-from service.learner import Sample
+from service.events import Counsel
+from service.guided import Deliberation
+from service.journal import Journal, Unkept
 from service.llm.answer import NoDecision, check_answer
 from service.llm.client import Completion
 from service.llm.upstream import Upstream
 from service.metrics import Metrics
 from service.mission import Mission
 from service.missions import Missions
+from service.outcomes import Outcomes
 from service.policy import decide_without_llm
+from service.problems import Unavailable
 from service.prompt import Prompt
 from service.settings import Settings, usable_cores
-from service.tokens import TokenCounter, price_usd
-from service.trust import Advice
+from service.stopwatch import Stopwatch
+from service.store import Store
+from service.tokens import TokenCounter, with_usage
+from service.trust import LLM, Advice
 from service.view import View
 from shared.wire import (
     BatchRequest,
@@ -34,10 +40,8 @@ from shared.wire import (
     FeedbackRequest,
     FeedbackResponse,
     Guided,
-    Outcome,
     Reason,
     Source,
-    Tokens,
     UavState,
 )
 
@@ -51,27 +55,11 @@ _RESERVE_S = 0.02
 _TOGETHER_MOST, _TOGETHER_LEAST = 0.75, 0.25
 # A UAV's own share, seconds, until it is known, and how many decisions it is learned over.
 _OWN_S, _OWN_MEMORY = 0.03, 20
-# Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
-_MAX_LESSONS = 256
-
-
-@dataclass(slots=True)
-class Stopwatch:
-    """Milliseconds by stage since the request came in."""
-
-    started: float = field(default_factory=time.perf_counter)
-    stages: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=time.perf_counter)
-
-    def lap(self, stage: str) -> None:
-        """End a stage, or one more part of it."""
-        now = time.perf_counter()
-        self.stages[stage] = round(self.stages.get(stage, 0.0) + (now - self._last) * 1e3, 3)
-        self._last = now
-
-    def total(self) -> dict[str, float]:
-        """The stages and their total."""
-        return {**self.stages, "total": round((time.perf_counter() - self.started) * 1e3, 3)}
+# The longest that an answer waits for the disk; where that takes longer, it goes out and says so.
+_STORE_S = 1.0
+# The last checkpoints, and the last commit, when the service ends.
+_LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 1.0
+_ANSWERS = TypeAdapter(list[DecideResponse])
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,57 +106,72 @@ class Choice:
 class Engine:
     """Decides for every mission of one service, and learns from what comes back."""
 
-    def __init__(self, settings: Settings, upstream: Upstream, counter: TokenCounter, metrics: Metrics) -> None:
+    def __init__(
+        self, settings: Settings, upstream: Upstream, counter: TokenCounter, metrics: Metrics, store: Store | None
+    ) -> None:
         self._settings = settings
         self._upstream = upstream
         self.asking = Asking(upstream, metrics)
         self.compiler = Compiler(upstream)
         self._counter = counter
         self._metrics = metrics
-        self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._plans: set[asyncio.Task[None]] = set()
         self._own_s = _OWN_S
-        self._room = threading.Semaphore(_MAX_LESSONS)
-        self.missions = Missions(settings, metrics)
+        self.keeper: Journal | Unkept = Unkept() if store is None else Journal(store, metrics)
+        self._outcomes = Outcomes(metrics, self.keeper)
+        self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
 
     def close(self) -> None:
-        """Finish the lesson and the plans in hand, and drop those that are queued."""
+        """Finish the lessons and the plans in hand, drop those that are queued, and write what is to be kept."""
         self._planning.shutdown(wait=True, cancel_futures=True)
-        self._learning.shutdown(wait=True, cancel_futures=True)
+        self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
+        self.keeper.close(_LAST_COMMIT_S)
 
-    async def decide(self, request: DecideRequest, *, may_make: bool = True) -> DecideResponse:
-        """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input."""
+    async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
+        """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input.
+
+        Args:
+            key: a request that comes again under it gets the same answer.
+        """
         watch = Stopwatch()
-        mission = self.missions.checked(request, may_make=may_make)
-        if request.outcome is not None:
-            self._apply(mission, request.outcome)
-        deadline_ms = request.deadline_ms or self._settings.deadline_ms
-        mission.observe(request, request.step)
-        plan = self._plan(mission, [request.uav_id], request.step, watch.started + deadline_ms / 1e3)
-        attempt = mission.attempt(request.step, request.uav_id)
-        return await self._decide(mission, Turn(request, request.step, attempt, deadline_ms, watch, plan))
+        mission = await self.missions.checked(request, may_make=may_make)
+        ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
+        return (await self._once(mission, key, request, lambda: self._one(mission, request, watch), ends))[0]
 
-    async def decide_batch(self, request: BatchRequest, *, may_make: bool = True) -> list[DecideResponse]:
-        """A fleet's decisions in the order asked.
+    async def _one(self, mission: Mission, request: DecideRequest, watch: Stopwatch) -> list[DecideResponse]:
+        if request.outcome is not None:
+            self._outcomes.apply(mission, request.outcome)
+        deadline_ms = request.deadline_ms or self._settings.deadline_ms
+        attempt = mission.observe(request, request.step)
+        plan = self._plan(mission, [request.uav_id], request.step, watch.started + deadline_ms / 1e3)
+        return [await self._decide(mission, Turn(request, request.step, attempt, deadline_ms, watch, plan))]
+
+    async def decide_batch(
+        self, request: BatchRequest, *, may_make: bool = True, key: str | None = None
+    ) -> list[DecideResponse]:
+        """A fleet's decisions in the order asked; ``key`` as for :meth:`decide`.
 
         All that the UAVs report is known before the first decides, and one plan serves them all, until a UAV is told
         something else than it: then the rest is planned again. The LLM is asked about all at once where it can be,
         while the plan is made; else about one after the other. Each UAV has an equal share of the time that is left.
         """
         watch = Stopwatch()
+        mission = await self.missions.checked(request, may_make=may_make)
+        ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
+        return await self._once(mission, key, request, lambda: self._all(mission, request, watch, ends), ends)
+
+    async def _all(
+        self, mission: Mission, request: BatchRequest, watch: Stopwatch, ends: float
+    ) -> list[DecideResponse]:
         total_ms = request.deadline_ms or self._settings.deadline_ms
-        ends = watch.started + total_ms / 1e3
         answers: list[DecideResponse] = []
-        mission = self.missions.checked(request, may_make=may_make)
         # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
         for outcome in (uav.outcome for uav in request.uavs if uav.outcome is not None):
-            self._apply(mission, outcome)
-        for uav in request.uavs:
-            mission.observe(uav, request.step)
+            self._outcomes.apply(mission, outcome)
         waiting = [uav.uav_id for uav in request.uavs]
         # Before the LLM is asked: a batch that is sent again meanwhile is the later attempt.
-        attempts = {uav: mission.attempt(request.step, uav) for uav in waiting}
+        attempts = {uav.uav_id: mission.observe(uav, request.step) for uav in request.uavs}
         plan: asyncio.Task[None] | None = None
         words: dict[int, Word] = {}
         llm_s = min(_TOGETHER_MOST * total_ms / 1e3, total_ms / 1e3 - 2 * len(waiting) * self._own_s)
@@ -196,10 +199,59 @@ class Engine:
             await asyncio.sleep(0)
         return answers
 
-    def feedback(self, request: FeedbackRequest) -> FeedbackResponse:
-        """Apply an outcome once; raises ``NotFound`` for an unknown mission or decision."""
-        mission = self.missions.get(request.mission_id)
-        return FeedbackResponse(decision_id=request.decision_id, result=self._apply(mission, request))
+    async def feedback(self, request: FeedbackRequest) -> FeedbackResponse:
+        """Apply an outcome once; acknowledged, it is on disk.
+
+        Raises:
+            NotFound: an unknown mission or decision.
+            Conflict: another outcome was told before.
+            Unavailable: the store fails, or is slow; to be sent again.
+        """
+        mission = await self.missions.get(request.mission_id)
+        if self.keeper.failing:
+            raise Unavailable("decision_id", "the store fails: nothing was recorded, send it again")
+        result = self._outcomes.apply(mission, request)
+        self._outcomes.checkpoint(mission)
+        await self.kept("decision_id")
+        return FeedbackResponse(decision_id=request.decision_id, result=result)
+
+    async def kept(self, field: str) -> None:
+        """Wait until all that happened so far is on disk; raises ``Unavailable`` where it is not in time."""
+        if not await self.keeper.stored(_STORE_S):
+            raise Unavailable(field, "not on disk yet: send it again to be sure")
+
+    async def _once(
+        self,
+        mission: Mission,
+        key: str | None,
+        request: DecideRequest | BatchRequest,
+        make: Callable[[], Awaitable[list[DecideResponse]]],
+        ends: float,
+    ) -> list[DecideResponse]:
+        """The answers under this key, made unless there are some, and whether they are on disk."""
+        made: list[DecideResponse] = []
+
+        async def body() -> str:
+            made.extend(await make())
+            return _ANSWERS.dump_json(made).decode()
+
+        if key is None:
+            answers = made = await make()
+        else:
+            text = await mission.repeats.once(key, request.model_dump_json(), body, mission.record)
+            answers = made or _ANSWERS.validate_json(text)
+        self._outcomes.checkpoint(mission)
+        began = time.perf_counter()
+        stored = await self.keeper.stored(min(_STORE_S, ends - began))
+        waited = round((time.perf_counter() - began) * 1e3, 3)
+        told = []
+        for answer in answers:
+            total = round(answer.latency_ms["total"] + waited, 3)
+            latency = {**answer.latency_ms, "store": waited, "total": total}
+            told.append(answer.model_copy(update={"stored": stored, "latency_ms": latency}))
+        for answer in told if made else ():
+            self._metrics.record_decision(answer)
+        return told
 
     async def _decide(self, mission: Mission, turn: Turn) -> DecideResponse:
         uav, step, watch, word = turn.uav, turn.step, turn.watch, turn.word
@@ -217,7 +269,7 @@ class Engine:
             prompt = mission.template.prompt(
                 view.state, view.shown(mission), mission.experiences, view.nearest(mission)
             )
-        tokens = self._count(prompt)
+        tokens = self._counter.account(prompt)
         watch.lap("prompt")
         if deliberation is not None:
             choice = await self._weigh(mission, view, deliberation, turn)
@@ -241,14 +293,12 @@ class Engine:
             model=None if choice.reason else self._upstream.model,
             top_k=view.candidates,
             guided=choice.guided,
-            tokens=self._with_usage(tokens, choice.completion),
+            tokens=with_usage(tokens, choice.completion, self._settings),
             deadline_ms=turn.deadline_ms,
             latency_ms=watch.total(),
         )
-        mission.commit(pending, turn.attempt)
-        if choice.advice is not None:
-            trust_of(mission, self._upstream.model).note(decision_id, choice.advice)
-        self._metrics.record_decision(answer)
+        counsel = None if choice.advice is None else Counsel(self._upstream.model or "", choice.advice)
+        mission.commit(pending, turn.attempt, counsel)
         waited_ms = watch.stages.get("llm", 0.0) + watch.stages.get("plan", 0.0)
         self._own_s += ((answer.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
         return answer
@@ -325,7 +375,7 @@ class Engine:
         finally:
             judgement = await thinking
         turn.watch.lap("judge")
-        trust = trust_of(mission, self._upstream.model)
+        trust = mission.trust_in(self._upstream.model)
         gone = mission.reserved(view.step, view.uav_id)
         told = word.of(deliberation.offer.actions)
         verdict = deliberation.conclude(trust, judgement, told, calibrated=word.calibrated, gone=gone)
@@ -336,61 +386,6 @@ class Engine:
         # All that it said something of may have been given away.
         reason = word.reason or ("answer_reserved" if told is None else None)
         return Choice(*verdict.action, reason, word.completion, verdict.told, verdict.advice)
-
-    def _apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
-        result: Literal["applied", "duplicate"] = "duplicate"
-        if mission.find(outcome.decision_id) == "pending":
-            result = "applied"
-            if outcome.cost > mission.most_cost:
-                # Forged or mistaken: as the worst that can be, it spoils neither the modules nor the prompt.
-                self._metrics.costs_clipped.inc()
-                outcome = outcome.model_copy(update={"cost": mission.most_cost})
-            sample = mission.apply(outcome)
-            for trust in mission.trust.values():
-                trust.settle(outcome.decision_id, outcome.cost)
-            if sample is not None and self._room.acquire(blocking=False):
-                self._learning.submit(self._learn, mission, sample, outcome.cost)
-            elif sample is not None:
-                log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
-        self._metrics.feedback.labels(result).inc()
-        return result
-
-    def _learn(self, mission: Mission, sample: Sample, cost: float) -> None:
-        try:
-            self._metrics.learner_loss.set(mission.learner.update(sample, cost))
-        except Exception:
-            log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
-        finally:
-            self._room.release()
-
-    def _count(self, prompt: Prompt) -> Tokens:
-        static = self._counter.count_repeated(prompt.static)
-        experiences = sum(self._counter.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
-        state = self._counter.count(prompt.state)
-        state_uncompressed = self._counter.count(prompt.state_uncompressed)
-        return Tokens(
-            tokenizer=self._counter.name,
-            static=static,
-            experiences=experiences,
-            state=state,
-            state_uncompressed=state_uncompressed,
-            prompt=static + experiences + state,
-            uncompressed=static + experiences + state_uncompressed,
-            saved=state_uncompressed - state,
-        )
-
-    def _with_usage(self, tokens: Tokens, completion: Completion | None) -> Tokens:
-        if completion is None or completion.prompt_tokens is None:
-            return tokens
-        cached = completion.cached_tokens or 0
-        cost = price_usd(self._settings, completion.prompt_tokens, cached, completion.completion_tokens or 0)
-        usage = {
-            "server_prompt": completion.prompt_tokens,
-            "cached": completion.cached_tokens,
-            "completion": completion.completion_tokens,
-            "cost_usd": cost,
-        }
-        return tokens.model_copy(update=usage)
 
 
 async def _until(plan: asyncio.Task[None] | None, deadline: float) -> None:

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,21 @@ class Experiences:
         if self.selection != "similar" or not len(rows):
             return []
         return [line for line in self._nearest(rows, NEAREST) if line not in self.block]
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is remembered, as copies."""
+        return {
+            "block": list(self.block),
+            "compactions": self.compactions,
+            "since": self._since,
+            "remembered": [[e.line, e.cost, e.features] for e in self._remembered],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As it was when the state was taken."""
+        self.block, self.compactions, self._since = state["block"], state["compactions"], state["since"]
+        self._remembered.clear()
+        self._remembered.extend(Experience(*remembered) for remembered in state["remembered"])
 
     def _chosen(self, keep: int) -> list[str]:
         if self.selection == "recent":

@@ -11,6 +11,7 @@ from scipy.special import softmax
 from service.critic import Action
 from service.mission import Mission
 from service.policy import decide_without_llm
+from service.trust import PLANNER
 from service.view import View
 from shared.channel import FloatArray
 
@@ -37,7 +38,7 @@ class Expert(Protocol):
 class PlannerExpert:
     """The receding-horizon plan, where there is one of this step."""
 
-    name = "planner"
+    name = PLANNER
 
     def proposal(self, mission: Mission, view: View) -> Action | None:
         """The plan's action."""
@@ -82,7 +83,6 @@ class PolicyExpert:
         return one_hot(self.proposal(mission, view), actions)
 
 
-PLANNER = PlannerExpert.name
 # In the order of the response.
 EXPERTS: tuple[Expert, ...] = (PlannerExpert(), ValueExpert(), PolicyExpert())
 

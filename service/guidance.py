@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from service.problems import Conflict, Refused
 from shared.guidance import NO_GUIDANCE, Guidance, GuidanceAnswer, GuidanceState, GuidanceStatus, Impossible
@@ -72,3 +72,22 @@ class OperatorGuidance:
             model=self._model,
             failure=self._failure,
         )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where it stands, as plain values."""
+        return {
+            "status": self.status,
+            "obeyed": self.obeyed.model_dump(),
+            "understood": None if self._understood is None else self._understood.model_dump(),
+            "origin": self._origin,
+            "model": self._model,
+            "failure": self._failure,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As it stood when the state was taken."""
+        self.status = state["status"]
+        self.obeyed = Guidance.model_validate(state["obeyed"])
+        understood = state["understood"]
+        self._understood = None if understood is None else Guidance.model_validate(understood)
+        self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]

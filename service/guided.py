@@ -25,21 +25,14 @@ import numpy as np
 
 from service.candidates import GuidedTemplate, Offer
 from service.critic import Action, Judgement, Situation, judge
-from service.experts import EXPERTS, PLANNER, SMOOTHING
+from service.experts import EXPERTS, SMOOTHING
 from service.mission import Mission
 from service.prompt import Prompt
-from service.trust import CAP, RATE, Advice, Trust
+from service.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.view import View
 from shared.channel import FloatArray
 from shared.wire import Guided, Weighed
 
-LLM = "llm"
-# The planner sees further than the others and needs no finding out.
-_PRIOR = {LLM: 0.2, PLANNER: 0.6, "value": 0.1, "policy": 0.1}
-# Where there is none, the LLM is believed until it is found out, within a few decisions in which the critic keeps it
-# from the worst. An LLM that answers as the planner would lost 17.4 packets with a prior of 0.8, 19.1 with 0.5, the
-# planner itself 16.1; one that names the worst 24.2 and 24.1 (20 worlds of scenario `paper`, seeds from 1000 on).
-_PRIOR_UNPLANNED = {LLM: 0.8, "value": 0.1, "policy": 0.1}
 _TOLD = 5
 
 
@@ -172,12 +165,3 @@ def offered(mission: Mission, view: View) -> Offer:
         return shown
     rows = {int(sensor): row for row, sensor in enumerate(view.state.ids)}
     return shown.flown_as(lambda sensor, velocity: asked.nearest(rows[sensor], velocity))
-
-
-def trust_of(mission: Mission, model: str | None) -> Trust:
-    """A mission's trust in its advisers while this LLM is one of them."""
-    name = model or ""
-    if name not in mission.trust:
-        prior = _PRIOR if mission.planner is not None else _PRIOR_UNPLANNED
-        mission.trust[name] = Trust(prior, most_open=8 * mission.scenario.uavs)
-    return mission.trust[name]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -90,6 +91,28 @@ class Learner:
         self.updates += 1
         self.last_loss = loss.item()
         return self.last_loss
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights and Adam's moments as arrays; from the learning thread, or where there is none."""
+        adam = self._adam.state_dict()["state"]
+        return {
+            "weights": {name: tensor.numpy().copy() for name, tensor in self._training.state_dict().items()},
+            "adam": {index: {name: t.numpy().copy() for name, t in kept.items()} for index, kept in adam.items()},
+            "updates": self.updates,
+            "last_loss": self.last_loss,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As it was when the state was taken; raises ``RuntimeError`` where that is of other modules."""
+        self._training.load_state_dict({name: torch.from_numpy(array) for name, array in state["weights"].items()})
+        kept = self._adam.state_dict()
+        kept["state"] = {
+            index: {name: torch.from_numpy(array) for name, array in moments.items()}
+            for index, moments in state["adam"].items()
+        }
+        self._adam.load_state_dict(kept)
+        self.current = copy.deepcopy(self._training).requires_grad_(False)
+        self.updates, self.last_loss = state["updates"], state["last_loss"]
 
 
 def rehearse() -> None:

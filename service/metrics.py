@@ -43,7 +43,11 @@ class Metrics:
         )
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
-        self.missions = Gauge("aicvds_missions", "Missions held in memory", registry=r)
+        self.missions = Gauge("aicvds_missions", "Missions held, in memory or in the store", registry=r)
+        self.store_seconds = Histogram(
+            "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
+        )
+        self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
 
     def record_decision(self, decision: DecideResponse) -> None:
         """Count one answered decision: source, stages, overhead, tokens, lateness."""

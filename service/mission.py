@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_modules
 from service.demonstrations import solved
+from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
 from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
 from service.guidance import OperatorGuidance
@@ -18,74 +20,54 @@ from service.learner import Learner, Modules, Sample
 from service.planner import Planner, can_plan
 from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template, note_block
-from service.rows import Cells
+from service.records import NEVER, Records
+from service.repeats import Repeats
 from service.settings import Settings, prompt_tokens
-from service.trust import Trust
+from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
+from service.turns import Given, Turns
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
-from shared.guidance import GuidanceAnswer
+from shared.guidance import Guidance, GuidanceAnswer
 from shared.scenario import Scenario, scenario_named
-from shared.wire import Belief, Features, MissionSpec, MissionStatus, Mode, Outcome, UavState
+from shared.wire import Belief, Features, MissionSpec, MissionStatus, Mode, Outcome, Selection, UavState
 
 # An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
 _PENDING_PER_UAV = 8
 _APPLIED_PER_UAV = 64
-# UAVs of one fleet may be this many steps apart.
-_RESERVED_STEPS = 64
-# Weight, in steps, of the scenario's mean arrival rate against what is observed.
-_PRIOR_STEPS = 2.0
-_NEVER = -1
 
-
-@dataclass(frozen=True, slots=True)
-class Pending:
-    """A decision whose outcome is still to come.
-
-    ``seen`` is the sensor's row as it was then; ``sample`` is None where the modules had no part in the decision.
-    """
-
-    decision_id: str
-    uav_id: int
-    step: int
-    sensor_id: int
-    velocity: int
-    seen: Cells
-    sample: Sample | None
-
-
-@dataclass(frozen=True, slots=True)
-class Given:
-    """The sensor that a UAV was given at a step, and by which of its attempts."""
-
-    sensor_id: int
-    decision_id: str
-    attempt: int
+T = TypeVar("T")
 
 
 class Mission:
     """One fleet's state. Only the event loop touches it, apart from the learner's own thread.
 
+    Everything that changes it is an event, which ``record`` hears of: the same events in the same order, on the same
+    spec, make the same mission again (see :mod:`service.replaying`).
+
+    Attributes:
+        asked_for: the spec as it was given; ``spec`` says in full what the service's settings made of it.
+
     Raises:
         Refused: the spec names an unknown scenario, or its prompt cannot fit the LLM's context.
     """
 
-    def __init__(self, mission_id: str, spec: MissionSpec, settings: Settings) -> None:
+    def __init__(
+        self, mission_id: str, asked_for: MissionSpec, settings: Settings, spec: MissionSpec | None = None
+    ) -> None:
+        self.mission_id = mission_id
+        self.asked_for = asked_for
+        self.spec = spec = spec or in_full(asked_for, settings)
         try:
             named = spec.scenario
             self.scenario: Scenario = scenario_named(named) if isinstance(named, str) else named
         except ValueError as error:
             raise Refused("scenario", str(error)) from None
-        self.mission_id = mission_id
-        self.mode: Mode = spec.mode or settings.mode
-        # The paper's method as it is written, unless asked otherwise.
-        written = self.mode == "llm"
-        self.features: Features = spec.features or ("paper" if written else "reach")
-        self.decides_from: Belief = spec.belief or ("reported" if written else "fleet")
-        self.spec = spec
-        self.top_k = spec.top_k or settings.top_k
-        told = spec.prompt.experiences
-        self._experience_limit = settings.experiences if told is None else told
-        self._selection = spec.prompt.selection or settings.selection
+        self.mode: Mode = required(spec.mode)
+        self.features: Features = required(spec.features)
+        self.decides_from: Belief = required(spec.belief)
+        self.top_k = required(spec.top_k)
+        self._experience_limit = required(spec.prompt.experiences)
+        self._selection: Selection = required(spec.prompt.selection)
         # Mode `value` has nothing else to decide by.
         self.attends = spec.attention == "on" or self.mode == "value"
         modules = initial_modules(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
@@ -96,24 +78,18 @@ class Mission:
         self.decisions = 0
         self.feedback = 0
         self.learner = Learner(modules, learning_rate=settings.learning_rate)
-        sensors = self.scenario.sensors
-        self.visits = np.full(sensors, _NEVER, dtype=np.int64)
-        self._confirmed = np.full(sensors, _NEVER, dtype=np.int64)
-        self._open_visits: dict[int, dict[str, int]] = {}
-        self._seen = np.full(sensors, _NEVER, dtype=np.int64)
-        self._queue = np.zeros(sensors)
-        self._arrivals = np.full(sensors, self.scenario.mean_arrival_rate * _PRIOR_STEPS)
-        self._exposure = np.full(sensors, _PRIOR_STEPS)
-        self._given: dict[int, dict[int, Given]] = {}
-        self._attempts: dict[int, dict[int, int]] = {}
+        self.records = Records(self.scenario)
+        self.turns = Turns()
         self._pending: dict[str, Pending] = {}
-        self._applied: OrderedDict[str, None] = OrderedDict()
+        self._applied: OrderedDict[str, tuple[float, bool]] = OrderedDict()
+        self.repeats = Repeats(_PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
-        wanted = (spec.planner or settings.planner) == "on"
+        wanted = spec.planner == "on"
         self.planner = Planner(self.scenario, self.belief) if wanted and can_plan(self.scenario) else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         # Mode `guided`: by the LLM's name.
         self.trust: dict[str, Trust] = {}
+        self.record: Callable[[Event], None] = _forgotten
 
     def _template(self, modules: Modules) -> Template:
         spec = self.spec
@@ -131,8 +107,30 @@ class Mission:
     def obey(self, answer: GuidanceAnswer) -> None:
         """The operator's word on the guidance; raises as :meth:`OperatorGuidance.answer`."""
         self.guidance.answer(answer)
+        self._heed()
+
+    def understand(self, guidance: Guidance, model: str | None) -> None:
+        """An LLM made this of the operator's note."""
+        self.guidance.propose(guidance, model)
+        self._heed()
+
+    def misunderstand(self, why: str, model: str | None) -> None:
+        """Nothing could be made of the operator's note."""
+        self.guidance.fail(why, model)
+        self._heed()
+
+    def _heed(self) -> None:
         if self.planner is not None:
             self.planner.obey(self.guidance.obeyed)
+        self.record(Guided(self.guidance.state_dict()))
+
+    def trust_in(self, model: str | None) -> Trust:
+        """Mode ``guided``: the trust in the advisers while this LLM is one of them."""
+        name = model or ""
+        if name not in self.trust:
+            prior = PRIOR if self.planner is not None else PRIOR_UNPLANNED
+            self.trust[name] = Trust(prior, most_open=_PENDING_PER_UAV * self.scenario.uavs)
+        return self.trust[name]
 
     @property
     def asks(self) -> bool:
@@ -150,10 +148,14 @@ class Mission:
         return float(self.scenario.uavs + self.scenario.sensors)
 
     @property
+    def visits(self) -> NDArray[np.int64]:
+        """TVR_j: each sensor's last visit, a step, shape ``(J,)``; -1 for never."""
+        return self.records.visits
+
+    @property
     def rates(self) -> FloatArray:
         """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
-        rates: FloatArray = self._arrivals / self._exposure
-        return rates
+        return self.records.rates
 
     def check(self, uav: UavState, step: int, at: str = "") -> None:
         """Refuse, before anything is recorded, what this mission's world does not have.
@@ -165,6 +167,7 @@ class Mission:
             Refused: an unknown UAV or sensor, a queue past its capacity, a beacon later than the step, or an outcome of
                 another UAV's decision.
             NotFound: an outcome of a decision that this mission does not know.
+            Conflict: an outcome that contradicts an earlier one.
         """
         if uav.uav_id >= self.scenario.uavs:
             raise Refused(f"{at}uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
@@ -178,7 +181,7 @@ class Mission:
             raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if uav.outcome is not None:
             name = uav.outcome.decision_id
-            self.find(name, f"{at}outcome.decision_id")
+            self.find(uav.outcome, f"{at}outcome.")
             if name in self._pending and (whose := self._pending[name].uav_id) != uav.uav_id:
                 raise Refused(
                     f"{at}outcome.decision_id", f"decision {name} is UAV {whose}'s, who alone knows its outcome"
@@ -215,21 +218,31 @@ class Mission:
                 f"and AICVDS_LLM_CONTEXT is {self._context}: raise it, or lower {lower} or top_k",
             )
 
-    def find(self, decision_id: str, field: str = "decision_id") -> Literal["pending", "applied"]:
-        """Where a decision stands; raises :class:`NotFound` for one that this mission does not know."""
-        if decision_id in self._pending:
+    def find(self, outcome: Outcome, at: str = "") -> Literal["pending", "applied"]:
+        """Whether an outcome is yet to be applied, or was.
+
+        Raises:
+            NotFound: this mission does not know the decision.
+            Conflict: it was told another outcome of it before, which counts.
+        """
+        name = outcome.decision_id
+        if name in self._pending:
             return "pending"
-        if decision_id in self._applied:
-            return "applied"
-        raise NotFound(field, f"mission {self.mission_id} knows no decision {decision_id} (or no longer)")
+        if name not in self._applied:
+            raise NotFound(f"{at}decision_id", f"mission {self.mission_id} knows no decision {name} (or no longer)")
+        cost, failed = self._applied[name]
+        if (min(outcome.cost, self.most_cost), outcome.failed) != (cost, failed):
+            told = f"cost {cost:g}{', failed' if failed else ''}"
+            raise Conflict(f"{at}cost", f"of decision {name} another outcome was told before, which counts: {told}")
+        return "applied"
 
-    def observe(self, uav: UavState, step: int) -> None:
-        """Take a UAV's report: arrival rates from the beacons that are news, and all of it into the fleet's belief.
+    def observe(self, uav: UavState, step: int) -> int:
+        """Take a UAV's report: into the sensors' records, and all of it into the fleet's belief.
 
-        Between two beacons of one sensor, with no visit and no overflow between them, its queue grew by the arrivals.
+        Returns the number of this request among the UAV's at this step, for :meth:`commit`.
         """
         ids = np.asarray(uav.sensors.id)
-        seen = filled(uav.sensors.last_seen, _NEVER).astype(np.int64)
+        seen = filled(uav.sensors.last_seen, NEVER).astype(np.int64)
         queue = filled(uav.sensors.queue)
         if self.planner is not None:
             self.planner.begin(step)
@@ -237,26 +250,15 @@ class Mission:
         self.belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
         places = np.stack((uav.sensors.x, uav.sensors.y), axis=1)
         self.belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
-        news = seen > self._seen[ids]
-        undisturbed = (self._seen[ids] >= 0) & (self.visits[ids] < self._seen[ids])
-        usable = news & undisturbed & (queue < self.scenario.queue_capacity) & (queue >= self._queue[ids])
-        self._arrivals[ids[usable]] += (queue - self._queue[ids])[usable]
-        self._exposure[ids[usable]] += (seen - self._seen[ids])[usable]
-        self._seen[ids[news]] = seen[news]
-        self._queue[ids[news]] = queue[news]
+        self.records.hear(ids, seen, queue)
+        self.record(Reported(step, uav))
+        return self.turns.attempt(step, uav.uav_id)
 
     def reserved(self, step: int, uav_id: int) -> frozenset[int]:
         """Sensors that other UAVs were given this step."""
-        return frozenset(given.sensor_id for uav, given in self._given.get(step, {}).items() if uav != uav_id)
+        return self.turns.reserved(step, uav_id)
 
-    def attempt(self, step: int, uav_id: int) -> int:
-        """Number a request of a UAV at a step: when it asks again, the later answer counts."""
-        attempts = self._attempts.setdefault(step, {})
-        attempts[uav_id] = attempts.get(uav_id, 0) + 1
-        _forget_lowest(self._attempts)
-        return attempts[uav_id]
-
-    def commit(self, decision: Pending, attempt: int = 1) -> None:
+    def commit(self, decision: Pending, attempt: int = 1, counsel: Counsel | None = None) -> None:
         """Reserve the sensor, note the visit, and wait for the outcome.
 
         An earlier decision for the same UAV and step is withdrawn: its sensor is free again and was not visited.
@@ -264,23 +266,24 @@ class Mission:
         Raises:
             Conflict: a later attempt of this UAV at this step was answered already; nothing is recorded.
         """
-        given = self._given.setdefault(decision.step, {})
-        earlier = given.get(decision.uav_id)
+        earlier = self.turns.given(decision.step, decision.uav_id)
         if earlier is not None and earlier.attempt > attempt:
             raise Conflict("step", f"UAV {decision.uav_id} asked again for step {decision.step} and was answered")
         if earlier is not None:
-            self._close_visit(earlier.sensor_id, earlier.decision_id)
-        given[decision.uav_id] = Given(decision.sensor_id, decision.decision_id, attempt)
-        _forget_lowest(self._given)
-        self._open_visits.setdefault(decision.sensor_id, {})[decision.decision_id] = decision.step
-        self._update_visit(decision.sensor_id)
+            self.records.withdraw(earlier.sensor_id, earlier.decision_id)
+        given = Given(decision.sensor_id, decision.decision_id, attempt)
+        self.turns.give(decision.step, decision.uav_id, given)
+        self.records.presume(decision.sensor_id, decision.decision_id, decision.step)
         self._pending[decision.decision_id] = decision
         self.belief.tell(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
         own = [d for d in self._pending.values() if d.uav_id == decision.uav_id]
         for forgotten in own[:-_PENDING_PER_UAV]:
             del self._pending[forgotten.decision_id]
-            self._confirm_visit(forgotten)
+            self.records.confirm(forgotten.sensor_id, forgotten.decision_id, forgotten.step)
         self.decisions += 1
+        if counsel is not None:
+            self.trust_in(counsel.model).note(decision.decision_id, counsel.advice)
+        self.record(Decided(decision, attempt, counsel))
 
     def apply(self, outcome: Outcome) -> Sample | None:
         """Record the outcome of a pending decision; returns what the modules saw, to learn from.
@@ -288,32 +291,58 @@ class Mission:
         A failed transmission was no visit: the visiting record goes back to the latest visit that was one.
         """
         decision = self._pending.pop(outcome.decision_id)
-        self._applied[decision.decision_id] = None
+        self._applied[decision.decision_id] = outcome.cost, outcome.failed
         while len(self._applied) > _APPLIED_PER_UAV * self.scenario.uavs:
             self._applied.popitem(last=False)
         self.feedback += 1
         if outcome.failed:
-            self._close_visit(decision.sensor_id, decision.decision_id)
+            self.records.withdraw(decision.sensor_id, decision.decision_id)
         else:
-            self._confirm_visit(decision)
+            self.records.confirm(decision.sensor_id, decision.decision_id, decision.step)
         line = self.template.experience(decision.seen, decision.sensor_id, decision.velocity, outcome.cost)
         sample = decision.sample
         features = None if sample is None else sample.features[sample.chosen].copy()
         self.memory.remember(Experience(line, outcome.cost, features))
+        for trust in self.trust.values():
+            trust.settle(outcome.decision_id, outcome.cost)
+        self.record(Settled(outcome))
         return sample
 
-    def _confirm_visit(self, decision: Pending) -> None:
-        self._confirmed[decision.sensor_id] = max(self._confirmed[decision.sensor_id], decision.step)
-        self._close_visit(decision.sensor_id, decision.decision_id)
+    def state_dict(self) -> dict[str, Any]:
+        """All of it but the modules and their optimizer, as copies: another thread may write it down."""
+        return {
+            "decisions": self.decisions,
+            "feedback": self.feedback,
+            "pending": [decision.state_dict() for decision in self._pending.values()],
+            "applied": [[name, *told] for name, told in self._applied.items()],
+            "repeats": self.repeats.state_dict(),
+            "memory": self.memory.state_dict(),
+            "records": self.records.state_dict(),
+            "turns": self.turns.state_dict(),
+            "belief": self.belief.state_dict(),
+            "guidance": self.guidance.state_dict(),
+            "trust": {model: trust.state_dict() for model, trust in self.trust.items()},
+        }
 
-    def _close_visit(self, sensor_id: int, decision_id: str) -> None:
-        self._open_visits.get(sensor_id, {}).pop(decision_id, None)
-        self._update_visit(sensor_id)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As it was when the state was taken, but for the plan, which is made again."""
+        self.decisions, self.feedback = state["decisions"], state["feedback"]
+        self._pending = {told["decision_id"]: Pending.of(told) for told in state["pending"]}
+        self._applied = OrderedDict((name, (cost, failed)) for name, cost, failed in state["applied"])
+        self.repeats.load_state_dict(state["repeats"])
+        self.memory.load_state_dict(state["memory"])
+        self.records.load_state_dict(state["records"])
+        self.turns.load_state_dict(state["turns"])
+        self.belief.load_state_dict(state["belief"])
+        for model, trust in state["trust"].items():
+            self.trust_in(model).load_state_dict(trust)
+        self.reinstate(state["guidance"])
 
-    def _update_visit(self, sensor_id: int) -> None:
-        """TVR_j: the latest step of a visit that is confirmed, or still open and so presumed to succeed."""
-        presumed = max(self._open_visits.get(sensor_id, {}).values(), default=_NEVER)
-        self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
+    def reinstate(self, guidance: dict[str, Any]) -> None:
+        """The operator's guidance as it stood."""
+        self.guidance.load_state_dict(guidance)
+        if self.planner is not None:
+            self.planner.obey(self.guidance.obeyed)
 
     def status(self) -> MissionStatus:
         """What ``GET /missions/{id}`` says."""
@@ -326,9 +355,7 @@ class Mission:
             features=self.features,
             belief=self.decides_from,
             planner="off" if self.planner is None else "on",
-            prompt=self.spec.prompt.model_copy(
-                update={"experiences": self._experience_limit, "selection": self._selection}
-            ),
+            prompt=self.spec.prompt,
             init=self.spec.init,
             seed=self.spec.seed,
             decisions=self.decisions,
@@ -340,6 +367,34 @@ class Mission:
         )
 
 
-def _forget_lowest(by_step: dict[int, Any]) -> None:
-    while len(by_step) > _RESERVED_STEPS:
-        del by_step[min(by_step)]
+def in_full(spec: MissionSpec, settings: Settings) -> MissionSpec:
+    """A spec with the service's settings, and what follows from its mode, where it says nothing."""
+    mode = spec.mode or settings.mode
+    # The paper's method as it is written, unless asked otherwise.
+    written = mode == "llm"
+    told = spec.prompt.experiences
+    prompt = {
+        "experiences": settings.experiences if told is None else told,
+        "selection": spec.prompt.selection or settings.selection,
+    }
+    return spec.model_copy(
+        update={
+            "mode": mode,
+            "features": spec.features or ("paper" if written else "reach"),
+            "belief": spec.belief or ("reported" if written else "fleet"),
+            "top_k": spec.top_k or settings.top_k,
+            "planner": spec.planner or settings.planner,
+            "prompt": spec.prompt.model_copy(update=prompt),
+        }
+    )
+
+
+def required(value: T | None) -> T:
+    """A field that a spec in full has; raises ``TypeError`` for one that has not."""
+    if value is None:
+        raise TypeError("this spec is not in full")
+    return value
+
+
+def _forgotten(_: Event) -> None:
+    """Nothing is kept."""

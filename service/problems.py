@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 _UNION_TAGS = ("constrained-", "function-")
 
 CONTENT_TYPE = "application/problem+json"
+# When to ask again what cannot be served now.
+_RETRY_S = 1
 
 
 class Refused(Exception):
@@ -45,6 +47,12 @@ class Conflict(Refused):
     status = HTTPStatus.CONFLICT
 
 
+class Unavailable(Refused):
+    """The request is right, and will be served once the edge can; nothing was recorded for it."""
+
+    status = HTTPStatus.SERVICE_UNAVAILABLE
+
+
 def problem_response(status: int, detail: str, errors: Sequence[dict[str, str]] = ()) -> Response:
     """An ``application/problem+json`` response; never echoes what was sent."""
     body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
@@ -62,7 +70,10 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Refused)
     async def refused(_: Request, error: Refused) -> Response:
-        return problem_response(error.status, str(error), [{"field": error.field, "problem": error.detail}])
+        response = problem_response(error.status, str(error), [{"field": error.field, "problem": error.detail}])
+        if isinstance(error, Unavailable):
+            response.headers["Retry-After"] = str(_RETRY_S)
+        return response
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: Request, error: RequestValidationError) -> Response:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Depends, Request, Response
+from fastapi import APIRouter, Body, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
 from service.engine import Engine
@@ -51,64 +51,81 @@ def _engine(request: Request) -> Engine:
 
 TheEngine = Annotated[Engine, Depends(_engine)]
 MayMake = Annotated[bool, Depends(may_make_missions)]
+RequestKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        pattern=r"^[\x21-\x7e]{1,64}$",
+        description="a request that is sent again under the same key gets the same answer, after a restart too; of any "
+        "mission the newest eight a UAV are remembered",
+    ),
+]
 
 
-@router.post("/decide", responses=documented(400, 404, 409, 413, 415, 422), tags=["decisions"])
+@router.post("/decide", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])
 async def decide(
     body: Annotated[DecideRequest, Body(openapi_examples={"paper": {"value": EXAMPLE}})],
     engine: TheEngine,
     response: Response,
     may_make: MayMake,
+    key: RequestKey = None,
 ) -> DecideResponse:
     """Which sensor to collect from, and how fast to fly the next step."""
-    answer = await engine.decide(body, may_make=may_make)
+    answer = await engine.decide(body, may_make=may_make, key=key)
     response.headers["Server-Timing"] = ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())
     return answer
 
 
-@router.post("/decide/batch", responses=documented(400, 404, 409, 413, 415, 422), tags=["decisions"])
-async def decide_batch(body: BatchRequest, engine: TheEngine, may_make: MayMake) -> BatchResponse:
+@router.post("/decide/batch", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])
+async def decide_batch(
+    body: BatchRequest, engine: TheEngine, may_make: MayMake, key: RequestKey = None
+) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
-    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make))
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make, key=key))
 
 
-@router.post("/feedback", responses=documented(400, 404, 413, 415, 422), tags=["decisions"])
+@router.post("/feedback", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])
 async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
-    """What came of a decision. Sent twice, it is applied once."""
-    return engine.feedback(body)
+    """What came of a decision. Sent twice, it is applied once; acknowledged, it is on disk."""
+    return await engine.feedback(body)
 
 
-@router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422), tags=["missions"])
+@router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422, 503), tags=["missions"])
 async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
     """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
-    mission = engine.missions.put(mission_id, body)
+    mission = await engine.missions.put(mission_id, body)
     engine.compiler.compile(mission)
+    await engine.kept("mission_id")
     return mission.status()
 
 
-@router.get("/missions/{mission_id}", responses=documented(404, 422), tags=["missions"])
+@router.get("/missions/{mission_id}", responses=documented(404, 409, 422, 503), tags=["missions"])
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
     """Where a mission stands."""
-    return engine.missions.get(mission_id).status()
+    return (await engine.missions.get(mission_id)).status()
 
 
-@router.delete("/missions/{mission_id}", status_code=204, responses=documented(404, 422), tags=["missions"])
+@router.delete("/missions/{mission_id}", status_code=204, responses=documented(404, 409, 422, 503), tags=["missions"])
 async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     """Forget a mission and what it learned."""
-    engine.missions.delete(mission_id)
+    await engine.missions.delete(mission_id)
+    await engine.kept("mission_id")
 
 
-@router.get("/missions/{mission_id}/guidance", responses=documented(404, 422), tags=["missions"])
+@router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
     """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
-    return engine.missions.get(mission_id).guidance.told(mission_id)
+    return (await engine.missions.get(mission_id)).guidance.told(mission_id)
 
 
-@router.post("/missions/{mission_id}/guidance", responses=documented(400, 404, 409, 413, 415, 422), tags=["missions"])
+@router.post(
+    "/missions/{mission_id}/guidance", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["missions"]
+)
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
     """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
-    mission = engine.missions.get(mission_id)
+    mission = await engine.missions.get(mission_id)
     mission.obey(body)
+    await engine.kept("answer")
     return mission.guidance.told(mission_id)
 
 

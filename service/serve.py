@@ -80,14 +80,17 @@ def _serve(listener: socket.socket, host: str) -> int:
 
     from service.app import create_app
     from service.keys import BadKeys
+    from service.store import Store, StoreUnusable
 
     logging.basicConfig(level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     # httpx logs every request at level info, address included.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     try:
-        app = create_app(settings)
+        app = create_app(settings, None if settings.store == "none" else Store(settings.store))
     except BadKeys as error:
         return _refused(f"AICVDS_KEYS: {error}")
+    except StoreUnusable as error:
+        return _refused(f"AICVDS_STORE: {error}. Give another, or `none` to keep nothing")
     config = uvicorn.Config(
         app,
         log_level=settings.log_level,

@@ -40,6 +40,11 @@ def _default_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
 
 
+def _default_store() -> str:
+    home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return str(home / "aicvds" / "missions.db")
+
+
 def usable_cores(cpu_max: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
     """Cores that this process may use: in a container fewer than the machine has, by affinity or by quota.
 
@@ -114,7 +119,9 @@ class Settings(BaseSettings):
     anonymous: Literal["on", "off"] = "off"
     # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take 0.4 to 0.8 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
-    # Missions held in memory at once; one more is refused until another is deleted.
+    # Where missions outlive the process: a SQLite file, or postgresql://user:password@host/database. `none`: nowhere.
+    store: str = Field(default_factory=_default_store, min_length=1, repr=False)
+    # Missions held at once, in memory or in the store; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
     # Where the model file and the token vocabulary live.
     cache_dir: Path = Field(default_factory=_default_cache)

@@ -11,7 +11,10 @@ from pathlib import Path
 
 import tiktoken
 
+from service.llm.client import Completion
+from service.prompt import Prompt
 from service.settings import Settings
+from shared.wire import Tokens
 
 ENCODING = "o200k_base"
 # The name under which tiktoken caches the vocabulary (the SHA-1 of its address), and what it must hold.
@@ -56,6 +59,37 @@ class TokenCounter:
     def count(self, text: str) -> int:
         """Tokens of a text; special tokens are counted as plain text."""
         return len(self._encoding.encode_ordinary(text))
+
+    def account(self, prompt: Prompt) -> Tokens:
+        """How long a prompt is, block by block, and how long it would be with nothing pruned."""
+        static = self.count_repeated(prompt.static)
+        experiences = sum(self.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
+        state = self.count(prompt.state)
+        state_uncompressed = self.count(prompt.state_uncompressed)
+        return Tokens(
+            tokenizer=self.name,
+            static=static,
+            experiences=experiences,
+            state=state,
+            state_uncompressed=state_uncompressed,
+            prompt=static + experiences + state,
+            uncompressed=static + experiences + state_uncompressed,
+            saved=state_uncompressed - state,
+        )
+
+
+def with_usage(tokens: Tokens, completion: Completion | None, settings: Settings) -> Tokens:
+    """The account with what the server said of one call, and its price."""
+    if completion is None or completion.prompt_tokens is None:
+        return tokens
+    cached = completion.cached_tokens or 0
+    usage = {
+        "server_prompt": completion.prompt_tokens,
+        "cached": completion.cached_tokens,
+        "completion": completion.completion_tokens,
+        "cost_usd": price_usd(settings, completion.prompt_tokens, cached, completion.completion_tokens or 0),
+    }
+    return tokens.model_copy(update=usage)
 
 
 def price_usd(settings: Settings, prompt: int, cached: int, completion: int) -> float:

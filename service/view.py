@@ -12,9 +12,10 @@ from torch import Tensor
 
 from service.asked import Asked
 from service.attention import top_k
+from service.events import Pending
 from service.features import State, augment
 from service.learner import Sample
-from service.mission import Mission, Pending
+from service.mission import Mission
 from service.rows import cells
 from shared.wire import Candidate, UavState
 

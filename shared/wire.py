@@ -218,6 +218,11 @@ class DecideResponse(Wire):
     tokens: Tokens
     deadline_ms: int = Field(description="what this decision was given")
     latency_ms: dict[str, float] = Field(description="by stage, and total")
+    stored: bool = Field(
+        True,
+        description="whether the decision, and the outcome that came with the request, are on disk: if not, send the "
+        "outcome again by `/feedback`. Always so where the edge was told to keep nothing",
+    )
 
 
 class BatchResponse(Wire):

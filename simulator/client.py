@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import time
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -192,7 +193,8 @@ class EdgeClient:
         """Ask for one decision, and time it; ``attempts`` overrides the client's."""
         body = request.model_dump_json().encode()
         began = time.perf_counter()
-        answer, tried = self._exchange("POST", "/decide", body, attempts)
+        # What is sent again, because its answer was lost on the way, gets that answer.
+        answer, tried = self._exchange("POST", "/decide", body, attempts, {"Idempotency-Key": uuid.uuid4().hex})
         rtt_ms = (time.perf_counter() - began) * 1000
         response = self._parse(DecideResponse, answer, "/decide")
         if response.sensor_id not in request.sensors.id:
@@ -207,13 +209,18 @@ class EdgeClient:
         return self._parse(FeedbackResponse, answer, "/feedback")
 
     def _exchange(
-        self, method: str, path: str, body: BaseModel | bytes, attempts: int | None = None
+        self,
+        method: str,
+        path: str,
+        body: BaseModel | bytes,
+        attempts: int | None = None,
+        headers: dict[str, str] | None = None,
     ) -> tuple[httpx.Response, int]:
         content = body if isinstance(body, bytes) else body.model_dump_json().encode()
         most = attempts or self._attempts
         for attempt in range(1, most + 1):
             try:
-                return self._once(method, path, content), attempt
+                return self._once(method, path, content, headers), attempt
             except _TryAgain as again:
                 if attempt == most:
                     tries = "once" if attempt == 1 else f"{attempt} times"
@@ -221,9 +228,11 @@ class EdgeClient:
                 time.sleep(self._pause(attempt, again.retry_after_s))
         raise AssertionError("unreachable: attempts is at least 1")
 
-    def _once(self, method: str, path: str, content: bytes | None = None) -> httpx.Response:
+    def _once(
+        self, method: str, path: str, content: bytes | None = None, headers: dict[str, str] | None = None
+    ) -> httpx.Response:
         try:
-            answer = self._http.request(method, self.base_url + path, content=content)
+            answer = self._http.request(method, self.base_url + path, content=content, headers=headers)
         except httpx.TransportError as error:
             raise _TryAgain(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__) from error
         except httpx.DecodingError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import socket
 import subprocess
@@ -89,7 +90,9 @@ def demo(options: Demo, command: str, console: Console) -> int:
         wait_s=options.wait_s,
     )
     log = options.out / EDGE_LOG
-    with edge_process(port, log) as process:
+    # Not the store of an edge that may run here already.
+    environment = {**os.environ, "AICVDS_STORE": str(options.out.resolve() / "missions.db")}
+    with edge_process(port, log, environment) as process:
         console.print(
             f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
         )

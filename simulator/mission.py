@@ -102,6 +102,8 @@ class EdgePilot:
         self._deadline_ms = deadline_ms
         self._max_velocity = scenario.max_velocity
         self._owed: dict[int, Outcome] = {}
+        # Told to an edge that could not put them on disk.
+        self._unsure: list[Outcome] = []
         self._lost = False
         self._fallback: Policy = policy_named(FALLBACK)
         self._fallback.reset(scenario, seed)
@@ -126,6 +128,8 @@ class EdgePilot:
             sensor, velocity = self._fallback.decide(uav, observation, taken)
             return Choice(int(sensor), int(velocity), "onboard", _reason(error))
         self._owed.pop(uav, None)
+        if request.outcome is not None and not exchange.response.stored:
+            self._unsure.append(request.outcome)
         self.answered += 1
         answer = exchange.response
         return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
@@ -169,15 +173,16 @@ class EdgePilot:
 
     def land(self) -> None:
         """Send the outcomes that no later request carried, as far as the edge still listens."""
-        for uav in sorted(self._owed):
+        for outcome in (*self._unsure, *self._owed.values()):
             try:
-                self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **self._owed[uav].model_dump()))
+                self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
             except EdgeUnreachable as error:
                 self.last_error = str(error)
                 break
             except EdgeError as error:
                 self.last_error = str(error)
         self._owed.clear()
+        self._unsure.clear()
 
 
 def _reason(error: EdgeError) -> str:

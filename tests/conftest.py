@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -11,18 +14,24 @@ import pytest
 
 from service.app import create_app
 from service.settings import Settings
+from service.store import Store
 from tests.running import serving
+
+# Edges that are started as processes keep nothing, unless a test says so: they would share the user's store.
+os.environ["AICVDS_STORE"] = "none"
 
 Edge = Callable[..., httpx.Client]
 
 
 @pytest.fixture
-def edge() -> Iterator[Edge]:
-    """Starts a real edge with the settings given (no LLM unless told) and returns a client of it."""
+def edge(tmp_path: Path) -> Iterator[Edge]:
+    """Starts real edges with stores and the settings given (no LLM unless told), and returns a client of each."""
+    count = itertools.count()
     with ExitStack() as stack:
 
         def start(**settings: Any) -> httpx.Client:
-            url = stack.enter_context(serving(create_app(Settings(**{"mode": "value", **settings}))))
+            store = Store(str(tmp_path / f"missions-{next(count)}.db"))
+            url = stack.enter_context(serving(create_app(Settings(**{"mode": "value", **settings}), store)))
             return stack.enter_context(httpx.Client(base_url=url, timeout=30))
 
         yield start

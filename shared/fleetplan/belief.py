@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +16,8 @@ from shared.trajectory import Trajectory, progress_of, trajectories
 IntArray = NDArray[np.int64]
 # Out of reach of everything.
 FAR_M = 1e9
+# The arrays that make a belief.
+_KEPT = ("arrived", "watched", "base", "since", "heard", "battery", "places", "visited")
 
 
 @dataclass(slots=True)
@@ -129,6 +132,21 @@ class FleetBelief:
         self.base[sensor] = max(0.0, self.queue(step)[sensor] - packets)
         self.since[sensor] = step
         self.visited[sensor] = max(int(self.visited[sensor]), step)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that is believed, as copies."""
+        arrays = {name: getattr(self, name).copy() for name in _KEPT}
+        uavs = {uav: [u.step, list(u.position), u.progress_m, u.told] for uav, u in self.uavs.items()}
+        return {**arrays, "uavs": uavs}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As it was when the state was taken."""
+        for name in _KEPT:
+            setattr(self, name, state[name])
+        self.uavs = {
+            uav: Whereabouts(step, (x, y), progress_m, None if told is None else (told[0], told[1]))
+            for uav, (step, (x, y), progress_m, told) in state["uavs"].items()
+        }
 
     def queue(self, step: int) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``."""

@@ -97,8 +97,8 @@ def edge_for(backing: Backing, llm: Llm, log: Path, console: Console) -> Iterato
 def environment_for(backing: Backing, llm: Llm) -> Iterator[Mapping[str, str]]:
     """The settings of an edge with that behind it, and of this process's only what cannot change a decision."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("AICVDS_") or k in _INHERITED}
-    # A mission a flight, and a full run has thousands of flights.
-    kept |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning"}
+    # A mission a flight, and a full run has thousands of flights, none of which is gone back to.
+    kept |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning", "AICVDS_STORE": "none"}
     if backing == OFF:
         yield kept | {"AICVDS_MODE": "value"}
     elif backing in (CHANCE, WORST):

@@ -53,7 +53,10 @@ def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
 def test_every_setting_and_its_default_is_in_the_table() -> None:
     listed = dict(re.findall(r"^\| `(AICVDS_\w+)` \| ([^|]*?) ?\|", README, re.MULTILINE))
     assert listed.keys() == {f"AICVDS_{name.upper()}" for name in Settings.model_fields}
-    defaults = Settings().model_dump(mode="json") | {"cache_dir": "~/.cache/aicvds"}
+    defaults = Settings().model_dump(mode="json") | {
+        "cache_dir": "~/.cache/aicvds",
+        "store": "~/.local/state/aicvds/missions.db",
+    }
     for name, shown in listed.items():
         default = defaults[name.removeprefix("AICVDS_").lower()]
         if isinstance(default, int | float):

@@ -14,13 +14,14 @@ from fastapi.responses import Response
 
 from service.candidates import GuidedTemplate, velocities
 from service.critic import Judgement, Situation, judge
-from service.guided import LLM, Deliberation, trust_of
+from service.guided import Deliberation
 from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.client import Completion, Place
 from service.mission import Mission
 from service.reach import Reach
 from service.settings import Settings
+from service.trust import LLM
 from service.view import View
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
@@ -209,7 +210,7 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
     place = made.offer.actions.index(plan)
     losses = np.zeros(len(made.offer.actions))
     losses[place] = lost
-    verdict = made.conclude(trust_of(mission, "stub"), Judgement(losses, losses), None, calibrated=False)
+    verdict = made.conclude(mission.trust_in("stub"), Judgement(losses, losses), None, calibrated=False)
     assert verdict is not None
     assert (verdict.action == plan) == flown
 
@@ -217,7 +218,7 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
 @pytest.mark.parametrize("answer", ["worst", "random"])
 def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
     mission = guided(planner="on")
-    trust, random = trust_of(mission, "stub"), np.random.default_rng(0)
+    trust, random = mission.trust_in("stub"), np.random.default_rng(0)
     for step in range(6):
         view, _ = deliberation(mission, step)
         plan = planned(mission, view)
@@ -234,7 +235,7 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
 
 def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
     mission = guided(planner="off")
-    trust = trust_of(mission, "stub")
+    trust = mission.trust_in("stub")
     for step in range(15):
         view, made = deliberation(mission, step)
         judgement = made.judge()
@@ -266,7 +267,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     worst = max(made.offer.labels, key=lambda name: judgement.lost[made.offer.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
     told = made.offer.spread({name: float(name == worst) for name in made.offer.labels})
-    verdict = made.conclude(trust_of(mission, "stub"), judgement, told, calibrated=False)
+    verdict = made.conclude(mission.trust_in("stub"), judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.offer.actions[made.offer.labels[worst]]
 
@@ -274,7 +275,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
 def test_what_others_got_meanwhile_is_not_flown() -> None:
     mission = guided()
     view, made = deliberation(mission)
-    trust, judgement = trust_of(mission, "stub"), made.judge()
+    trust, judgement = mission.trust_in("stub"), made.judge()
     first = made.conclude(trust, judgement, None, calibrated=False)
     assert first is not None
     second = made.conclude(trust, judgement, None, calibrated=False, gone={first.action[0]})

@@ -65,10 +65,10 @@ def test_pending_decisions_are_bounded_and_the_forgotten_are_unknown() -> None:
     m = mission()
     ids = [decide(m, number, step=number) for number in range(1, 40)]
     with pytest.raises(NotFound):
-        m.find(ids[0])
-    assert m.find(ids[-1]) == "pending"
+        m.find(outcome(ids[0]))
+    assert m.find(outcome(ids[-1])) == "pending"
     assert m.apply(outcome(ids[-1])) is not None
-    assert m.find(ids[-1]) == "applied"
+    assert m.find(outcome(ids[-1])) == "applied"
 
 
 def test_a_failure_takes_back_only_its_own_visit() -> None:
@@ -101,16 +101,16 @@ def test_a_fleet_whose_uavs_are_steps_apart_still_shares_its_sensors() -> None:
 def test_reservations_are_bounded() -> None:
     m = mission()
     for step in [1_000_000, *range(500)]:
-        m.attempt(step, 0)
+        m.turns.attempt(step, 0)
         decide(m, step + 1, step=step)
     assert m.reserved(0, uav_id=1) == frozenset()
     assert m.reserved(499, uav_id=1) == {1}
-    assert len(m._given) == len(m._attempts) == 64
+    assert len(m.turns._given) == len(m.turns._attempts) == 64
 
 
 def test_an_answer_to_an_earlier_attempt_does_not_undo_a_later_one() -> None:
     m = mission()
-    slow, fast = m.attempt(1, 0), m.attempt(1, 0)
+    slow, fast = m.turns.attempt(1, 0), m.turns.attempt(1, 0)
     view = attended(m, uav(step=1), 1)
     m.commit(view.pending(m, "a" * 32, 4, 7), fast)
     with pytest.raises(Conflict):
@@ -149,4 +149,4 @@ def test_one_uav_that_retries_forgets_only_its_own_decisions() -> None:
     other = decide(m, 1, uav_id=1, sensor=2)
     for number in range(2, 60):
         decide(m, number, step=number, uav_id=0)
-    assert m.find(other) == "pending"
+    assert m.find(outcome(other)) == "pending"

@@ -1,0 +1,239 @@
+"""The journal: what changes missions is on disk before it is acknowledged, many changes to a commit.
+
+One thread writes. While it commits, what comes meanwhile gathers for the next commit, so that under load a commit, and
+its fsync, serves many answers. Where the store fails, nothing that waits is lost: it is tried again, and meanwhile
+decisions go on while what must be on disk is refused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections import deque
+from typing import Any, Protocol
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.events import Event, Reported
+from service.metrics import Metrics
+from service.mission import Mission
+from service.store import Checkpoint, Deleted, Entry, Item, Made, Store
+
+log = logging.getLogger(__name__)
+
+# A mission is checkpointed after so many events, so that it is read back in a fraction of a second. Each event of a
+# large network counts for one more a thousand sensors.
+_EVENTS = 256
+_SENSORS = 1000
+_MOST_AT_ONCE = 1000
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
+
+
+class Track:
+    """One mission's place in the journal: ``seq`` is its newest event's."""
+
+    def __init__(self, mission_id: str, seq: int) -> None:
+        self.mission_id = mission_id
+        self.seq = seq
+        self.since = 0
+        self.over = False
+
+
+class Keeper(Protocol):
+    """What missions are kept by."""
+
+    @property
+    def failing(self) -> bool:
+        """Whether the last attempt to write failed."""
+        ...
+
+    def begin(self, mission: Mission) -> None:
+        """A mission is made, and its events are heard from now on."""
+        ...
+
+    def end(self, mission_id: str) -> None:
+        """A mission is deleted."""
+        ...
+
+    async def stored(self, within_s: float) -> bool:
+        """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
+        ...
+
+
+class Unkept:
+    """Keeps nothing: missions live as long as the process."""
+
+    failing = False
+
+    def begin(self, mission: Mission) -> None:
+        """Nothing is kept."""
+
+    def end(self, mission_id: str) -> None:
+        """Nothing was kept."""
+
+    async def stored(self, within_s: float) -> bool:
+        """Nobody waits for what nobody keeps."""
+        return True
+
+    def close(self, within_s: float) -> bool:
+        """There is nothing to write."""
+        return True
+
+
+class Journal:
+    """Writes to a store. Called from the event loop, but for :meth:`checkpoint`, which any thread may call."""
+
+    def __init__(self, store: Store, metrics: Metrics) -> None:
+        self._store = store
+        self._metrics = metrics
+        self._loop = asyncio.get_running_loop()
+        self._tracks: dict[str, Track] = {}
+        self._queue: deque[tuple[int, Item]] = deque()
+        self._changed = threading.Condition()
+        self._added = self._written = 0
+        self._failing = self._closing = False
+        self._waiting: list[tuple[int, asyncio.Future[bool]]] = []
+        self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
+        self._thread.start()
+
+    @property
+    def failing(self) -> bool:
+        """Whether the last attempt to write failed."""
+        return self._failing
+
+    def begin(self, mission: Mission) -> None:
+        """A mission is made, and its events are heard from now on."""
+        self._add(Made(mission.mission_id, mission.asked_for, mission.spec))
+        self.follow(mission, 0)
+
+    def follow(self, mission: Mission, seq: int) -> None:
+        """Hear a mission's events, of which so many are in the store."""
+        track = self._tracks[mission.mission_id] = Track(mission.mission_id, seq)
+
+        def record(event: Event) -> None:
+            track.seq += 1
+            track.since += 1 + (len(event.uav.sensors.id) // _SENSORS if isinstance(event, Reported) else 0)
+            self._add(Entry(track.mission_id, track.seq, event))
+
+        mission.record = record
+
+    def end(self, mission_id: str) -> None:
+        """A mission is deleted."""
+        if (track := self._tracks.pop(mission_id, None)) is not None:
+            track.over = True
+        self._add(Deleted(mission_id))
+
+    def due(self, mission: Mission, least: int = _EVENTS) -> Track | None:
+        """The mission's track, where it has so many events since its last checkpoint; they are counted anew then."""
+        track = self._tracks.get(mission.mission_id)
+        if track is None or track.since < least:
+            return None
+        track.since = 0
+        return track
+
+    def checkpoint(self, track: Track, seq: int, state: dict[str, Any]) -> None:
+        """Keep a mission's state after event ``seq`` in place of the events until then."""
+        with self._changed:
+            if track.over:
+                return
+            made, self._queue = self._queue, deque()
+            # While the store fails, events would gather without end; the checkpoint stands for them.
+            self._queue.extend(entry for entry in made if not _covered(entry[1], track.mission_id, seq))
+        self._add(Checkpoint(track.mission_id, seq, state))
+
+    async def stored(self, within_s: float) -> bool:
+        """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
+        if self._written >= self._added:
+            return True
+        if self._failing:
+            return False
+        mine = self._added, self._loop.create_future()
+        self._waiting.append(mine)
+        try:
+            async with asyncio.timeout(max(0.0, within_s)):
+                return bool(await mine[1])
+        except TimeoutError:
+            return False
+        finally:
+            if mine in self._waiting:
+                self._waiting.remove(mine)
+
+    def close(self, within_s: float) -> bool:
+        """Write what waits, once more; returns whether all is written."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(within_s)
+        return not self._queue
+
+    def _add(self, item: Item) -> None:
+        with self._changed:
+            self._added += 1
+            self._queue.append((self._added, item))
+            self._changed.notify()
+
+    def _write(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._queue or self._closing)
+                if not self._queue:
+                    return
+                batch = [self._queue[i] for i in range(min(len(self._queue), _MOST_AT_ONCE))]
+            begun = time.perf_counter()
+            try:
+                self._store.write([item for _, item in batch])
+            except (SQLAlchemyError, TypeError, ValueError) as error:
+                self._fail(error)
+                with self._changed:
+                    if self._closing or self._changed.wait_for(lambda: self._closing, timeout=pause_s):
+                        # Once more: the last attempt.
+                        self._give_up()
+                        return
+                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+                continue
+            pause_s = _FIRST_PAUSE_S
+            self._metrics.store_seconds.observe(time.perf_counter() - begun)
+            self._done(batch)
+
+    def _done(self, batch: list[tuple[int, Item]]) -> None:
+        last = batch[-1][0]
+        with self._changed:
+            while self._queue and self._queue[0][0] <= last:
+                self._queue.popleft()
+        if self._failing:
+            log.warning("the store works again")
+        self._failing = False
+        self._written = max(self._written, last)
+        self._tell()
+
+    def _fail(self, error: Exception) -> None:
+        self._metrics.store_failures.inc()
+        if not self._failing:
+            log.error("the store fails, what waits is tried again: %s", str(error).splitlines()[0])
+        self._failing = True
+        self._tell()
+
+    def _give_up(self) -> None:
+        try:
+            self._store.write([item for _, item in self._queue])
+            self._queue.clear()
+        except (SQLAlchemyError, TypeError, ValueError):
+            log.error(
+                "the store failed to the end: %d changes are not on disk, none of them acknowledged", len(self._queue)
+            )
+
+    def _tell(self) -> None:
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._settle)
+
+    def _settle(self) -> None:
+        for ticket, waiting in self._waiting:
+            if not waiting.done() and (ticket <= self._written or self._failing):
+                waiting.set_result(ticket <= self._written)
+
+
+def _covered(item: Item, mission_id: str, seq: int) -> bool:
+    return isinstance(item, Entry | Checkpoint) and item.mission_id == mission_id and item.seq <= seq

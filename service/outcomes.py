@@ -1,0 +1,76 @@
+"""What came of decisions: recorded once, learned from beside the decisions, and checkpointed with what was learned."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Literal
+
+from service.journal import Journal, Keeper
+from service.learner import Sample
+from service.metrics import Metrics
+from service.mission import Mission
+from shared.wire import Outcome
+
+log = logging.getLogger(__name__)
+
+# Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
+_MAX_LESSONS = 256
+
+
+class Outcomes:
+    """One thread learns, in the order that the outcomes came, for every mission of a service."""
+
+    def __init__(self, metrics: Metrics, keeper: Keeper) -> None:
+        self._metrics = metrics
+        self._keeper = keeper
+        self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        self._room = threading.Semaphore(_MAX_LESSONS)
+
+    def apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
+        """Record an outcome, unless it is recorded already; raises as :meth:`Mission.find`."""
+        result: Literal["applied", "duplicate"] = "duplicate"
+        if mission.find(outcome) == "pending":
+            result = "applied"
+            if outcome.cost > mission.most_cost:
+                # Forged or mistaken: as the worst that can be, it spoils neither the modules nor the prompt.
+                self._metrics.costs_clipped.inc()
+                outcome = outcome.model_copy(update={"cost": mission.most_cost})
+            sample = mission.apply(outcome)
+            if sample is not None and self._room.acquire(blocking=False):
+                self._learning.submit(self._learn, mission, sample, outcome.cost)
+            elif sample is not None:
+                log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
+        self._metrics.feedback.labels(result).inc()
+        return result
+
+    def checkpoint(self, mission: Mission, least: int | None = None) -> Future[None] | None:
+        """Begin to keep the mission's whole state, once what happened until now is learned; None where none is due.
+
+        Args:
+            least: events since the last checkpoint that make one due; the journal's own number unless given.
+        """
+        if not isinstance(self._keeper, Journal):
+            return None
+        track = self._keeper.due(mission) if least is None else self._keeper.due(mission, least)
+        if track is None:
+            return None
+        keeper, seq, state = self._keeper, track.seq, mission.state_dict()
+        return self._learning.submit(
+            lambda: keeper.checkpoint(track, seq, {**state, "learner": mission.learner.state_dict()})
+        )
+
+    def close(self, missions: list[Mission], within_s: float) -> None:
+        """Checkpoint every mission after the lessons in hand, as far as there is time; the journal has the rest."""
+        begun = [taken for mission in missions if (taken := self.checkpoint(mission, 1)) is not None]
+        wait(begun, timeout=within_s)
+        self._learning.shutdown(wait=True, cancel_futures=True)
+
+    def _learn(self, mission: Mission, sample: Sample, cost: float) -> None:
+        try:
+            self._metrics.learner_loss.set(mission.learner.update(sample, cost))
+        except Exception:
+            log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
+        finally:
+            self._room.release()

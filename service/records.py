@@ -1,0 +1,94 @@
+"""What a fleet's visits and beacons say of each sensor: its visiting record and its arrival rate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import FloatArray
+from shared.scenario import Scenario
+
+# Weight, in steps, of the scenario's mean arrival rate against what is observed.
+_PRIOR_STEPS = 2.0
+NEVER = -1
+
+
+class Records:
+    """By sensor.
+
+    Attributes:
+        visits: TVR_j, shape ``(J,)``: the latest step of a visit that is confirmed, or still open and so presumed to
+            succeed; -1 for none.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        count = scenario.sensors
+        self._capacity = scenario.queue_capacity
+        self.visits: NDArray[np.int64] = np.full(count, NEVER, dtype=np.int64)
+        self._confirmed = np.full(count, NEVER, dtype=np.int64)
+        self._open: dict[int, dict[str, int]] = {}
+        self._seen = np.full(count, NEVER, dtype=np.int64)
+        self._queue = np.zeros(count)
+        self._arrivals = np.full(count, scenario.mean_arrival_rate * _PRIOR_STEPS)
+        self._exposure = np.full(count, _PRIOR_STEPS)
+
+    @property
+    def rates(self) -> FloatArray:
+        """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
+        rates: FloatArray = self._arrivals / self._exposure
+        return rates
+
+    def hear(self, ids: NDArray[np.int64], seen: NDArray[np.int64], queue: FloatArray) -> None:
+        """Take beacons that are news, ``(n,)`` each.
+
+        Between two beacons of one sensor, with no visit and no overflow between them, its queue grew by the arrivals.
+        """
+        news = seen > self._seen[ids]
+        undisturbed = (self._seen[ids] >= 0) & (self.visits[ids] < self._seen[ids])
+        usable = news & undisturbed & (queue < self._capacity) & (queue >= self._queue[ids])
+        self._arrivals[ids[usable]] += (queue - self._queue[ids])[usable]
+        self._exposure[ids[usable]] += (seen - self._seen[ids])[usable]
+        self._seen[ids[news]] = seen[news]
+        self._queue[ids[news]] = queue[news]
+
+    def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
+        """A UAV was sent: a visit, until its outcome says otherwise."""
+        self._open.setdefault(sensor_id, {})[decision_id] = step
+        self._update(sensor_id)
+
+    def confirm(self, sensor_id: int, decision_id: str, step: int) -> None:
+        """The visit succeeded, or nobody will ever say."""
+        self._confirmed[sensor_id] = max(self._confirmed[sensor_id], step)
+        self.withdraw(sensor_id, decision_id)
+
+    def withdraw(self, sensor_id: int, decision_id: str) -> None:
+        """It was no visit: the record goes back to the latest that was one."""
+        waiting = self._open.get(sensor_id, {})
+        waiting.pop(decision_id, None)
+        if not waiting:
+            self._open.pop(sensor_id, None)
+        self._update(sensor_id)
+
+    def _update(self, sensor_id: int) -> None:
+        presumed = max(self._open.get(sensor_id, {}).values(), default=NEVER)
+        self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All of it, as copies."""
+        return {
+            "visits": self.visits.copy(),
+            "confirmed": self._confirmed.copy(),
+            "open": {sensor: dict(waiting) for sensor, waiting in self._open.items()},
+            "seen": self._seen.copy(),
+            "queue": self._queue.copy(),
+            "arrivals": self._arrivals.copy(),
+            "exposure": self._exposure.copy(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """As they were when the state was taken."""
+        self.visits, self._confirmed, self._open = state["visits"], state["confirmed"], state["open"]
+        self._seen, self._queue = state["seen"], state["queue"]
+        self._arrivals, self._exposure = state["arrivals"], state["exposure"]

@@ -1,0 +1,43 @@
+"""Reading a mission back: its last checkpoint, and the events since played again on it."""
+
+from __future__ import annotations
+
+from service.events import Decided, Event, Guided, Reported, Settled
+from service.mission import Mission
+from service.repeats import Answered
+from service.settings import Settings
+from service.store import Kept
+
+
+def revived(mission_id: str, kept: Kept, settings: Settings) -> Mission:
+    """The mission as it was after the last event kept, but for its plan, which is made again.
+
+    Raises:
+        ValueError: what is kept does not fit together.
+    """
+    mission = Mission(mission_id, kept.asked_for, settings, kept.spec)
+    try:
+        if kept.state is not None:
+            mission.load_state_dict(kept.state)
+            mission.learner.load_state_dict(kept.state["learner"])
+        for event in kept.events:
+            _play(mission, event)
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError) as error:
+        raise ValueError(f"mission {mission_id} cannot be read back: {error!r}") from error
+    return mission
+
+
+def _play(mission: Mission, event: Event) -> None:
+    match event:
+        case Reported(step, uav):
+            mission.observe(uav, step)
+        case Decided(decision, attempt, counsel):
+            mission.commit(decision, attempt, counsel)
+        case Settled(outcome):
+            sample = mission.apply(outcome)
+            if sample is not None:
+                mission.learner.update(sample, outcome.cost)
+        case Guided(state):
+            mission.reinstate(state)
+        case Answered():
+            mission.repeats.remember(event)

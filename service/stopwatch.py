@@ -1,0 +1,25 @@
+"""How long the stages of a decision take."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Milliseconds by stage since the request came in."""
+
+    started: float = field(default_factory=time.perf_counter)
+    stages: dict[str, float] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
+
+    def lap(self, stage: str) -> None:
+        """End a stage, or one more part of it."""
+        now = time.perf_counter()
+        self.stages[stage] = round(self.stages.get(stage, 0.0) + (now - self._last) * 1e3, 3)
+        self._last = now
+
+    def total(self) -> dict[str, float]:
+        """The stages and their total."""
+        return {**self.stages, "total": round((time.perf_counter() - self.started) * 1e3, 3)}
