@@ -17,7 +17,7 @@ from service.engine import Engine
 from service.guard import CarefulHeaders, Guard
 from service.keys import Keys
 from service.learner import rehearse
-from service.limits import BodyLimit
+from service.limits import BodyLimit, Crowd
 from service.llm.upstream import Upstream
 from service.metrics import Metrics
 from service.routes import router
@@ -74,6 +74,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     )
     app.include_router(router)
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
+    app.add_middleware(Crowd, most=settings.max_requests)
     if settings.keys is not None:
         app.add_middleware(Guard, keys=Keys(settings.keys))
     app.add_middleware(CarefulHeaders)

@@ -6,8 +6,9 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Awaitable, Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -62,10 +63,11 @@ class Word:
 
 
 class Asking:
-    """Asks one LLM for every mission of a service."""
+    """Asks one LLM for every mission of a service, ``most`` decisions at once."""
 
-    def __init__(self, upstream: Upstream, metrics: Metrics) -> None:
+    def __init__(self, upstream: Upstream, metrics: Metrics, most: int) -> None:
         self._upstream = upstream
+        self._most = most
         self._metrics = metrics
         self._labels = LabelReader(upstream)
         self._late = 0
@@ -152,7 +154,10 @@ class Asking:
     def _knows(self, static: str, lists: Sequence[Sequence[str]]) -> bool:
         return self._labels.bias(static, len(lists)) is not None and self._upstream.logprobs
 
-    async def _within(self, asked: Awaitable[Completion], deadline: float) -> Completion:
+    async def _within(self, asked: Coroutine[Any, Any, Completion], deadline: float) -> Completion:
+        if len(self._waiting) >= self._most:
+            asked.close()
+            raise NoDecision("llm_busy", f"{self._most} decisions wait for it already")
         limit = asyncio.timeout(min(deadline - time.perf_counter(), _HURRY_S if self._closing else math.inf))
         try:
             async with limit:

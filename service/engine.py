@@ -32,6 +32,7 @@ from service.stopwatch import Stopwatch
 from service.store import Store
 from service.tokens import TokenCounter, with_usage
 from service.trust import LLM, Advice
+from service.verifier import verify
 from service.view import View
 from shared.wire import (
     BatchRequest,
@@ -111,7 +112,7 @@ class Engine:
     ) -> None:
         self._settings = settings
         self._upstream = upstream
-        self.asking = Asking(upstream, metrics)
+        self.asking = Asking(upstream, metrics, settings.llm_concurrency)
         self.compiler = Compiler(upstream)
         self._counter = counter
         self._metrics = metrics
@@ -336,9 +337,7 @@ class Engine:
                 sensor, velocity = check_answer(completion.text, view.offered, mission.scenario.max_velocity + 1)
                 if not mission.guidance.obeyed.allows(velocity):
                     raise NoDecision("answer_velocity", f"the operator forbids {velocity} m/s")
-            # Others may have been answered while this one waited.
-            if sensor in mission.reserved(view.step, view.uav_id):
-                raise NoDecision("answer_reserved", f"sensor {sensor} was given away meanwhile")
+                verify(mission, view, sensor, velocity)
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             await _until(turn.plan, turn.deadline)

@@ -1,4 +1,4 @@
-"""The door: bodies are bounded before and after decompression, so that no request can fill the memory."""
+"""The door: requests are bounded in number, and bodies in size before and after they are unpacked."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import problem_response
 
+_NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
+
 
 class _TooLarge(Exception):
     """The body, or what it unpacks to, exceeds the limit."""
@@ -17,6 +19,34 @@ class _TooLarge(Exception):
 
 class _Damaged(Exception):
     """The body is not in the encoding that it claims."""
+
+
+class Crowd:
+    """Pure ASGI middleware: past ``most`` requests in hand 503 with ``Retry-After``; probes and metrics do not count.
+
+    Nothing of the refused body is read.
+    """
+
+    def __init__(self, app: ASGIApp, most: int) -> None:
+        self.app = app
+        self._most = most
+        self._inside = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["path"] in _NEVER_REFUSED:
+            await self.app(scope, receive, send)
+            return
+        if self._inside >= self._most:
+            response = problem_response(503, f"{self._most} requests are in hand already")
+            response.headers["Retry-After"] = "1"
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+            return
+        self._inside += 1
+        try:
+            await self.app(scope, receive, send)
+        finally:
+            self._inside -= 1
 
 
 class BodyLimit:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from service.prompt import Template, note_block
 from service.records import NEVER, Records
 from service.repeats import Repeats
 from service.settings import Settings, prompt_tokens
+from service.spec import in_full, required
 from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.turns import Given, Turns
 from shared.channel import FloatArray
@@ -34,8 +35,6 @@ from shared.wire import Belief, Features, MissionSpec, MissionStatus, Mode, Outc
 # An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
 _PENDING_PER_UAV = 8
 _APPLIED_PER_UAV = 64
-
-T = TypeVar("T")
 
 
 class Mission:
@@ -355,6 +354,7 @@ class Mission:
             features=self.features,
             belief=self.decides_from,
             planner="off" if self.planner is None else "on",
+            verify=required(self.spec.verify),
             prompt=self.spec.prompt,
             init=self.spec.init,
             seed=self.spec.seed,
@@ -365,35 +365,6 @@ class Mission:
             learner_loss=self.learner.last_loss,
             visits={int(s): int(self.visits[s]) for s in np.flatnonzero(self.visits >= 0)},
         )
-
-
-def in_full(spec: MissionSpec, settings: Settings) -> MissionSpec:
-    """A spec with the service's settings, and what follows from its mode, where it says nothing."""
-    mode = spec.mode or settings.mode
-    # The paper's method as it is written, unless asked otherwise.
-    written = mode == "llm"
-    told = spec.prompt.experiences
-    prompt = {
-        "experiences": settings.experiences if told is None else told,
-        "selection": spec.prompt.selection or settings.selection,
-    }
-    return spec.model_copy(
-        update={
-            "mode": mode,
-            "features": spec.features or ("paper" if written else "reach"),
-            "belief": spec.belief or ("reported" if written else "fleet"),
-            "top_k": spec.top_k or settings.top_k,
-            "planner": spec.planner or settings.planner,
-            "prompt": spec.prompt.model_copy(update=prompt),
-        }
-    )
-
-
-def required(value: T | None) -> T:
-    """A field that a spec in full has; raises ``TypeError`` for one that has not."""
-    if value is None:
-        raise TypeError("this spec is not in full")
-    return value
 
 
 def _forgotten(_: Event) -> None:

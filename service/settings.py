@@ -113,12 +113,20 @@ class Settings(BaseSettings):
     price_cached: float = Field(0.0, ge=0)
     price_output: float = Field(0.0, ge=0)
 
+    # Decisions that may wait for the LLM at once. More would only share its time: they are the policy's at once.
+    llm_concurrency: int = Field(64, ge=1, le=10_000)
+    # Requests in hand at once; one more is answered 503 with Retry-After. Several times `llm_concurrency`, so that
+    # decisions go to the policy before any is refused.
+    max_requests: int = Field(512, ge=1, le=100_000)
     # File of the keys that requests must carry (`aicvds keys add` makes it); unset: everyone may ask.
     keys: Path | None = None
     # Whether everyone may ask who reaches an address other than loopback.
     anonymous: Literal["on", "off"] = "off"
     # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take 0.4 to 0.8 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
+    # Whether an LLM's answer must keep hard rules in mode `llm`: in reach, battery not flat. What breaks one is
+    # overridden by the policy; `off` is the paper's method as it is written.
+    verify: Literal["on", "off"] = "on"
     # Where missions outlive the process: a SQLite file, or postgresql://user:password@host/database. `none`: nowhere.
     store: str = Field(default_factory=_default_store, min_length=1, repr=False)
     # Missions held at once, in memory or in the store; one more is refused until another is deleted.

@@ -52,6 +52,9 @@ Reason = Literal[
     "answer_sensor",
     "answer_velocity",
     "answer_reserved",
+    "rule_reach",
+    "rule_battery",
+    "llm_busy",
 ]
 
 
@@ -291,6 +294,11 @@ class MissionSpec(Wire):
     planner: Literal["on", "off"] | None = Field(
         None, description="`off`: one step of look-ahead is the LLM-free policy; default: the service's"
     )
+    verify: Literal["on", "off"] | None = Field(
+        None,
+        description="mode `llm`: whether the policy overrides an answer that breaks a hard rule (out of reach, flat "
+        "battery); default: the service's",
+    )
     prompt: PromptStyle = PromptStyle()
     init: Init = Field("pretrained", description="the modules' start; `random` is the paper's")
     seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights and of shuffled rows")
@@ -310,6 +318,7 @@ class MissionStatus(Wire):
     attention: Literal["on", "off"] = "on"
     features: Features = "paper"
     belief: Belief = "fleet"
+    verify: Literal["on", "off"] = "off"
     planner: Literal["on", "off"] = Field("off", description="`on` where it is wanted, installed, and up to the size")
     prompt: PromptStyle = PromptStyle()
     init: Init

@@ -9,6 +9,7 @@ from simulator.experiments import (
     attention,
     fairness,
     guided,
+    jailbreak,
     latency,
     llm_models,
     obedience,
@@ -33,6 +34,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         ablation_features,
         llm_models,
         obedience,
+        jailbreak,
         aoi,
         scenarios,
     )

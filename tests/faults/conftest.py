@@ -1,0 +1,24 @@
+"""The suite's table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.faults.table import PAGE, Tables
+
+
+@pytest.fixture(scope="session")
+def tables(request: pytest.FixtureRequest) -> Iterator[Tables]:
+    """Where each test writes what it measured; a run of the whole suite that passes makes the page anew."""
+    kept = Tables()
+    yield kept
+    session = request.session
+    ran = {Path(item.path) for item in session.items}
+    whole = ran >= set(Path(__file__).parent.glob("test_*.py")) and not session.config.option.keyword
+    text = kept.page()
+    if whole and not session.testsfailed:
+        PAGE.write_text(text)
+    print(text)
