@@ -23,7 +23,7 @@ from rich.table import Table
 
 from service.compiler import understood
 from service.llm.answer import NoDecision
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.orders import BadOrders, number_of, read, shown
 from service.settings import Settings
 from shared.guidance import Guidance, Impossible
@@ -57,7 +57,7 @@ class Understood:
 
 async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
     """The LLM's name and what was made of each note."""
-    upstream = Upstream(Settings(mode="llm"))
+    upstream = Servers(Settings(mode="llm"))
     upstream.start()
     while upstream.status == "loading":
         await asyncio.sleep(0.2)

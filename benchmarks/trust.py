@@ -28,7 +28,7 @@ from service.asking import Asking, Word, by_action
 from service.candidates import Offer
 from service.critic import Action
 from service.engine import Engine
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.mission import Mission
 from service.prompt import Prompt
@@ -64,8 +64,8 @@ class Trusted:
 class Echo(Asking):
     """Asks nobody: its word is for ``answer``, or the nearest to it that is offered."""
 
-    def __init__(self, upstream: Upstream, metrics: Metrics) -> None:
-        super().__init__(upstream, metrics)
+    def __init__(self, llm: Servers, metrics: Metrics) -> None:
+        super().__init__(llm, metrics, most=64)
         self.answer: Action = (0, 0)
 
     async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
@@ -75,7 +75,7 @@ class Echo(Asking):
         there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
         said = min(there, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
         told = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == said) for letter in letters}
-        return Word(prompt, by_action(offer, told), None, None, calibrated=False)
+        return Word(prompt, by_action(offer, told), None, None, calibrated=False, model=self._llm.model)
 
 
 class Pilot(EdgePilot):
@@ -134,7 +134,7 @@ def main(args: Trusted) -> int:
     lost: dict[str, list[int]] = {"planner": [], "echo": []}
     trust: list[list[float]] = []
     with edge() as (url, engine):
-        engine.asking = echo = Echo(engine._upstream, engine._metrics)
+        engine.asking = echo = Echo(engine._llm, engine._metrics)
         for seed in track(seeds, "Flying", console=console):
             lost["planner"].append(flown(url, site, seed, echo, "policy")[0])
             total, weights = flown(url, site, seed, echo, "guided")

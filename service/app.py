@@ -18,7 +18,7 @@ from service.guard import CarefulHeaders, Guard
 from service.keys import Keys
 from service.learner import rehearse
 from service.limits import BodyLimit, Crowd
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.routes import router
 from service.settings import Settings
@@ -31,7 +31,7 @@ class State(TypedDict):
     """What every request finds in ``request.state``."""
 
     engine: Engine
-    upstream: Upstream
+    llm: Servers
     metrics: Metrics
 
 
@@ -50,18 +50,18 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
         torch.set_num_threads(1)
         metrics = Metrics()
-        upstream = Upstream(settings, metrics.llm_breaker_opened.inc)
+        llm = Servers(settings, metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         await asyncio.to_thread(rehearse)
-        engine = Engine(settings, upstream, counter, metrics, store)
+        engine = Engine(settings, llm, counter, metrics, store)
         app.state.engine = engine
-        upstream.start()
+        llm.start()
         try:
-            yield {"engine": engine, "upstream": upstream, "metrics": metrics}
+            yield {"engine": engine, "llm": llm, "metrics": metrics}
         finally:
             await engine.compiler.close()
             await engine.asking.close()
-            await upstream.close()
+            await llm.close()
             await asyncio.to_thread(engine.close)
             if store is not None:
                 store.close()

@@ -18,7 +18,7 @@ from service.guided import offered, template_of
 from service.llm.answer import NoDecision
 from service.llm.calibration import LabelReader
 from service.llm.client import Completion
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.mission import Mission
 from service.prompt import Prompt
@@ -39,8 +39,8 @@ class Word:
     """What the LLM said of one UAV's candidates in mode ``guided``.
 
     ``told`` holds the probabilities of the actions that it was asked about; None where it was silent, for the
-    ``reason``. Where several UAVs were asked about at once, ``prompt`` is this one's share, and the whole call's static
-    block, experiences and ``completion`` are with the first.
+    ``reason``; ``model`` is whose word it is. Where several UAVs were asked about at once, ``prompt`` is this one's
+    share, and the whole call's static block, experiences and ``completion`` are with the first.
     """
 
     prompt: Prompt
@@ -48,6 +48,7 @@ class Word:
     reason: Reason | None
     completion: Completion | None
     calibrated: bool
+    model: str | None
 
     def of(self, actions: Sequence[Action]) -> FloatArray | None:
         """Its probabilities of these actions, ``(n,)``; None where it said nothing of any.
@@ -65,11 +66,11 @@ class Word:
 class Asking:
     """Asks one LLM for every mission of a service, ``most`` decisions at once."""
 
-    def __init__(self, upstream: Upstream, metrics: Metrics, most: int) -> None:
-        self._upstream = upstream
+    def __init__(self, llm: Servers, metrics: Metrics, most: int) -> None:
+        self._llm = llm
         self._most = most
         self._metrics = metrics
-        self._labels = LabelReader(upstream)
+        self._labels = LabelReader(llm)
         self._late = 0
         self._waiting: set[asyncio.Timeout] = set()
         self._closing = False
@@ -87,22 +88,22 @@ class Asking:
 
     async def pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: float) -> Completion:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``. Deadlines are of ``time.perf_counter``."""
-        return await self._within(self._upstream.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
+        return await self._within(self._llm.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
 
     async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
         """Mode ``guided``: what the LLM says of one UAV's candidates."""
         template = template_of(mission)
         lists = [list(offer.labels)]
         completion, told, reason = await self._heard(mission, prompt.static, prompt.user, lists, deadline)
-        calibrated = self._knows(prompt.static, lists)
+        calibrated, model = self._knows(completion, prompt.static, lists), self._model(completion)
         if told is None:
-            return Word(prompt, None, reason, completion, calibrated)
-        self._labels.calibrate(prompt.static, template.content_free(), [template.labels])
-        return Word(prompt, by_action(offer, told[0]), None, completion, calibrated)
+            return Word(prompt, None, reason, completion, calibrated, model)
+        self._labels.calibrate(model, prompt.static, template.content_free(), [template.labels])
+        return Word(prompt, by_action(offer, told[0]), None, completion, calibrated, model)
 
     def may_ask_together(self, mission: Mission, uavs: int) -> bool:
         """Whether one call can decide for so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
-        able = self._upstream.status == "ready" and uavs <= self._upstream.most_together
+        able = self._llm.status == "ready" and uavs <= self._llm.most_together
         return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
 
     async def words(self, mission: Mission, views: Sequence[View], deadline: float) -> dict[int, Word]:
@@ -125,17 +126,17 @@ class Asking:
         self._late = self._late + 1 if reason == "llm_timeout" else 0
         if reason is not None and (self._late == 0 or self._late >= _LATE):
             log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", len(asked), reason)
-            self._upstream.most_together = len(asked) - 1
+            self._llm.most_together = len(asked) - 1
             self._late = 0
         if reason is not None and reason != "llm_timeout":
             return {}
-        calibrated = self._knows(static, lists)
+        calibrated, model = self._knows(completion, static, lists), self._model(completion)
         if told is not None:
-            self._labels.calibrate(static, template.content_free(list(asked)), [template.labels] * len(asked))
+            self._labels.calibrate(model, static, template.content_free(list(asked)), [template.labels] * len(asked))
         words = {}
         for place, (uav, (_, offer)) in enumerate(asked.items()):
             heard = None if told is None else by_action(offer, told[place])
-            words[uav] = Word(prompts[uav], heard, reason, None if place else completion, calibrated)
+            words[uav] = Word(prompts[uav], heard, reason, None if place else completion, calibrated, model)
         return words
 
     async def _heard(
@@ -151,8 +152,13 @@ class Asking:
         self._metrics.llm_requests.labels(reason or "ok").inc()
         return completion, told, reason
 
-    def _knows(self, static: str, lists: Sequence[Sequence[str]]) -> bool:
-        return self._labels.bias(static, len(lists)) is not None and self._upstream.logprobs
+    def _model(self, completion: Completion | None) -> str | None:
+        """Who said it, or would have."""
+        return self._llm.model if completion is None else completion.model
+
+    def _knows(self, completion: Completion | None, static: str, lists: Sequence[Sequence[str]]) -> bool:
+        model = self._model(completion)
+        return self._labels.bias(model, static, len(lists)) is not None and self._llm.logprobs
 
     async def _within(self, asked: Coroutine[Any, Any, Completion], deadline: float) -> Completion:
         if len(self._waiting) >= self._most:

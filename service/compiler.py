@@ -16,7 +16,7 @@ import logging
 import time
 
 from service.llm.answer import NoDecision
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.mission import Mission
 from service.orders import BadOrders, read, shown
 from shared.guidance import Guidance, Impossible
@@ -36,8 +36,8 @@ _POLL_S = 0.2
 class Compiler:
     """Compiles the notes of a service's missions, one after another."""
 
-    def __init__(self, upstream: Upstream) -> None:
-        self._upstream = upstream
+    def __init__(self, llm: Servers) -> None:
+        self._llm = llm
         self._turn = asyncio.Lock()
         self._tasks: dict[int, asyncio.Task[None]] = {}
 
@@ -64,7 +64,7 @@ class Compiler:
                 await self._ready()
                 if mission.guidance.status != "compiling":
                     return
-                mission.understand(await understood(note, mission.scenario, self._upstream), self._upstream.model)
+                mission.understand(await understood(note, mission.scenario, self._llm), self._llm.model)
                 return
         except (BadOrders, Impossible, NoDecision) as error:
             why = str(error)
@@ -73,17 +73,17 @@ class Compiler:
         except Exception as error:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             why = f"{type(error).__name__}: see the log"
-        mission.misunderstand(f"{why}; give `guidance` of your own", self._upstream.model)
+        mission.misunderstand(f"{why}; give `guidance` of your own", self._llm.model)
 
     async def _ready(self) -> None:
         """Wait while the LLM loads, or recovers."""
-        while self._upstream.status != "ready" and self._upstream.coming:
+        while self._llm.status != "ready" and self._llm.coming:
             await asyncio.sleep(_POLL_S)
-        if self._upstream.status != "ready":
-            raise NoDecision("llm_unavailable", f"the LLM is {self._upstream.status}")
+        if self._llm.status != "ready":
+            raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")
 
 
-async def understood(note: str, scenario: Scenario, upstream: Upstream) -> Guidance:
+async def understood(note: str, scenario: Scenario, llm: Servers) -> Guidance:
     """The first of a few answers that stands up to every check.
 
     Raises:
@@ -97,7 +97,7 @@ async def understood(note: str, scenario: Scenario, upstream: Upstream) -> Guida
     for attempt in range(_ATTEMPTS):
         temperature = _TEMPERATURE if attempt else 0.0
         async with asyncio.timeout(_ANSWER_S):
-            text = await upstream.ask_orders(note, examples, temperature=temperature, seed=attempt)
+            text = await llm.ask_orders(note, examples, temperature=temperature, seed=attempt)
         try:
             guidance = read(text, note)
             guidance.check(scenario)

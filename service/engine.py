@@ -19,7 +19,7 @@ from service.guided import Deliberation
 from service.journal import Journal, Unkept
 from service.llm.answer import NoDecision, check_answer
 from service.llm.client import Completion
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.mission import Mission
 from service.missions import Missions
@@ -95,6 +95,7 @@ class Choice:
     velocity: int
     reason: Reason | None
     completion: Completion | None
+    model: str | None
     guided: Guided | None = None
     advice: Advice | None = None
 
@@ -108,12 +109,12 @@ class Engine:
     """Decides for every mission of one service, and learns from what comes back."""
 
     def __init__(
-        self, settings: Settings, upstream: Upstream, counter: TokenCounter, metrics: Metrics, store: Store | None
+        self, settings: Settings, llm: Servers, counter: TokenCounter, metrics: Metrics, store: Store | None
     ) -> None:
         self._settings = settings
-        self._upstream = upstream
-        self.asking = Asking(upstream, metrics, settings.llm_concurrency)
-        self.compiler = Compiler(upstream)
+        self._llm = llm
+        self.asking = Asking(llm, metrics, settings.llm_concurrency)
+        self.compiler = Compiler(llm)
         self._counter = counter
         self._metrics = metrics
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
@@ -291,14 +292,14 @@ class Engine:
             velocity=choice.velocity,
             source=choice.source,
             reason=choice.reason,
-            model=None if choice.reason else self._upstream.model,
+            model=None if choice.reason else choice.model,
             top_k=view.candidates,
             guided=choice.guided,
             tokens=with_usage(tokens, choice.completion, self._settings),
             deadline_ms=turn.deadline_ms,
             latency_ms=watch.total(),
         )
-        counsel = None if choice.advice is None else Counsel(self._upstream.model or "", choice.advice)
+        counsel = None if choice.advice is None else Counsel(choice.model or "", choice.advice)
         mission.commit(pending, turn.attempt, counsel)
         waited_ms = watch.stages.get("llm", 0.0) + watch.stages.get("plan", 0.0)
         self._own_s += ((answer.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
@@ -346,7 +347,7 @@ class Engine:
             reason = error.reason
         if mission.asks and reason != "no_candidate":
             self._metrics.llm_requests.labels(reason or "ok").inc()
-        return Choice(sensor, velocity, reason, completion)
+        return Choice(sensor, velocity, reason, completion, completion.model if completion else None)
 
     def _by_policy(self, mission: Mission, view: View) -> tuple[int, int]:
         """The plan's, or one step of look-ahead where there is no plan."""
@@ -374,17 +375,17 @@ class Engine:
         finally:
             judgement = await thinking
         turn.watch.lap("judge")
-        trust = mission.trust_in(self._upstream.model)
+        trust = mission.trust_in(word.model)
         gone = mission.reserved(view.step, view.uav_id)
         told = word.of(deliberation.offer.actions)
         verdict = deliberation.conclude(trust, judgement, told, calibrated=word.calibrated, gone=gone)
         if verdict is None:
             sensor, velocity = self._by_policy(mission, view)
-            return Choice(sensor, velocity, "answer_reserved", word.completion)
+            return Choice(sensor, velocity, "answer_reserved", word.completion, word.model)
         self._metrics.llm_trust.observe(trust.weights[LLM])
         # All that it said something of may have been given away.
         reason = word.reason or ("answer_reserved" if told is None else None)
-        return Choice(*verdict.action, reason, word.completion, verdict.told, verdict.advice)
+        return Choice(*verdict.action, reason, word.completion, word.model, verdict.told, verdict.advice)
 
 
 async def _until(plan: asyncio.Task[None] | None, deadline: float) -> None:

@@ -9,7 +9,7 @@ from prometheus_client import generate_latest
 
 from service.engine import Engine
 from service.guard import may_make_missions
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.problems import documented
 from shared.guidance import GuidanceAnswer, GuidanceStatus
@@ -138,8 +138,8 @@ async def healthz() -> dict[str, str]:
 @router.get("/readyz", tags=["operation"])
 async def readyz(request: Request) -> Readiness:
     """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``."""
-    upstream: Upstream = request.state.upstream
-    return upstream.readiness()
+    llm: Servers = request.state.llm
+    return llm.readiness()
 
 
 @router.get("/metrics", tags=["operation"], response_class=Response)

@@ -75,11 +75,16 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", env_ignore_empty=True)
 
-    # An OpenAI-compatible server, up to and including /v1. Unset: the embedded llama.cpp.
+    # An OpenAI-compatible server, up to and including /v1, or several in order of preference, divided by commas.
+    # Unset: the embedded llama.cpp.
     llm_url: str | None = None
-    # The model to ask for. Unset: the first that the server lists.
+    # The model to ask for, or one for each server. Unset: the first that the server lists.
     llm_model: str | None = None
+    # Sent as a bearer token: to all servers, or one for each.
     llm_api_key: SecretStr | None = None
+    # Milliseconds after which a second server (or the only one, again) is asked beside one that has not answered.
+    # 0: none is. It doubles what a slow server has to do, so it pays where there are several.
+    hedge_ms: int = Field(0, ge=0, le=60_000)
     # Another model file for the embedded llama.cpp. Unset: the one that `aicvds model fetch` brought.
     llm_gguf: Path | None = None
     # Threads of the embedded llama.cpp. 0: cores - 1, because with as many threads as cores and
@@ -140,15 +145,7 @@ class Settings(BaseSettings):
     def _http_url(cls, url: str | None) -> str | None:
         if url is None or url == "":
             return None
-        if not url.startswith(("http://", "https://")):
-            raise ValueError("must start with http:// or https://, for example http://localhost:8080/v1")
-        try:
-            parsed = httpx.URL(url)
-        except (httpx.InvalidURL, ValueError):
-            raise ValueError("is not a valid address") from None
-        if parsed.userinfo or not parsed.host:
-            raise ValueError("must name a host and no user: the key goes into AICVDS_LLM_API_KEY")
-        return url.rstrip("/")
+        return ",".join(_checked_url(one.strip()) for one in url.split(","))
 
     @field_validator("llm_api_key")
     @classmethod
@@ -162,6 +159,11 @@ class Settings(BaseSettings):
         return SecretStr(stripped)
 
     @model_validator(mode="after")
+    def _one_for_each_server(self) -> Self:
+        self.each_server()
+        return self
+
+    @model_validator(mode="after")
     def _prompt_fits(self) -> Self:
         needed = prompt_tokens("csv", self.top_k, self.experiences)
         if needed > self.llm_context:
@@ -171,10 +173,43 @@ class Settings(BaseSettings):
             )
         return self
 
+    def each_server(self) -> list[Settings]:
+        """These settings for each LLM server by itself, in order of preference; raises ``ValueError``."""
+        if self.llm_url is None:
+            return [self]
+        urls = self.llm_url.split(",")
+        models = _for_each(len(urls), "AICVDS_LLM_MODEL", self.llm_model)
+        key = None if self.llm_api_key is None else self.llm_api_key.get_secret_value()
+        keys = _for_each(len(urls), "AICVDS_LLM_API_KEY", key)
+        return [
+            self.model_copy(update={"llm_url": url, "llm_model": model, "llm_api_key": SecretStr(one) if one else None})
+            for url, model, one in zip(urls, models, keys, strict=True)
+        ]
+
     @property
     def embedded_threads(self) -> int:
         """Threads for the embedded llama.cpp: the setting, or cores - 1, at least 1."""
         return self.llm_threads or max(1, usable_cores() - 1)
+
+
+def _checked_url(url: str) -> str:
+    if not url.startswith(("http://", "https://")):
+        raise ValueError("must start with http:// or https://, for example http://localhost:8080/v1")
+    try:
+        parsed = httpx.URL(url)
+    except (httpx.InvalidURL, ValueError):
+        raise ValueError("is not a valid address") from None
+    if parsed.userinfo or not parsed.host:
+        raise ValueError("must name a host and no user: the key goes into AICVDS_LLM_API_KEY")
+    return url.rstrip("/")
+
+
+def _for_each(servers: int, name: str, given: str | None) -> list[str | None]:
+    """One for each server, or the same for all of them."""
+    several: list[str | None] = [one.strip() or None for one in given.split(",")] if given else [None]
+    if len(several) not in (1, servers):
+        raise ValueError(f"{name} names {len(several)} and AICVDS_LLM_URL {servers} servers: name one, or one for each")
+    return several * servers if len(several) == 1 else several
 
 
 def unknown_variables() -> list[str]:

@@ -338,6 +338,7 @@ class Readiness(Wire):
     decides: Source
     llm: Literal["loading", "ready", "unavailable", "off"]
     model: str | None = None
+    standing_by: int = Field(0, description="further LLM servers that are well")
     constraint: str | None = Field(None, description="how the server holds the LLM to the answer's form")
     detail: str | None = None
 

@@ -17,7 +17,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from service.llm.answer import NoDecision, check_labels
 from service.llm.client import Completion
-from service.llm.upstream import Upstream
+from service.llm.servers import Servers
 
 log = logging.getLogger(__name__)
 
@@ -76,38 +76,38 @@ class LabelReader:
     One question may have several lists of labels, of each of which the answer is to name one.
     """
 
-    def __init__(self, upstream: Upstream) -> None:
-        self._upstream = upstream
+    def __init__(self, llm: Servers) -> None:
+        self._llm = llm
         self._bias: OrderedDict[_Asked, list[dict[str, float]]] = OrderedDict()
         self._attempts: dict[_Asked, int] = {}
         self._task: asyncio.Task[None] | None = None
 
-    def bias(self, static: str, lists: int = 1) -> list[dict[str, float]] | None:
-        """What the present model favours under a static block, by list, once that is measured."""
-        return self._bias.get((self._upstream.model, static, lists))
+    def bias(self, model: str | None, static: str, lists: int = 1) -> list[dict[str, float]] | None:
+        """What a model favours under a static block, by list, once that is measured."""
+        return self._bias.get((model, static, lists))
 
     async def ask(self, static: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
         """One answer; raises :class:`NoDecision`. What it tells is for :meth:`read`."""
-        return await self._upstream.ask_labels(static, user, lists)
+        return await self._llm.ask_labels(static, user, lists)
 
     def read(self, completion: Completion, static: str, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
         """The labels' probabilities by list, without the bias where that is known; raises :class:`NoDecision`."""
         told = probabilities(completion, lists)
-        bias = self.bias(static, len(lists))
+        bias = self.bias(completion.model, static, len(lists))
         if bias is None or not completion.places:
             return told
         return [calibrated(*pair) for pair in zip(told, bias, strict=True)]
 
-    def calibrate(self, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
-        """Measure the bias in the background, unless it is known, being measured, or cannot be.
+    def calibrate(self, model: str | None, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
+        """Measure a model's bias in the background, unless it is known, being measured, or cannot be.
 
         Args:
             texts: user messages that say nothing.
             lists: every label that a question under this static block can offer, by list.
         """
-        key = (self._upstream.model, static, len(lists))
+        key = (model, static, len(lists))
         busy = self._task is not None and not self._task.done()
-        if busy or key in self._bias or not self._upstream.logprobs or self._attempts.get(key, 0) >= _ATTEMPTS:
+        if busy or key in self._bias or not self._llm.logprobs or self._attempts.get(key, 0) >= _ATTEMPTS:
             return
         self._attempts[key] = self._attempts.get(key, 0) + 1
         self._task = asyncio.create_task(self._measure(key, texts, lists), name="calibration")
@@ -121,9 +121,13 @@ class LabelReader:
     async def _measure(self, key: _Asked, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
             async with asyncio.timeout(_TIMEOUT_S):
-                told = [probabilities(await self.ask(key[1], text, lists), lists) for text in texts]
+                answers = [await self.ask(key[1], text, lists) for text in texts]
+            told = [probabilities(answer, lists) for answer in answers]
         except (NoDecision, TimeoutError) as error:
             log.warning("label bias not measured: %s", error)
+            return
+        if {answer.model for answer in answers} != {key[0]}:
+            # Another server answered meanwhile.
             return
         self._bias[key] = [
             {label: sum(answer[at][label] for answer in told) / len(told) for label in labels}

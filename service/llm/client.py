@@ -50,7 +50,7 @@ class Place:
 class Completion:
     """An answer's text and the server's ``usage``; ``None`` where it said nothing.
 
-    ``places`` are those of the text's tokens; empty where the server told no probabilities.
+    ``places`` are those of the text's tokens; empty where the server told no probabilities. ``model`` said it.
     """
 
     text: str
@@ -58,6 +58,7 @@ class Completion:
     cached_tokens: int | None
     completion_tokens: int | None
     places: tuple[Place, ...] = ()
+    model: str | None = None
 
 
 class LLMClient:

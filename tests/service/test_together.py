@@ -199,7 +199,7 @@ def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
 def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     """A velocity forbidden meanwhile counts as the nearest that is offered; of sensors given away nothing is left."""
     prompt = Prompt("", "", "", "")
-    word = Word(prompt, {(1, 9): 0.3, (1, 2): 0.1, (4, 7): 0.6}, None, None, calibrated=False)
+    word = Word(prompt, {(1, 9): 0.3, (1, 2): 0.1, (4, 7): 0.6}, None, None, calibrated=False, model=None)
     told = word.of([(1, 3), (1, 7), (2, 7)])
     assert told is not None
     assert told.tolist() == pytest.approx([0.25, 0.75, 0.0])

@@ -1,0 +1,128 @@
+"""Several LLM servers in order of preference: the first that is well is asked, and the next one where that fails.
+
+Each has its own health and circuit breaker. Optionally a second one is asked beside the first that keeps a UAV waiting
+(a hedged request: Dean and Barroso 2013, "The Tail at Scale"); whoever answers first counts, and the other is hung up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+from service.llm.answer import Constraint, NoDecision
+from service.llm.client import Completion
+from service.llm.upstream import Upstream
+from service.settings import Settings
+from shared.wire import Readiness
+
+Ask = Callable[[Upstream], Coroutine[Any, Any, Completion]]
+
+
+class Servers:
+    """The LLM servers of one edge, as one; ``on_open`` hears when one's circuit breaker opens."""
+
+    def __init__(self, settings: Settings, on_open: Callable[[], None] = lambda: None) -> None:
+        self._each = [Upstream(one, on_open) for one in settings.each_server()]
+        self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None
+
+    @property
+    def present(self) -> Upstream:
+        """The one that is asked now: the first that is ready, or the first of all."""
+        return next((server for server in self._each if server.status == "ready"), self._each[0])
+
+    @property
+    def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
+        """Where the present one stands."""
+        return self.present.status
+
+    @property
+    def model(self) -> str | None:
+        """The present one's."""
+        return self.present.model
+
+    @property
+    def constraint(self) -> Constraint:
+        """How the present one is held to the answer's form."""
+        return self.present.constraint
+
+    @property
+    def logprobs(self) -> bool:
+        """Whether the present one tells the probabilities of tokens."""
+        return self.present.logprobs
+
+    @property
+    def most_together(self) -> int:
+        """UAVs that the present one may be asked about at once."""
+        return self.present.most_together
+
+    @most_together.setter
+    def most_together(self, most: int) -> None:
+        self.present.most_together = most
+
+    @property
+    def coming(self) -> bool:
+        """Whether one that is not ready may yet be, without anybody's doing."""
+        return any(server.coming for server in self._each)
+
+    def readiness(self) -> Readiness:
+        """What ``/readyz`` says: of the present one, and how many more are well."""
+        present = self.present
+        well = sum(server.status == "ready" for server in self._each if server is not present)
+        return present.readiness().model_copy(update={"standing_by": well})
+
+    def start(self) -> None:
+        """Begin loading or probing all of them, unless the LLM is off."""
+        for server in self._each:
+            server.start()
+
+    async def close(self) -> None:
+        """Stop trying, close connections, free the embedded model."""
+        await asyncio.gather(*(server.close() for server in self._each))
+
+    async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
+        """As :meth:`Upstream.ask`."""
+        return await self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
+
+    async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
+        """As :meth:`Upstream.ask_labels`."""
+        return await self._first(lambda server: server.ask_labels(system, user, lists))
+
+    async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
+        """As :meth:`Upstream.ask_orders`, of the present one."""
+        return await self.present.ask_orders(note, examples, temperature=temperature, seed=seed)
+
+    async def _first(self, ask: Ask) -> Completion:
+        """The first answer of those that are well, asked one after another; the first failure where there is none."""
+        waiting = deque(server for server in self._each if server.status == "ready") or deque(self._each[:1])
+        if self._hedge_s is not None and len(waiting) == 1:
+            # Behind one address there may be several machines.
+            waiting.append(waiting[0])
+        running: dict[asyncio.Task[Completion], Upstream] = {}
+        failure: NoDecision | None = None
+        try:
+            while waiting or running:
+                if not running:
+                    self._begin(ask, waiting, running)
+                hedge = self._hedge_s if waiting and len(running) == 1 else None
+                done, _ = await asyncio.wait(running, timeout=hedge, return_when=asyncio.FIRST_COMPLETED)
+                if not done:
+                    self._begin(ask, waiting, running)
+                for task in done:
+                    server = running.pop(task)
+                    try:
+                        return replace(task.result(), model=server.model)
+                    except NoDecision as error:
+                        failure = failure or error
+        finally:
+            for task in running:
+                task.cancel()
+            await asyncio.gather(*running, return_exceptions=True)
+        raise failure or NoDecision("llm_unavailable", "there is no server")
+
+    @staticmethod
+    def _begin(ask: Ask, waiting: deque[Upstream], running: dict[asyncio.Task[Completion], Upstream]) -> None:
+        server = waiting.popleft()
+        running[asyncio.create_task(ask(server), name="ask-llm")] = server

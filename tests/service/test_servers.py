@@ -1,0 +1,124 @@
+"""Several LLM servers: the first that is well is asked, the next where it fails, and a second beside a slow one."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+from fastapi.responses import Response
+from pydantic import ValidationError
+
+from service.settings import Settings
+from tests.running import listening, serving
+from tests.service.stub_llm import StubLlm, misbehaving, saying, silent, wait_for
+
+Report = Callable[..., dict[str, Any]]
+Edge = Callable[..., httpx.Client]
+
+
+class Named(StubLlm):
+    """A server with a model of its own."""
+
+    def __init__(self, name: str, answer: str) -> None:
+        super().__init__(answer)
+        self.name = name
+
+    async def models(self) -> dict[str, Any]:
+        return {"data": [{"id": self.name}]}
+
+
+def standing_by(client: httpx.Client, count: int) -> dict[str, Any]:
+    ends = time.monotonic() + 30
+    while (ready := client.get("/readyz").json())["standing_by"] != count:
+        assert time.monotonic() < ends, ready
+        time.sleep(0.05)
+    return dict(ready)
+
+
+def test_the_first_that_is_well_decides_and_the_next_where_it_is_gone(edge: Edge, report: Report) -> None:
+    with serving(Named("second", "1 7").app) as second:
+        with serving(Named("first", "0 7").app) as first:
+            client = edge(mode="llm", llm_url=f"{first}/v1, {second}/v1")
+            wait_for(client, "ready")
+            standing_by(client, 1)
+            answer = client.post("/decide", json=report()).json()
+            assert (answer["sensor_id"], answer["model"]) == (0, "first")
+        # Gone, and nobody knows yet: this very decision is the second's.
+        answer = client.post("/decide", json=report(step=1)).json()
+        assert (answer["sensor_id"], answer["model"], answer["source"]) == (1, "second", "llm")
+        assert client.get("/readyz").json()["model"] == "second"
+        standing_by(client, 0)
+
+
+def test_a_server_that_answers_with_errors_costs_nobody_a_decision(edge: Edge, report: Report) -> None:
+    with listening(misbehaving(saying(b"500 Oops", b"oops"))) as first, serving(Named("second", "1 7").app) as second:
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", llm_model="first,second")
+        standing_by(client, 1)
+        answers = [client.post("/decide", json=report(step=step)).json() for step in range(5)]
+        assert {(answer["source"], answer["model"]) for answer in answers} == {("llm", "second")}
+        # Its own breaker opened.
+        assert "aicvds_llm_breaker_opened_total 1.0" in client.get("/metrics").text
+
+
+def test_a_second_is_asked_beside_one_that_is_silent(edge: Edge, report: Report) -> None:
+    with listening(misbehaving(silent)) as first, serving(Named("second", "1 7").app) as second:
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", hedge_ms=100, deadline_ms=5000)
+        standing_by(client, 1)
+        answer = client.post("/decide", json=report()).json()
+        assert (answer["source"], answer["model"]) == ("llm", "second")
+        assert 100 <= answer["latency_ms"]["llm"] < 4000
+
+
+def test_the_only_server_is_asked_again_beside_itself(edge: Edge, report: Report) -> None:
+    class Stuck(StubLlm):
+        asked = 0
+
+        async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+            self.asked += not probed and body["messages"][-1]["content"] != "0,50,-90,1,100\n"
+            if self.asked == 1:
+                await asyncio.sleep(30)
+            return await super().respond(body, probed)
+
+    stuck = Stuck("1 7")
+    with serving(stuck.app) as llm:
+        client = edge(mode="llm", llm_url=f"{llm}/v1", hedge_ms=100, deadline_ms=5000)
+        wait_for(client, "ready")
+        assert client.post("/decide", json=report()).json()["source"] == "llm"
+        assert stuck.asked == 2
+
+
+def test_where_all_fail_the_first_ones_fault_is_told(edge: Edge, report: Report) -> None:
+    bad, worse = saying(b"429 Too Many Requests", b"{}"), saying(b"200 OK", b"<html>")
+    with listening(misbehaving(bad)) as first, listening(misbehaving(worse)) as second:
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1")
+        standing_by(client, 1)
+        assert client.post("/decide", json=report()).json()["reason"] == "llm_status"
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"llm_url": "http://a/v1,ftp://b/v1"},
+        {"llm_url": "http://a/v1,"},
+        {"llm_url": "http://a/v1,http://b/v1", "llm_model": "x,y,z"},
+        {"llm_url": "http://a/v1,http://b/v1", "llm_api_key": "hunter2,hunter3,hunter4"},
+    ],
+)
+def test_lists_that_do_not_fit_are_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError) as refused:
+        Settings(**given)
+    assert "hunter" not in "".join(error["msg"] for error in refused.value.errors())
+
+
+def test_each_server_gets_its_own_key_or_all_the_same() -> None:
+    urls = "http://a/v1,http://b/v1/"
+    each = Settings(llm_url=urls, llm_api_key="one,two").each_server()
+    told = [(s.llm_url, s.llm_api_key and s.llm_api_key.get_secret_value(), s.llm_model) for s in each]
+    assert told == [("http://a/v1", "one", None), ("http://b/v1", "two", None)]
+    each = Settings(llm_url=urls, llm_api_key="one", llm_model="m,").each_server()
+    assert [s.llm_model for s in each] == ["m", None]
+    assert {s.llm_api_key and s.llm_api_key.get_secret_value() for s in each} == {"one"}
