@@ -1,14 +1,15 @@
-# make install | demo | test | check | compose | clean
+# make install | demo | test | check | faults | soak | compose | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 TORCH_INDEX ?=
+MINUTES ?= 10
 TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
-.PHONY: help install demo test check compose clean
+.PHONY: help install demo test check faults soak compose clean
 .DEFAULT_GOAL := help
 
 help:
@@ -16,6 +17,8 @@ help:
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
 	@echo "make test      install, run the tests"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
+	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
+	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
 
 install: .venv/installed
@@ -39,6 +42,12 @@ check: install
 	PYTHONHASHSEED=0 $(BIN)/mypy
 	PYTHONHASHSEED=0 $(BIN)/mypy benchmarks
 	$(BIN)/lint-imports
+
+faults: install
+	$(BIN)/pytest -m faults --capture=tee-sys tests/faults
+
+soak: install
+	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)
 
 compose:
 	tests/e2e/compose.sh

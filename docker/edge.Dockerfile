@@ -18,7 +18,7 @@ COPY pyproject.toml ./
 # No source yet, so this installs an empty aic-vds with all that it requires, and outlives every edit of the source.
 # Torch's C++ headers and test programs are a fifth of it, and nothing here compiles. OR-Tools brings pandas.
 RUN touch README.md LICENSE \
- && pip install --constraint constraints.txt '.[service,planner,postgres]' \
+ && pip install --constraint constraints.txt '.[service,planner,otel,postgres]' \
  && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test pandas/tests
 
 # These files alone, so that an edit elsewhere does not bring the model again.

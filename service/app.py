@@ -24,6 +24,7 @@ from service.routes import router
 from service.settings import Settings
 from service.store import Store
 from service.tokens import TokenCounter
+from service.tracing import Traced, Traces, provider_from_environment
 from shared.wire import Problem
 
 
@@ -45,6 +46,8 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         BadKeys: the file of keys that the settings name cannot be used.
     """
 
+    traces = Traces(provider_from_environment(version("aic-vds")), settings)
+
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[State]:
         # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
@@ -53,7 +56,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         llm = Servers(settings, metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         await asyncio.to_thread(rehearse)
-        engine = Engine(settings, llm, counter, metrics, store)
+        engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine
         llm.start()
         try:
@@ -65,6 +68,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
             await asyncio.to_thread(engine.close)
             if store is not None:
                 store.close()
+            await asyncio.to_thread(traces.close)
 
     app = FastAPI(
         title="AIC-VDS edge",
@@ -78,6 +82,8 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     if settings.keys is not None:
         app.add_middleware(Guard, keys=Keys(settings.keys))
     app.add_middleware(CarefulHeaders)
+    if traces.provider is not None:
+        app.add_middleware(Traced)
     problems.install(app)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

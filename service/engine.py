@@ -8,11 +8,13 @@ import time
 import uuid
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from pydantic import TypeAdapter
 
+from service import logs
 from service.asking import Asking, Word
+from service.choice import RESERVE_S, Choice, Turn
 from service.compiler import Compiler
 from service.events import Counsel
 from service.guided import Deliberation
@@ -31,7 +33,8 @@ from service.settings import Settings, usable_cores
 from service.stopwatch import Stopwatch
 from service.store import Store
 from service.tokens import TokenCounter, with_usage
-from service.trust import LLM, Advice
+from service.tracing import Traces
+from service.trust import LLM
 from service.verifier import verify
 from service.view import View
 from shared.wire import (
@@ -40,17 +43,11 @@ from shared.wire import (
     DecideResponse,
     FeedbackRequest,
     FeedbackResponse,
-    Guided,
     Reason,
-    Source,
-    UavState,
 )
 
 log = logging.getLogger(__name__)
 
-_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
-# Kept back from the LLM's time for checking, answering and the way through the event loop.
-_RESERVE_S = 0.02
 # Of a batch's time, the most that the LLM may take which is asked about all of its UAVs at once, and the least that it
 # is asked for: what it leaves is for weighing one UAV's candidates after the other's, reckoned twice.
 _TOGETHER_MOST, _TOGETHER_LEAST = 0.75, 0.25
@@ -63,54 +60,19 @@ _LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 1.0
 _ANSWERS = TypeAdapter(list[DecideResponse])
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """One UAV's turn to be told: its attempt at this step, its time, and what has been begun for it.
-
-    ``word`` is there where the LLM has been asked about it already.
-    """
-
-    uav: UavState
-    step: int
-    attempt: int
-    deadline_ms: int
-    watch: Stopwatch
-    plan: asyncio.Task[None] | None
-    word: Word | None = None
-
-    @property
-    def deadline(self) -> float:
-        """When to have checked and answered, of ``time.perf_counter``."""
-        return self.watch.started + self.deadline_ms / 1e3 - _RESERVE_S
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """A sensor and a velocity, with the reason where the LLM had no part in them.
-
-    In mode ``guided`` also what the response tells of it, and the advice that trust learns from.
-    """
-
-    sensor_id: int
-    velocity: int
-    reason: Reason | None
-    completion: Completion | None
-    model: str | None
-    guided: Guided | None = None
-    advice: Advice | None = None
-
-    @property
-    def source(self) -> Source:
-        """Who decided."""
-        return "guided" if self.guided and self.reason is None else _SOURCES.get(self.reason, "policy")
-
-
 class Engine:
     """Decides for every mission of one service, and learns from what comes back."""
 
     def __init__(
-        self, settings: Settings, llm: Servers, counter: TokenCounter, metrics: Metrics, store: Store | None
+        self,
+        settings: Settings,
+        llm: Servers,
+        counter: TokenCounter,
+        metrics: Metrics,
+        traces: Traces,
+        store: Store | None,
     ) -> None:
+        self._traces = traces
         self._settings = settings
         self._llm = llm
         self.asking = Asking(llm, metrics, settings.llm_concurrency)
@@ -137,6 +99,7 @@ class Engine:
             key: a request that comes again under it gets the same answer.
         """
         watch = Stopwatch()
+        logs.bind(request.mission_id, request.step)
         mission = await self.missions.checked(request, may_make=may_make)
         ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
         return (await self._once(mission, key, request, lambda: self._one(mission, request, watch), ends))[0]
@@ -159,6 +122,7 @@ class Engine:
         while the plan is made; else about one after the other. Each UAV has an equal share of the time that is left.
         """
         watch = Stopwatch()
+        logs.bind(request.mission_id, request.step)
         mission = await self.missions.checked(request, may_make=may_make)
         ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
         return await self._once(mission, key, request, lambda: self._all(mission, request, watch, ends), ends)
@@ -253,6 +217,8 @@ class Engine:
             told.append(answer.model_copy(update={"stored": stored, "latency_ms": latency}))
         for answer in told if made else ():
             self._metrics.record_decision(answer)
+            self._traces.decided(answer)
+            logs.decided(answer)
         return told
 
     async def _decide(self, mission: Mission, turn: Turn) -> DecideResponse:
@@ -309,7 +275,7 @@ class Engine:
         """Begin to plan for UAVs of this step, where their mission's mode may need it."""
         if mission.planner is None or mission.mode == "value":
             return None
-        left = deadline - _RESERVE_S - time.perf_counter()
+        left = deadline - RESERVE_S - time.perf_counter()
         # In mode `guided` what comes after it, the LLM's answer mostly, is to have at least as much.
         seconds = min(self._settings.planner_ms / 1e3, left / 2 if mission.mode == "guided" else left)
         taken = mission.reserved(step, uavs[0])

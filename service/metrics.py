@@ -43,6 +43,7 @@ class Metrics:
         )
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
+        self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
         self.missions = Gauge("aicvds_missions", "Missions held, in memory or in the store", registry=r)
         self.store_seconds = Histogram(
             "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Depends, Header, Request, Response
@@ -146,6 +147,7 @@ async def readyz(request: Request) -> Readiness:
 async def metrics(request: Request) -> Response:
     """Prometheus metrics."""
     owned: Metrics = request.state.metrics
+    owned.tasks.set(len(asyncio.all_tasks()))
     return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 

@@ -74,17 +74,14 @@ def _serve(listener: socket.socket, host: str) -> int:
             "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
 
-    import logging
-
     import uvicorn
 
+    from service import logs
     from service.app import create_app
     from service.keys import BadKeys
     from service.store import Store, StoreUnusable
 
-    logging.basicConfig(level=settings.log_level.upper(), format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    # httpx logs every request at level info, address included.
-    logging.getLogger("httpx").setLevel(logging.WARNING)
+    logs.configure(settings.log_level, settings.log_format)
     try:
         app = create_app(settings, None if settings.store == "none" else Store(settings.store))
     except BadKeys as error:
@@ -93,6 +90,7 @@ def _serve(listener: socket.socket, host: str) -> int:
         return _refused(f"AICVDS_STORE: {error}. Give another, or `none` to keep nothing")
     config = uvicorn.Config(
         app,
+        log_config=None,
         log_level=settings.log_level,
         timeout_graceful_shutdown=_SHUTDOWN_S,
         access_log=settings.log_level == "debug",

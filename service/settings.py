@@ -139,6 +139,8 @@ class Settings(BaseSettings):
     # Where the model file and the token vocabulary live.
     cache_dir: Path = Field(default_factory=_default_cache)
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+    # `text` for people, `json` (an object a line) for machines.
+    log_format: Literal["text", "json"] = "text"
 
     @field_validator("llm_url")
     @classmethod

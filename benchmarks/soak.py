@@ -1,0 +1,234 @@
+"""A long flight of 200 missions against one edge: do its memory, tasks, connections and files stay what they are?
+
+    python benchmarks/soak.py --minutes 60
+
+Starts an edge with its embedded LLM and a store, and flies 190 missions of mode ``value`` and 10 of mode ``guided`` at
+once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, so
+the edge is measured once every mission has filled it: the slope of the resident memory by least squares, with its 95%
+interval, and the first and last count of tasks, connections and open files. Prints it, and writes the same as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import psutil
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+from scipy import stats
+
+from simulator.demo import HOST, usable_port
+
+MISSIONS, GUIDED, UAVS, SENSORS = 200, 10, 3, 10
+# Outcomes after which a mission remembers no more than before.
+FULL = 300
+SAMPLE_S = 2.0
+WORKERS = 3
+DELETED_ONE_IN = 2000
+
+
+@dataclass(frozen=True)
+class Soak:
+    """Fly 200 missions and watch the edge's memory."""
+
+    minutes: float = 10.0
+    """How long to measure, once every mission of mode value remembers as much as it can."""
+    out: Path = Path("runs/soak.json")
+    """Where to write the figures."""
+
+
+@dataclass
+class Mission:
+    """One fleet's place in its flight."""
+
+    name: str
+    mode: str
+    step: int = 0
+    owed: dict[int, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass
+class Sample:
+    """What the edge's process held at one time."""
+
+    at_s: float
+    resident_mb: float
+    tasks: float
+    connections: int
+    files: int
+
+
+def report(mission: Mission, uav: int, random_: random.Random) -> dict[str, Any]:
+    """A UAV that hears its ten sensors."""
+    return {
+        "uav_id": uav,
+        "position": [500.0 + 10 * uav, 450.0],
+        "sensors": {
+            "id": list(range(SENSORS)),
+            "x": [100.0 * i for i in range(SENSORS)],
+            "y": [90.0 * i for i in range(SENSORS)],
+            "queue": [random_.randrange(60) for _ in range(SENSORS)],
+            "battery": [40.0] * SENSORS,
+            "channel_gain": [-90.0] * SENSORS,
+            "last_seen": [mission.step] * SENSORS,
+        },
+        "outcome": mission.owed.get(uav),
+    }
+
+
+class Worker(threading.Thread):
+    """Flies its missions in turn, a fleet's step at a time."""
+
+    def __init__(self, url: str, missions: list[Mission], seed: int) -> None:
+        super().__init__(daemon=True)
+        self._url, self._missions, self._random = url, missions, random.Random(seed)
+        self.over = False
+        self.decisions = 0
+        self.error: str | None = None
+
+    def run(self) -> None:
+        try:
+            with httpx.Client(base_url=self._url, timeout=60) as client:
+                while not self.over:
+                    for mission in self._missions:
+                        self._turn(client, mission)
+        except (httpx.HTTPError, KeyError) as error:
+            if not self.over:
+                self.error = repr(error)
+
+    def _turn(self, client: httpx.Client, mission: Mission) -> None:
+        if self._random.randrange(DELETED_ONE_IN) == 0 and mission.step:
+            client.delete(f"/missions/{mission.name}").raise_for_status()
+            client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
+            mission.owed.clear()
+        body = {
+            "mission_id": mission.name,
+            "step": mission.step,
+            "uavs": [report(mission, uav, self._random) for uav in range(UAVS)],
+        }
+        key = {"Idempotency-Key": uuid.uuid4().hex}
+        for _ in range(1 + (self._random.randrange(20) == 0)):
+            answer = client.post("/decide/batch", json=body, headers=key)
+            answer.raise_for_status()
+        for told in answer.json()["decisions"]:
+            cost = self._random.random()
+            mission.owed[told["uav_id"]] = {"decision_id": told["decision_id"], "cost": cost, "failed": cost > 0.8}
+        mission.step += 1
+        self.decisions += UAVS
+
+
+def sample(url: str, process: psutil.Process, began: float) -> Sample:
+    """What the process holds now."""
+    lines = httpx.get(f"{url}/metrics", timeout=30).text.splitlines()
+    tasks = next(float(line.split()[1]) for line in lines if line.startswith("aicvds_tasks "))
+    return Sample(
+        at_s=time.monotonic() - began,
+        resident_mb=process.memory_info().rss / 1e6,
+        tasks=tasks,
+        connections=len(process.net_connections("tcp")),
+        files=process.num_fds(),
+    )
+
+
+def slope(samples: list[Sample]) -> tuple[float, float]:
+    """Megabytes an hour of the resident memory, and half of its 95% interval, by least squares over 20 means.
+
+    Successive samples are alike, so that the interval of all of them would be too narrow.
+    """
+    parts = np.array_split(np.array([[s.at_s / 3600, s.resident_mb] for s in samples]), min(20, len(samples)))
+    hours, megabytes = np.array([part.mean(axis=0) for part in parts]).T
+    fit = stats.linregress(hours, megabytes)
+    return float(fit.slope), float(stats.t.ppf(0.975, len(parts) - 2) * fit.stderr)
+
+
+def main() -> int:
+    """Returns 0 where nothing grows."""
+    options, console = tyro.cli(Soak, description=__doc__), Console()
+    missions = [Mission(f"soak{n}", "guided" if n < GUIDED else "value") for n in range(MISSIONS)]
+    with tempfile.TemporaryDirectory() as folder:
+        port = usable_port(0)
+        url = f"http://{HOST}:{port}"
+        settings = {"AICVDS_STORE": f"{folder}/missions.db", "AICVDS_LOG_LEVEL": "warning"}
+        command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+        with subprocess.Popen(command, env={**os.environ, **settings}) as edge:
+            try:
+                samples, decisions = _fly(url, edge.pid, missions, options.minutes, console)
+            finally:
+                edge.terminate()
+    return _tell(samples, decisions, options, console)
+
+
+def _fly(url: str, pid: int, missions: list[Mission], minutes: float, console: Console) -> tuple[list[Sample], int]:
+    with httpx.Client(base_url=url, timeout=300) as client:
+        while client.get("/readyz").json()["llm"] == "loading":
+            time.sleep(0.5)
+        for mission in missions:
+            client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
+    shares = [missions[:GUIDED], *(missions[GUIDED + worker :: WORKERS] for worker in range(WORKERS))]
+    workers = [Worker(url, share, seed) for seed, share in enumerate(shares)]
+    for worker in workers:
+        worker.start()
+    process, samples = psutil.Process(pid), list[Sample]()
+    with Progress(console=console) as progress:
+        filling = progress.add_task("filling", total=FULL // UAVS)
+        while (least := min(mission.step for mission in missions[GUIDED:])) < FULL // UAVS:
+            progress.update(filling, completed=least)
+            _check(workers)
+            time.sleep(1)
+        began = time.monotonic()
+        measuring = progress.add_task("measuring", total=minutes * 60)
+        while time.monotonic() < began + minutes * 60:
+            samples.append(sample(url, process, began))
+            progress.update(measuring, completed=samples[-1].at_s)
+            _check(workers)
+            time.sleep(SAMPLE_S)
+    for worker in workers:
+        worker.over = True
+    for worker in workers:
+        worker.join(timeout=60)
+    return samples, sum(worker.decisions for worker in workers)
+
+
+def _check(workers: list[Worker]) -> None:
+    if faults := [worker.error for worker in workers if worker.error]:
+        raise SystemExit(f"soak: {faults[0]}")
+
+
+def _tell(samples: list[Sample], decisions: int, options: Soak, console: Console) -> int:
+    tenth = max(1, len(samples) // 10)
+    grown, half = slope(samples)
+    figures: dict[str, Any] = {
+        "minutes": options.minutes,
+        "missions": MISSIONS,
+        "decisions": decisions,
+        "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
+        "slope_mb_an_hour": [round(grown, 2), round(grown - half, 2), round(grown + half, 2)],
+    }
+    for name in ("tasks", "connections", "files"):
+        counts = [getattr(s, name) for s in samples]
+        figures[name] = [max(counts[:tenth]), max(counts[-tenth:])]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(figures, indent=2) + "\n")
+    for name, figure in figures.items():
+        console.print(f"{name:>18}  {figure}")
+    grew = [name for name in ("tasks", "connections", "files") if figures[name][1] > figures[name][0] + 5]
+    console.print("grows: " + ", ".join(grew) if grew else "no count grows")
+    return 1 if grew or grown - half > 1.0 else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

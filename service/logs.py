@@ -1,0 +1,68 @@
+"""Logs, as text for people or as JSON for machines: what is bound to a request stands in each of its lines."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from typing import Literal
+
+import structlog
+from structlog.typing import Processor
+
+from shared.wire import DecideResponse
+
+log = logging.getLogger(__name__)
+
+
+def configure(level: str, form: Literal["text", "json"]) -> None:
+    """Send every log of this process to stderr in this form; ``logging``'s ``extra`` and bound names become fields."""
+    shared: list[Processor] = [
+        structlog.contextvars.merge_contextvars,
+        structlog.stdlib.add_log_level,
+        structlog.stdlib.add_logger_name,
+        structlog.stdlib.ExtraAdder(),
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    ending: list[Processor] = (
+        [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+        if form == "json"
+        else [structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())]
+    )
+    handler = logging.StreamHandler()
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            foreign_pre_chain=shared, processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *ending]
+        )
+    )
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    # httpx logs every request at level info, address included.
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+
+
+def bind(mission_id: str, step: int) -> None:
+    """Name these in every line of the request at hand."""
+    structlog.contextvars.clear_contextvars()
+    structlog.contextvars.bind_contextvars(mission_id=mission_id, step=step)
+
+
+def decided(answer: DecideResponse) -> None:
+    """One line a decision; at level warning where it was late."""
+    late = answer.latency_ms["total"] > answer.deadline_ms
+    log.log(
+        logging.WARNING if late else logging.INFO,
+        "late decision" if late else "decision",
+        extra={
+            "decision_id": answer.decision_id,
+            "mission_id": answer.mission_id,
+            "uav_id": answer.uav_id,
+            "step": answer.step,
+            "sensor_id": answer.sensor_id,
+            "velocity": answer.velocity,
+            "source": answer.source,
+            "reason": answer.reason,
+            "model": answer.model,
+            "total_ms": answer.latency_ms["total"],
+            "llm_ms": answer.latency_ms.get("llm"),
+            "stored": answer.stored,
+        },
+    )
