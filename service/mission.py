@@ -287,7 +287,8 @@ class Mission:
     def apply(self, outcome: Outcome) -> Sample | None:
         """Record the outcome of a pending decision; returns what the modules saw, to learn from.
 
-        A failed transmission was no visit: the visiting record goes back to the latest visit that was one.
+        Of a UAV that asked more than once at a step only the decision that stands teaches anything: one that asks
+        again and again has no more say than the others. A failed transmission was no visit: the visiting record goes back to the latest visit that was one.
         """
         decision = self._pending.pop(outcome.decision_id)
         self._applied[decision.decision_id] = outcome.cost, outcome.failed
@@ -298,13 +299,16 @@ class Mission:
             self.records.withdraw(decision.sensor_id, decision.decision_id)
         else:
             self.records.confirm(decision.sensor_id, decision.decision_id, decision.step)
+        self.record(Settled(outcome))
+        standing = self.turns.given(decision.step, decision.uav_id)
+        if standing is not None and standing.decision_id != decision.decision_id:
+            return None
         line = self.template.experience(decision.seen, decision.sensor_id, decision.velocity, outcome.cost)
         sample = decision.sample
         features = None if sample is None else sample.features[sample.chosen].copy()
         self.memory.remember(Experience(line, outcome.cost, features))
         for trust in self.trust.values():
             trust.settle(outcome.decision_id, outcome.cost)
-        self.record(Settled(outcome))
         return sample
 
     def state_dict(self) -> dict[str, Any]:

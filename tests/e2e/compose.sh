@@ -60,6 +60,9 @@ fetch() { # url
 opener = u.build_opener(u.ProxyHandler({}))
 sys.stdout.write(opener.open(sys.argv[1], timeout=5).read().decode())' "$1"
 }
+answered() { # how many decisions the edge has answered since it started
+  fetch "$(published edge 8000)/metrics" | awk '/^aicvds_decisions_total[{ ]/ {n += $NF} END {print n + 0}'
+}
 llm_of() { # container: what its /readyz says of the LLM, asked from inside
   docker exec "$1" python -c 'import json, urllib.request as u
 print(json.load(u.urlopen("http://127.0.0.1:8000/readyz", timeout=2))["llm"])' 2>/dev/null || true
@@ -119,7 +122,7 @@ PYTHON
 say "the simulator flew 90 decisions and ended with exit code 0"
 
 # --- measured --------------------------------------------------------------------------------------------------------
-counted=$(fetch "$(published edge 8000)/metrics" | awk '/^aicvds_decisions_total[{ ]/ {n += $NF} END {print n + 0}')
+counted=$(answered)
 [[ $counted == 90 ]] || fail "/metrics counts $counted decisions"
 prometheus=$(published prometheus 9090)
 for _ in {1..30}; do
@@ -131,6 +134,38 @@ print(*(sample["value"][1] for sample in json.load(sys.stdin)["data"]["result"])
 done
 [[ $scraped == 90 ]] || fail "Prometheus knows of '$scraped' decisions"
 say "/metrics counts 90 decisions, and Prometheus has scraped them"
+
+# --- killed in mid-mission -------------------------------------------------------------------------------------------
+flown=$(answered)
+export AICVDS_SEED=1
+quietly compose up --detach --no-deps --force-recreate simulator
+simulator=$(container simulator)
+begin=$SECONDS
+until (($(answered) > flown + 30)); do
+  ((SECONDS - begin < FLIGHT_S)) || fail "the second mission does not begin"
+  sleep 0.3
+done
+quietly compose kill -s KILL edge
+quietly compose up --detach --no-recreate edge
+code=$(timeout "$FLIGHT_S" docker wait "$simulator") || fail "the second simulator did not end within $FLIGHT_S s"
+[[ $code == 0 ]] || fail "the second simulator ended with exit code $code"
+rm -rf "$WORK/run"
+docker cp "$simulator:/runs/compose" "$WORK/run" >/dev/null
+mission=$(python3 -c 'import json, sys; print(json.load(open(sys.argv[1]))["mission_id"])' "$WORK/run/summary.json")
+fetch "$(published edge 8000)/missions/$mission" >"$WORK/mission.json"
+python3 - "$WORK/run/summary.json" "$WORK/mission.json" <<'PYTHON'
+import json, sys
+
+summary, mission = (json.load(open(path)) for path in sys.argv[1:])
+told = summary["decisions"] - summary["by_source"]["onboard"]
+print("       ", summary["by_source"], {key: mission[key] for key in ("decisions", "feedback", "learner_updates")})
+if told < 60 or told == summary["decisions"]:
+    sys.exit("FAIL: the edge was not killed in mid-mission, or hardly came back")
+if mission["feedback"] != told or mission["decisions"] < told:
+    sys.exit(f"FAIL: of {told} decisions told the edge knows {mission['decisions']}, and {mission['feedback']} outcomes")
+PYTHON
+edge=$(container edge)
+say "the edge was killed in mid-mission and came back: every decision and outcome is there"
 
 # --- what the images hold --------------------------------------------------------------------------------------------
 edge_image=$(docker inspect --format '{{.Image}}' "$edge")

@@ -150,3 +150,12 @@ def test_one_uav_that_retries_forgets_only_its_own_decisions() -> None:
     for number in range(2, 60):
         decide(m, number, step=number, uav_id=0)
     assert m.find(outcome(other)) == "pending"
+
+
+def test_a_uav_that_asks_again_and_again_teaches_once_a_step() -> None:
+    m = mission(experiences=8)
+    ids = [decide(m, number, step=5) for number in range(1, 6)]
+    assert [m.apply(outcome(name)) is not None for name in ids] == [False, False, False, False, True]
+    assert (m.feedback, len(m.experiences)) == (5, 1)
+    # It was there all the same.
+    assert m.visits[1] == 5
