@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
+import logging.handlers
+import queue
 import sys
+import threading
+from contextlib import suppress
 from typing import Literal
 
 import structlog
@@ -12,6 +17,42 @@ from structlog.typing import Processor
 from shared.wire import DecideResponse
 
 log = logging.getLogger(__name__)
+
+_MOST_WAITING = 10_000
+_LAST_WORDS_S = 1.0
+
+
+class _Patient(logging.handlers.QueueHandler):
+    """Writes to stderr from a thread of its own: where nobody reads it, or its disk is slow, no decision waits for it.
+
+    What does not fit into the queue is dropped, and how much that was is told when there is room again.
+    """
+
+    def start(self) -> None:
+        """Begin to write, until the process ends; then what is waiting gets a moment."""
+        self._dropped = 0
+        self._writer = threading.Thread(target=self._write, name="logs", daemon=True)
+        self._writer.start()
+        atexit.register(self._end)
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Never waits."""
+        try:
+            self.queue.put_nowait(record.getMessage())
+            if self._dropped:
+                dropped, self._dropped = self._dropped, 0
+                self.queue.put_nowait(f"{dropped} lines of the log were dropped: nobody took them")
+        except queue.Full:
+            self._dropped += 1
+
+    def _write(self) -> None:
+        while (line := self.queue.get()) is not None:
+            print(line, file=sys.stderr, flush=True)
+
+    def _end(self) -> None:
+        with suppress(queue.Full):
+            self.queue.put_nowait(None)
+        self._writer.join(timeout=_LAST_WORDS_S)
 
 
 def configure(level: str, form: Literal["text", "json"]) -> None:
@@ -28,13 +69,14 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
         if form == "json"
         else [structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())]
     )
-    handler = logging.StreamHandler()
+    handler = _Patient(queue.Queue(_MOST_WAITING))
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared, processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *ending]
         )
     )
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    handler.start()
     # httpx logs every request at level info, address included.
     logging.getLogger("httpx").setLevel(logging.WARNING)
 

@@ -288,7 +288,8 @@ class Mission:
         """Record the outcome of a pending decision; returns what the modules saw, to learn from.
 
         Of a UAV that asked more than once at a step only the decision that stands teaches anything: one that asks
-        again and again has no more say than the others. A failed transmission was no visit: the visiting record goes back to the latest visit that was one.
+        again and again has no more say than the others. A failed transmission was no visit: the visiting record goes
+        back to the latest visit that was one.
         """
         decision = self._pending.pop(outcome.decision_id)
         self._applied[decision.decision_id] = outcome.cost, outcome.failed

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -141,3 +142,18 @@ def test_an_llm_that_fails_is_an_error_in_the_trace(report: Report) -> None:
     asked = next(span for span in spans if span.name.startswith("chat"))
     assert told(asked)["error.type"] == "llm_status"
     assert asked.status.code == 2
+
+
+def test_a_log_that_nobody_reads_keeps_no_uav_waiting(report: Report) -> None:
+    """A pipe holds 64 KB; past that, who writes to it waits."""
+    with (
+        serving_edge(AICVDS_MODE="value", AICVDS_LOG_LEVEL="debug") as (url, process),
+        httpx.Client(base_url=url, timeout=30) as client,
+    ):
+        for step in range(600):
+            assert client.post("/decide", json=report(step=step)).status_code == 200
+        began = time.monotonic()
+        process.terminate()
+        # Nor is the end waited for.
+        assert process.wait(timeout=20) in (0, -15)
+        assert time.monotonic() - began < 15
