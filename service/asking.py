@@ -157,8 +157,8 @@ class Asking:
         return self._llm.model if completion is None else completion.model
 
     def _knows(self, completion: Completion | None, static: str, lists: Sequence[Sequence[str]]) -> bool:
-        model = self._model(completion)
-        return self._labels.bias(model, static, len(lists)) is not None and self._llm.logprobs
+        known = self._labels.bias(self._model(completion), static, len(lists)) is not None
+        return known and completion is not None and bool(completion.places)
 
     async def _within(self, asked: Coroutine[Any, Any, Completion], deadline: float) -> Completion:
         if len(self._waiting) >= self._most:

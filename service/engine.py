@@ -56,7 +56,7 @@ _OWN_S, _OWN_MEMORY = 0.03, 20
 # The longest that an answer waits for the disk; where that takes longer, it goes out and says so.
 _STORE_S = 1.0
 # The last checkpoints, and the last commit, when the service ends.
-_LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 1.0
+_LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 2.5
 _ANSWERS = TypeAdapter(list[DecideResponse])
 
 
@@ -89,6 +89,7 @@ class Engine:
     def close(self) -> None:
         """Finish the lessons and the plans in hand, drop those that are queued, and write what is to be kept."""
         self._planning.shutdown(wait=True, cancel_futures=True)
+        self.missions.close()
         self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
         self.keeper.close(_LAST_COMMIT_S)
 
@@ -100,8 +101,9 @@ class Engine:
         """
         watch = Stopwatch()
         logs.bind(request.mission_id, request.step)
-        mission = await self.missions.checked(request, may_make=may_make)
         ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
+        within_s = ends - RESERVE_S - time.perf_counter()
+        mission = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
         return (await self._once(mission, key, request, lambda: self._one(mission, request, watch), ends))[0]
 
     async def _one(self, mission: Mission, request: DecideRequest, watch: Stopwatch) -> list[DecideResponse]:
@@ -123,8 +125,9 @@ class Engine:
         """
         watch = Stopwatch()
         logs.bind(request.mission_id, request.step)
-        mission = await self.missions.checked(request, may_make=may_make)
         ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
+        within_s = ends - RESERVE_S - time.perf_counter()
+        mission = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
         return await self._once(mission, key, request, lambda: self._all(mission, request, watch, ends), ends)
 
     async def _all(
@@ -174,12 +177,16 @@ class Engine:
             Unavailable: the store fails, or is slow; to be sent again.
         """
         mission = await self.missions.get(request.mission_id)
-        if self.keeper.failing:
-            raise Unavailable("decision_id", "the store fails: nothing was recorded, send it again")
+        self.refuse_if_failing("decision_id")
         result = self._outcomes.apply(mission, request)
         self._outcomes.checkpoint(mission)
         await self.kept("decision_id")
         return FeedbackResponse(decision_id=request.decision_id, result=result)
+
+    def refuse_if_failing(self, field: str) -> None:
+        """Raises ``Unavailable`` while the store fails, before anything is recorded."""
+        if self.keeper.failing:
+            raise Unavailable(field, "the store fails: nothing was recorded, send it again")
 
     async def kept(self, field: str) -> None:
         """Wait until all that happened so far is on disk; raises ``Unavailable`` where it is not in time."""

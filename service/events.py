@@ -70,9 +70,10 @@ class Decided:
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What came of a decision."""
+    """What came of a decision, and whether the modules learn from it: under too heavy a load they do not."""
 
     outcome: Outcome
+    taught: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +99,8 @@ def encode(event: Event) -> tuple[Kind, bytes]:
         case Decided(decision, attempt, counsel):
             told = None if counsel is None else [counsel.model, counsel.advice.state_dict()]
             return "decided", pack([decision.state_dict(), attempt, told])
-        case Settled(outcome):
-            return "settled", pack(outcome.model_dump(include=_OUTCOME))
+        case Settled(outcome, taught):
+            return "settled", pack([outcome.model_dump(include=_OUTCOME), taught])
         case Guided(state):
             return "guided", pack(state)
         case Answered(key, digest, body):
@@ -117,7 +118,7 @@ def decode(kind: str, data: bytes) -> Event:
                 counsel = None if body[2] is None else Counsel(body[2][0], Advice(**body[2][1]))
                 return Decided(Pending.of(body[0]), body[1], counsel)
             case "settled":
-                return Settled(Outcome.model_validate(body))
+                return Settled(Outcome.model_validate(body[0]), body[1])
             case "guided":
                 return Guided(body)
             case "answered":

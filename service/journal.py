@@ -12,32 +12,37 @@ import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, Protocol
 
-from sqlalchemy.exc import SQLAlchemyError
-
-from service.events import Event, Reported
+from service.events import Decided, Event
 from service.metrics import Metrics
 from service.mission import Mission
 from service.store import Checkpoint, Deleted, Entry, Item, Made, Store
 
 log = logging.getLogger(__name__)
 
-# A mission is checkpointed after so many events, so that it is read back in a fraction of a second. Each event of a
-# large network counts for one more a thousand sensors.
+# A mission is checkpointed after so many events, so that it is read back in a fraction of a second. A lesson takes a
+# millisecond with 10 sensors, some 100 with 1,000 times as many: it counts for one more every hundred sensors.
 _EVENTS = 256
-_SENSORS = 1000
+_SENSORS = 100
 _MOST_AT_ONCE = 1000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
 
 
 class Track:
-    """One mission's place in the journal: ``seq`` is its newest event's."""
+    """A mission's place in the journal.
 
-    def __init__(self, mission_id: str, seq: int) -> None:
-        self.mission_id = mission_id
+    Attributes:
+        seq: its newest event's.
+        since: what it would take to read it back, in events, since its last checkpoint.
+        over: it was deleted; what still happens to it is nobody's business, and another may have its ID.
+    """
+
+    def __init__(self, mission: Mission, seq: int, since: int) -> None:
+        self.mission = mission
         self.seq = seq
-        self.since = 0
+        self.since = since
         self.over = False
 
 
@@ -105,43 +110,56 @@ class Journal:
 
     def begin(self, mission: Mission) -> None:
         """A mission is made, and its events are heard from now on."""
-        self._add(Made(mission.mission_id, mission.asked_for, mission.spec))
-        self.follow(mission, 0)
+        with self._changed:
+            self._add(Made(mission.mission_id, mission.asked_for, mission.spec))
+        self.follow(mission, 0, [])
 
-    def follow(self, mission: Mission, seq: int) -> None:
-        """Hear a mission's events, of which so many are in the store."""
-        track = self._tracks[mission.mission_id] = Track(mission.mission_id, seq)
+    def follow(self, mission: Mission, seq: int, played: Sequence[Event]) -> None:
+        """Hear a mission's events, of which so many are in the store, these since its last checkpoint."""
+        track = Track(mission, seq, sum(map(_weight, played)))
+        self._tracks[mission.mission_id] = track
 
         def record(event: Event) -> None:
-            track.seq += 1
-            track.since += 1 + (len(event.uav.sensors.id) // _SENSORS if isinstance(event, Reported) else 0)
-            self._add(Entry(track.mission_id, track.seq, event))
+            with self._changed:
+                if track.over:
+                    return
+                track.seq += 1
+                track.since += _weight(event)
+                self._add(Entry(mission.mission_id, track.seq, event))
 
         mission.record = record
 
     def end(self, mission_id: str) -> None:
         """A mission is deleted."""
-        if (track := self._tracks.pop(mission_id, None)) is not None:
-            track.over = True
-        self._add(Deleted(mission_id))
+        with self._changed:
+            if (track := self._tracks.pop(mission_id, None)) is not None:
+                track.over = True
+            self._add(Deleted(mission_id))
 
     def due(self, mission: Mission, least: int = _EVENTS) -> Track | None:
         """The mission's track, where it has so many events since its last checkpoint; they are counted anew then."""
         track = self._tracks.get(mission.mission_id)
-        if track is None or track.since < least:
+        if track is None or track.mission is not mission or track.since < least:
             return None
         track.since = 0
         return track
 
     def checkpoint(self, track: Track, seq: int, state: dict[str, Any]) -> None:
-        """Keep a mission's state after event ``seq`` in place of the events until then."""
+        """Keep a mission's state after event ``seq`` in place of the events until then.
+
+        While the store fails events would gather without end, so those that the checkpoint stands for leave the queue.
+        It takes the place of the last of them: what comes after is written no sooner than it.
+        """
+        taken = Checkpoint(track.mission.mission_id, seq, state)
         with self._changed:
             if track.over:
                 return
-            made, self._queue = self._queue, deque()
-            # While the store fails, events would gather without end; the checkpoint stands for them.
-            self._queue.extend(entry for entry in made if not _covered(entry[1], track.mission_id, seq))
-        self._add(Checkpoint(track.mission_id, seq, state))
+            covered = [ticket for ticket, item in self._queue if _covered(item, taken)]
+            if not covered:
+                self._add(taken)
+                return
+            kept = [(ticket, item) for ticket, item in self._queue if not _covered(item, taken)]
+            self._queue = deque(sorted([*kept, (covered[-1], taken)], key=lambda entry: entry[0]))
 
     async def stored(self, within_s: float) -> bool:
         """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
@@ -169,10 +187,10 @@ class Journal:
         return not self._queue
 
     def _add(self, item: Item) -> None:
-        with self._changed:
-            self._added += 1
-            self._queue.append((self._added, item))
-            self._changed.notify()
+        """The caller holds the lock."""
+        self._added += 1
+        self._queue.append((self._added, item))
+        self._changed.notify()
 
     def _write(self) -> None:
         pause_s = _FIRST_PAUSE_S
@@ -185,7 +203,7 @@ class Journal:
             begun = time.perf_counter()
             try:
                 self._store.write([item for _, item in batch])
-            except (SQLAlchemyError, TypeError, ValueError) as error:
+            except Exception as error:
                 self._fail(error)
                 with self._changed:
                     if self._closing or self._changed.wait_for(lambda: self._closing, timeout=pause_s):
@@ -201,8 +219,12 @@ class Journal:
     def _done(self, batch: list[tuple[int, Item]]) -> None:
         last = batch[-1][0]
         with self._changed:
-            while self._queue and self._queue[0][0] <= last:
+            # A checkpoint may have come into their midst meanwhile.
+            done = {id(item) for _, item in batch}
+            while self._queue and id(self._queue[0][1]) in done:
                 self._queue.popleft()
+            if self._queue and self._queue[0][0] <= last:
+                self._queue = deque(entry for entry in self._queue if id(entry[1]) not in done)
         if self._failing:
             log.warning("the store works again")
         self._failing = False
@@ -220,9 +242,10 @@ class Journal:
         try:
             self._store.write([item for _, item in self._queue])
             self._queue.clear()
-        except (SQLAlchemyError, TypeError, ValueError):
+        except Exception:
             log.error(
-                "the store failed to the end: %d changes are not on disk, none of them acknowledged", len(self._queue)
+                "the store failed to the end: %d changes are not on disk, no outcome among them was acknowledged",
+                len(self._queue),
             )
 
     def _tell(self) -> None:
@@ -235,5 +258,12 @@ class Journal:
                 waiting.set_result(ticket <= self._written)
 
 
-def _covered(item: Item, mission_id: str, seq: int) -> bool:
-    return isinstance(item, Entry | Checkpoint) and item.mission_id == mission_id and item.seq <= seq
+def _weight(event: Event) -> int:
+    """What it takes to play an event again, in events of a small network: a lesson grows with the sensors."""
+    if isinstance(event, Decided) and event.decision.sample is not None:
+        return 1 + len(event.decision.sample.features) // _SENSORS
+    return 1
+
+
+def _covered(item: Item, by: Checkpoint) -> bool:
+    return isinstance(item, Entry | Checkpoint) and item.mission_id == by.mission_id and item.seq <= by.seq

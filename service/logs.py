@@ -40,14 +40,18 @@ class _Patient(logging.handlers.QueueHandler):
         try:
             self.queue.put_nowait(record.getMessage())
             if self._dropped:
-                dropped, self._dropped = self._dropped, 0
-                self.queue.put_nowait(f"{dropped} lines of the log were dropped: nobody took them")
+                said = "%d lines of the log were dropped: nobody took them"
+                about = logging.LogRecord(__name__, logging.WARNING, __file__, 0, said, (self._dropped,), None)
+                self.queue.put_nowait(self.format(about))
+                self._dropped = 0
         except queue.Full:
             self._dropped += 1
 
     def _write(self) -> None:
         while (line := self.queue.get()) is not None:
-            print(line, file=sys.stderr, flush=True)
+            # A full disk, say; it may have room again.
+            with suppress(OSError, ValueError):
+                print(line, file=sys.stderr, flush=True)
 
     def _end(self) -> None:
         with suppress(queue.Full):
@@ -67,7 +71,8 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
     ending: list[Processor] = (
         [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
         if form == "json"
-        else [structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())]
+        # The other formatters print local variables, keys among them.
+        else [structlog.dev.ConsoleRenderer(sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)]
     )
     handler = _Patient(queue.Queue(_MOST_WAITING))
     handler.setFormatter(

@@ -284,7 +284,7 @@ class Mission:
             self.trust_in(counsel.model).note(decision.decision_id, counsel.advice)
         self.record(Decided(decision, attempt, counsel))
 
-    def apply(self, outcome: Outcome) -> Sample | None:
+    def apply(self, outcome: Outcome, *, taught: bool = True) -> Sample | None:
         """Record the outcome of a pending decision; returns what the modules saw, to learn from.
 
         Of a UAV that asked more than once at a step only the decision that stands teaches anything: one that asks
@@ -300,7 +300,7 @@ class Mission:
             self.records.withdraw(decision.sensor_id, decision.decision_id)
         else:
             self.records.confirm(decision.sensor_id, decision.decision_id, decision.step)
-        self.record(Settled(outcome))
+        self.record(Settled(outcome, taught))
         standing = self.turns.given(decision.step, decision.uav_id)
         if standing is not None and standing.decision_id != decision.decision_id:
             return None

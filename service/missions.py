@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -18,6 +19,9 @@ from service.store import Store
 from shared.wire import BatchRequest, DecideRequest, MissionSpec
 
 log = logging.getLogger(__name__)
+
+# The longest that who asks about a mission waits for its being read back; a decision no longer than its deadline.
+_WAKE_S = 10.0
 
 
 class Missions:
@@ -42,6 +46,9 @@ class Missions:
         self._missions: dict[str, Mission] = {}
         self._asleep = set[str]() if store is None else set(store.missions())
         self._waking: dict[str, asyncio.Task[Mission]] = {}
+        # One after another, and apart from what decisions need: a store that hangs must not keep these waiting, and
+        # torch draws initial weights from one generator.
+        self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
         self._count()
 
     @property
@@ -49,28 +56,37 @@ class Missions:
         """Those in memory."""
         return list(self._missions.values())
 
-    async def get(self, mission_id: str) -> Mission:
-        """A mission.
+    async def get(self, mission_id: str, within_s: float = _WAKE_S) -> Mission:
+        """A mission, waited for where the store must be read.
 
         Raises:
             NotFound: there is none.
-            Unavailable: the store cannot be read.
+            Unavailable: the store cannot be read, or takes longer.
             Conflict: what the store has of it is damaged.
         """
-        mission = await self._find(mission_id)
+        mission = await self._find(mission_id, within_s)
         if mission is None:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
 
-    async def checked(self, request: DecideRequest | BatchRequest, *, may_make: bool = True) -> Mission:
+    async def checked(
+        self, request: DecideRequest | BatchRequest, *, may_make: bool, key: str | None, within_s: float
+    ) -> Mission:
         """The mission for a request that fits it; one with scenario ``paper`` is made on first use, where one may.
+
+        Args:
+            key: a request that was answered under it already fits.
+            within_s: to wait, at most, for a mission that must be read back.
 
         Raises:
             NotFound: there is no such mission, and none may be made.
+            Unavailable, Conflict: as :meth:`get`.
             Refused: a UAV's report does not fit the mission's world; nothing was recorded.
         """
         mission_id = request.mission_id
-        mission = await self._find(mission_id)
+        mission = await self._find(mission_id, within_s)
+        if mission is not None and key is not None and mission.repeats.knows(key):
+            return mission
         if mission is None and not may_make:
             raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
         mission = mission or Mission(mission_id, MissionSpec(), self._settings)
@@ -87,9 +103,11 @@ class Missions:
 
         Raises:
             Conflict: the mission flies with another spec.
+            Unavailable: the store fails.
         """
-        mission = await self._find(mission_id)
+        mission = await self._find(mission_id, _WAKE_S)
         if mission is None:
+            self._refuse_if_failing()
             mission = Mission(mission_id, spec, self._settings)
             self._add(mission)
         elif mission.asked_for != spec:
@@ -97,7 +115,8 @@ class Missions:
         return mission
 
     async def delete(self, mission_id: str) -> None:
-        """Forget a mission; raises :class:`NotFound`."""
+        """Forget a mission; raises :class:`NotFound`, or :class:`Unavailable` while the store fails."""
+        self._refuse_if_failing()
         if (waking := self._waking.get(mission_id)) is not None:
             await asyncio.wait({waking})
         if mission_id not in self._missions and mission_id not in self._asleep:
@@ -107,13 +126,25 @@ class Missions:
         self._keeper.end(mission_id)
         self._count()
 
-    async def _find(self, mission_id: str) -> Mission | None:
+    def _refuse_if_failing(self) -> None:
+        if self._keeper.failing:
+            raise Unavailable("mission_id", "the store fails: nothing was changed, send it again")
+
+    def close(self) -> None:
+        """Read no more."""
+        self._reading.shutdown(wait=False, cancel_futures=True)
+
+    async def _find(self, mission_id: str, within_s: float) -> Mission | None:
         if mission_id in self._asleep:
             waking = self._waking.get(mission_id)
             if waking is None:
                 waking = self._waking[mission_id] = asyncio.create_task(self._wake(mission_id), name="wake-mission")
                 waking.add_done_callback(lambda _: self._waking.pop(mission_id, None))
-            return await asyncio.shield(waking)
+            await asyncio.wait({waking}, timeout=max(0.0, within_s))
+            if not waking.done():
+                raise Unavailable("mission_id", f"mission {mission_id} is being read back from the store")
+            # Raises what it raised. It may have been deleted since.
+            waking.result()
         return self._missions.get(mission_id)
 
     async def _wake(self, mission_id: str) -> Mission:
@@ -121,17 +152,18 @@ class Missions:
         assert self._store is not None and isinstance(self._keeper, Journal)
         store = self._store
         try:
-            kept = await asyncio.to_thread(store.load, mission_id)
+            loop = asyncio.get_running_loop()
+            kept = await loop.run_in_executor(self._reading, store.load, mission_id)
             if kept is None:
                 raise ValueError("it is gone from the store")
-            mission = await asyncio.to_thread(revived, mission_id, kept, self._settings)
+            mission = await loop.run_in_executor(self._reading, revived, mission_id, kept, self._settings)
         except SQLAlchemyError as error:
             log.error("mission %s: the store cannot be read: %s", mission_id, str(error).splitlines()[0])
             raise Unavailable("mission_id", "the store cannot be read; its log says more") from None
         except ValueError as error:
             log.error("mission %s is damaged: %s", mission_id, error)
             raise Conflict("mission_id", f"what the store has of {mission_id} is damaged: DELETE it") from None
-        self._keeper.follow(mission, kept.seq)
+        self._keeper.follow(mission, kept.seq, kept.events)
         self._missions[mission_id] = mission
         self._asleep.discard(mission_id)
         self._on_wake(mission)

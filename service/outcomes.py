@@ -37,9 +37,12 @@ class Outcomes:
                 # Forged or mistaken: as the worst that can be, it spoils neither the modules nor the prompt.
                 self._metrics.costs_clipped.inc()
                 outcome = outcome.model_copy(update={"cost": mission.most_cost})
-            sample = mission.apply(outcome)
-            if sample is not None and self._room.acquire(blocking=False):
+            taught = self._room.acquire(blocking=False)
+            sample = mission.apply(outcome, taught=taught)
+            if sample is not None and taught:
                 self._learning.submit(self._learn, mission, sample, outcome.cost)
+            elif taught:
+                self._room.release()
             elif sample is not None:
                 log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
         self._metrics.feedback.labels(result).inc()
@@ -69,8 +72,15 @@ class Outcomes:
 
     def _learn(self, mission: Mission, sample: Sample, cost: float) -> None:
         try:
-            self._metrics.learner_loss.set(mission.learner.update(sample, cost))
-        except Exception:
-            log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
+            learn(mission, sample, cost)
+            self._metrics.learner_loss.set(mission.learner.last_loss or 0.0)
         finally:
             self._room.release()
+
+
+def learn(mission: Mission, sample: Sample, cost: float) -> None:
+    """One lesson; one that fails is told and left out."""
+    try:
+        mission.learner.update(sample, cost)
+    except Exception:
+        log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)

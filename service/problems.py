@@ -48,7 +48,7 @@ class Conflict(Refused):
 
 
 class Unavailable(Refused):
-    """The request is right, and will be served once the edge can; nothing was recorded for it."""
+    """The request is right, and the edge cannot serve it now, or not for sure: to be sent again."""
 
     status = HTTPStatus.SERVICE_UNAVAILABLE
 

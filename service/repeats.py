@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from service.problems import Refused
+from service.problems import Refused, Unavailable
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,8 @@ class Repeats:
             body = await make()
         except BaseException as error:
             # Whoever waits fails alike; nobody may be waiting.
-            waiting.set_exception(error if isinstance(error, Exception) else asyncio.CancelledError())
+            gone = Unavailable("Idempotency-Key", "the request under this key was given up: send it again")
+            waiting.set_exception(error if isinstance(error, Exception) else gone)
             waiting.exception()
             raise
         finally:
@@ -70,6 +71,10 @@ class Repeats:
         record(answered)
         waiting.set_result(body)
         return body
+
+    def knows(self, key: str) -> bool:
+        """Whether there is an answer under this key."""
+        return key in self._answers
 
     def remember(self, answered: Answered) -> None:
         """Keep an answer; the oldest of too many is forgotten."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from service.events import Decided, Event, Guided, Reported, Settled
 from service.mission import Mission
+from service.outcomes import learn
 from service.repeats import Answered
 from service.settings import Settings
 from service.store import Kept
@@ -33,10 +34,10 @@ def _play(mission: Mission, event: Event) -> None:
             mission.observe(uav, step)
         case Decided(decision, attempt, counsel):
             mission.commit(decision, attempt, counsel)
-        case Settled(outcome):
-            sample = mission.apply(outcome)
-            if sample is not None:
-                mission.learner.update(sample, outcome.cost)
+        case Settled(outcome, taught):
+            sample = mission.apply(outcome, taught=taught)
+            if sample is not None and taught:
+                learn(mission, sample, outcome.cost)
         case Guided(state):
             mission.reinstate(state)
         case Answered():

@@ -11,9 +11,9 @@ from typing import Annotated
 import tyro
 from pydantic import ValidationError
 
-# In-flight decisions end within their deadline; past this, shutting down does not wait for them. Less than the 10 s
-# after which `docker stop` kills.
-_SHUTDOWN_S = 8
+# In-flight decisions are hurried to end within 4 s; past this, shutting down does not wait for them. With the last
+# checkpoints and the last commit it is less than the 10 s after which `docker stop` kills.
+_SHUTDOWN_S = 5
 
 
 @dataclass(frozen=True)

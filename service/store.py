@@ -7,8 +7,8 @@ holds is deleted from the journal in the same transaction that brings it.
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -174,7 +174,7 @@ class Store:
             sqlalchemy.exc.SQLAlchemyError: nothing was written.
         """
         entries: list[dict[str, Any]] = []
-        with self._engine.begin() as db:
+        with self._writing() as db:
             for item in items:
                 if isinstance(item, Entry):
                     kind, body = encode(item.event)
@@ -207,6 +207,20 @@ class Store:
                 for table in (missions, checkpoints, journal):
                     db.execute(sa.delete(table).where(table.c.mission_id == mission_id))
 
+    @contextmanager
+    def _writing(self) -> Iterator[sa.Connection]:
+        """A transaction of whoever holds the store; raises where that is another edge by now."""
+        if self._engine.dialect.name == "sqlite":
+            with self._engine.begin() as db:
+                yield db
+            return
+        # The lock is this connection's: one that broke may have let another edge in.
+        if self._guard is None or not isinstance(self._guard, sa.Connection) or self._guard.invalidated:
+            self._take()
+        assert isinstance(self._guard, sa.Connection)
+        with self._guard.begin():
+            yield self._guard
+
     def _take(self) -> None:
         """Hold the store as long as this process lives, however it ends."""
         file = self._engine.url.database
@@ -217,8 +231,12 @@ class Store:
             except BlockingIOError:
                 raise StoreUnusable(f"another edge uses {file}") from None
             return
-        self._guard = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
-        if not self._guard.scalar(sa.select(sa.func.pg_try_advisory_lock(_ADVISORY_LOCK))):
+        self._guard = self._engine.connect()
+        with self._guard.begin():
+            taken = self._guard.scalar(sa.select(sa.func.pg_try_advisory_lock(_ADVISORY_LOCK)))
+        if not taken:
+            self._guard.close()
+            self._guard = None
             raise StoreUnusable(f"another edge uses the database {file}")
 
     def _migrate(self) -> None:
@@ -245,7 +263,13 @@ def _engine(url: str) -> sa.Engine:
     if "://" not in url:
         Path(url).expanduser().parent.mkdir(parents=True, exist_ok=True)
         url = f"sqlite:///{Path(url).expanduser()}"
-    parsed = sa.make_url(url)
+    try:
+        parsed = sa.make_url(url)
+    except (sa.exc.ArgumentError, ValueError):
+        # What cannot be told apart may be part of a password.
+        raise ValueError("is no address: write @, : and / in a password as %40, %3A and %2F") from None
+    if "@" in (parsed.host or ""):
+        raise ValueError("names a host with an @: write @ in a password as %40")
     if parsed.drivername in ("postgresql", "postgres"):
         parsed = parsed.set(drivername="postgresql+psycopg")
     if parsed.get_backend_name() == "sqlite":

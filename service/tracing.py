@@ -51,12 +51,14 @@ class Traces:
     def __init__(self, provider: TracerProvider | None, settings: Settings) -> None:
         self.provider = provider
         self._tracer = None if provider is None else provider.get_tracer("aic_vds.edge")
-        url = httpx.URL((settings.llm_url or "http://localhost").split(",")[0])
-        self._server = {"server.address": url.host, "server.port": url.port or (443 if url.scheme == "https" else 80)}
+        self._server = _where(settings.llm_url)
         self._vendor = "openai" if settings.llm_url else "llama.cpp"
 
     def decided(self, answer: DecideResponse) -> None:
-        """The spans of a decision just answered, from its stages' times, which follow each other."""
+        """The spans of a decision just answered, from its stages' times, which follow each other.
+
+        Those of a batch all end now, as their answers do.
+        """
         if self._tracer is None:
             return
         from opentelemetry import trace
@@ -122,6 +124,14 @@ class Traced:
             await self.app(scope, receive, send)
         finally:
             context.detach(token)
+
+
+def _where(url: str | None) -> dict[str, Any]:
+    """Where the only LLM server is; of several nobody knows which was asked."""
+    if url is None or "," in url:
+        return {}
+    parsed = httpx.URL(url)
+    return {"server.address": parsed.host, "server.port": parsed.port or (443 if parsed.scheme == "https" else 80)}
 
 
 def _about(answer: DecideResponse) -> dict[str, Any]:

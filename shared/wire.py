@@ -170,7 +170,7 @@ class Weighed(Wire):
     llm: float | None = None
     mixture: float = Field(description="the advisers' probabilities, weighted by trust")
     regret: float = Field(description="packets that the critic expects it to lose above the best candidate")
-    score: float = Field(description="ln(mixture) - 0.3 min(regret, 8): the highest is flown")
+    score: float = Field(description="ln(mixture) - 0.6 min(regret, 8): the highest is flown")
 
 
 class Guided(Wire):

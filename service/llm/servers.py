@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from service.llm.answer import Constraint, NoDecision
 from service.llm.client import Completion
-from service.llm.upstream import Upstream
+from service.llm.upstream import LOST, Upstream
 from service.settings import Settings
 from shared.wire import Readiness
 
@@ -88,20 +88,22 @@ class Servers:
 
     async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
         """As :meth:`Upstream.ask_labels`."""
-        return await self._first(lambda server: server.ask_labels(system, user, lists))
+        return await self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
 
     async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
         """As :meth:`Upstream.ask_orders`, of the present one."""
         return await self.present.ask_orders(note, examples, temperature=temperature, seed=seed)
 
-    async def _first(self, ask: Ask) -> Completion:
+    async def _first(self, ask: Ask, uavs: int = 1) -> Completion:
         """The first answer of those that are well, asked one after another; the first failure where there is none."""
-        waiting = deque(server for server in self._each if server.status == "ready") or deque(self._each[:1])
+        well = [server for server in self._each if server.status == "ready" and server.most_together >= uavs]
+        waiting = deque(well or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
             # Behind one address there may be several machines.
             waiting.append(waiting[0])
         running: dict[asyncio.Task[Completion], Upstream] = {}
         failure: NoDecision | None = None
+        later: list[asyncio.Task[Completion]] = []
         try:
             while waiting or running:
                 if not running:
@@ -111,14 +113,16 @@ class Servers:
                 if not done:
                     self._begin(ask, waiting, running)
                 for task in done:
+                    later = list(running)[list(running).index(task) + 1 :]
                     server = running.pop(task)
                     try:
                         return replace(task.result(), model=server.model)
                     except NoDecision as error:
                         failure = failure or error
+                        waiting = deque(other for other in waiting if other is not server)
         finally:
             for task in running:
-                task.cancel()
+                task.cancel(LOST if task in later else None)
             await asyncio.gather(*running, return_exceptions=True)
         raise failure or NoDecision("llm_unavailable", "there is no server")
 

@@ -7,6 +7,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextvars import Context
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -34,6 +35,8 @@ from shared.wire import Readiness, Reason
 log = logging.getLogger(__name__)
 
 _RETRY_S = 5.0
+# Said to a call that is hung up because another server, asked before, has answered: that is no fault of this one.
+LOST = "another answered"
 _PROBE_TIMEOUT_S, _TOGETHER_TIMEOUT_S = 60.0, 15.0
 _ANY_NUMBER = 1000
 # What is no decision gives way to one so often, and waits so long for so much silence between them: each spoils the
@@ -101,7 +104,7 @@ class Upstream:
     def start(self) -> None:
         """Begin loading or probing, unless the LLM is off."""
         if self.status != "off":
-            self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up")
+            self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up", context=Context())
 
     @property
     def coming(self) -> bool:
@@ -175,8 +178,8 @@ class Upstream:
         except NoDecision as error:
             self._failed(error.reason)
             raise
-        except asyncio.CancelledError:
-            if not patient:
+        except asyncio.CancelledError as hung_up:
+            if not patient and LOST not in hung_up.args:
                 self._in_vain(begun)
             raise
         else:
@@ -209,7 +212,7 @@ class Upstream:
         self._status = _Status("unavailable", f"failed too often, the last time by {reason}: left alone {pause_s:g} s")
         log.warning("LLM %s", self._status.detail)
         self._on_open()
-        self._task = asyncio.create_task(self._recover(), name="llm-recovery")
+        self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())
 
     async def _silence(self) -> None:
         """Wait until no decision has been asked for a while, but not for ever."""

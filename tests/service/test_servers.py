@@ -122,3 +122,18 @@ def test_each_server_gets_its_own_key_or_all_the_same() -> None:
     each = Settings(llm_url=urls, llm_api_key="one", llm_model="m,").each_server()
     assert [s.llm_model for s in each] == ["m", None]
     assert {s.llm_api_key and s.llm_api_key.get_secret_value() for s in each} == {"one"}
+
+
+def test_who_was_asked_later_and_answered_later_is_no_failure(edge: Edge, report: Report) -> None:
+    class Slow(Named):
+        async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+            await asyncio.sleep(0.3)
+            return await super().respond(body, probed)
+
+    with serving(Slow("first", "0 7").app) as first, serving(Slow("second", "1 7").app) as second:
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", hedge_ms=50, deadline_ms=800)
+        standing_by(client, 1)
+        for step in range(12):
+            assert client.post("/decide", json=report(step=step)).json()["model"] == "first"
+        assert client.get("/readyz").json()["standing_by"] == 1
+        assert "aicvds_llm_breaker_opened_total 0.0" in client.get("/metrics").text

@@ -1,0 +1,301 @@
+"""What may come between: deletion, a second life, a store that hangs or fails, a service that is too busy to learn."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from service import outcomes
+from service.journal import Journal
+from service.learner import Sample
+from service.metrics import Metrics
+from service.mission import Mission
+from service.problems import Refused, Unavailable
+from service.repeats import Repeats
+from service.replaying import revived
+from service.settings import Settings
+from service.store import Checkpoint, Entry, Item, Kept, Store
+from shared.wire import MissionSpec, Outcome
+from tests.running import listening
+from tests.service.making import attended, uav
+from tests.service.stub_llm import misbehaving, saying, wait_for
+from tests.service.test_durability import copy_of, fly, locked, running, same, state
+
+Report = Callable[..., dict[str, Any]]
+
+
+def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: Path, report: Report) -> None:
+    asked = threading.Semaphore(0)
+
+    async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked.release()
+        await asyncio.sleep(0.7)
+        await saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
+
+    with (
+        listening(misbehaving(slowly)) as llm,
+        running(tmp_path / "m.db", mode="llm", llm_url=f"{llm}/v1", planner="off") as (client, _),
+        ThreadPoolExecutor(1) as pool,
+    ):
+        wait_for(client, "ready")
+        late = pool.submit(client.post, "/decide", json=report())
+        assert asked.acquire(timeout=10)
+        assert client.delete("/missions/test").status_code == 204
+        assert client.put("/missions/test", json={"mode": "policy"}).status_code == 200
+        told = client.post("/decide", json=report()).json()
+        assert late.result().status_code == 200
+        fed = client.post("/feedback", json={"mission_id": "test", "decision_id": told["decision_id"], "cost": 0.5})
+        assert (fed.status_code, told["stored"]) == (200, True)
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    with running(copied) as (client, _):
+        status = client.get("/missions/test").json()
+        assert (status["mode"], status["decisions"], status["feedback"]) == ("policy", 1, 1)
+
+
+class Moody(Store):
+    """A store that fails when it is told to, and says what it wrote."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(str(path))
+        self.well = True
+        self.written: list[Item] = []
+
+    def write(self, items: Sequence[Item]) -> None:
+        if not self.well:
+            raise OperationalError("disk full", None, Exception("disk full"))
+        super().write(items)
+        self.written.extend(items)
+
+
+async def until(done: Callable[[], bool]) -> None:
+    ends = time.monotonic() + 20
+    while not done():
+        assert time.monotonic() < ends
+        await asyncio.sleep(0.01)
+
+
+async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_path: Path) -> None:
+    store = Moody(tmp_path / "m.db")
+    journal = Journal(store, Metrics())
+    mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
+    journal.begin(mission)
+    for step in range(3):
+        mission.observe(uav(step=step), step)
+    assert await journal.stored(5)
+    store.well = False
+    for step in range(3, 10):
+        mission.observe(uav(step=step), step)
+    await until(lambda: journal.failing)
+    track = journal.due(mission, 1)
+    assert track is not None
+    seq, told = track.seq, mission.state_dict()
+    for step in range(10, 13):
+        mission.observe(uav(step=step), step)
+    journal.checkpoint(track, seq, {**told, "learner": mission.learner.state_dict()})
+    store.well = True
+    await until(lambda: not journal.failing and not journal._queue)
+    tail = store.written[4:]
+    assert [item.seq for item in tail if isinstance(item, Checkpoint | Entry)] == [10, 11, 12, 13]
+    assert isinstance(tail[0], Checkpoint)
+    kept = store.load("test")
+    assert kept is not None
+    assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+    journal.close(5)
+    store.close()
+
+
+async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    journal = Journal(store, Metrics())
+    write, failures = store.write, iter([OSError("no such device"), MemoryError()])
+
+    def moody(items: Sequence[Item]) -> None:
+        if (failure := next(failures, None)) is not None:
+            raise failure
+        write(items)
+
+    monkeypatch.setattr(store, "write", moody)
+    mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
+    journal.begin(mission)
+    assert not await journal.stored(5)
+    await until(lambda: not journal.failing)
+    assert await journal.stored(5)
+    assert store.missions() == ["test"]
+    journal.close(5)
+    store.close()
+
+
+def test_a_mission_deleted_while_it_wakes_stays_deleted(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+    load, begun = Store.load, threading.Event()
+
+    def slowly(self: Store, mission_id: str) -> Kept | None:
+        begun.set()
+        time.sleep(0.7)
+        return load(self, mission_id)
+
+    monkeypatch.setattr(Store, "load", slowly)
+    with running(tmp_path / "m.db") as (client, _), ThreadPoolExecutor(3) as pool:
+        got = pool.submit(client.get, "/missions/test")
+        assert begun.wait(timeout=10)
+        deleted = pool.submit(client.delete, "/missions/test")
+        time.sleep(0.2)
+        decided = pool.submit(client.post, "/decide", json=report())
+        assert (got.result().status_code, deleted.result().status_code, decided.result().status_code) == (200, 204, 200)
+        assert client.get("/missions/test").json()["decisions"] == 1
+
+
+def test_a_store_that_hangs_keeps_no_other_mission_waiting_and_a_sleeping_one_no_longer_than_its_deadline(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        for number in range(9):
+            client.post("/decide", json=report(mission_id=f"m{number}"))
+    load = Store.load
+
+    def slowly(self: Store, mission_id: str) -> Kept | None:
+        time.sleep(2)
+        return load(self, mission_id)
+
+    monkeypatch.setattr(Store, "load", slowly)
+    with (
+        running(tmp_path / "m.db", mode="guided", llm_gguf="none", planner="off") as (client, _),
+        ThreadPoolExecutor(9) as pool,
+    ):
+        client.post("/decide", json=report(mission_id="awake"))
+        bodies = [report(mission_id=f"m{number}", deadline_ms=500) for number in range(9)]
+        sleeping = [pool.submit(client.post, "/decide", json=body) for body in bodies]
+        time.sleep(0.3)
+        answer = client.post("/decide", json=report(mission_id="awake", step=1, deadline_ms=1500)).json()
+        assert answer["latency_ms"]["total"] < 1550
+        late = [asked.result() for asked in sleeping]
+        assert {answer.status_code for answer in late} == {503}
+        assert {answer.headers["retry-after"] for answer in late} == {"1"}
+        # It wakes all the same.
+        ends = time.monotonic() + 60
+        while client.post("/decide", json=bodies[0]).status_code == 503:
+            assert time.monotonic() < ends
+
+
+def test_while_the_store_fails_nothing_is_deleted_made_or_confirmed(tmp_path: Path, report: Report) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+        other = locked(tmp_path / "m.db")
+        try:
+            client.post("/decide", json=report(step=2))
+            structure = {"guidance": {"max_velocity": 5}}
+            assert client.delete("/missions/test").status_code == 503
+            assert client.put("/missions/new", json={}).status_code == 503
+            assert client.post("/missions/test/guidance", json=structure).status_code == 503
+            assert client.get("/missions/test").status_code == 200
+            assert client.get("/missions/new").status_code == 404
+            assert client.get("/missions/test/guidance").json()["status"] == "none"
+        finally:
+            other.execute("ROLLBACK")
+            other.close()
+
+
+def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outcomes, "_MAX_LESSONS", 1)
+    learn = outcomes.learn
+
+    def slowly(mission: Mission, sample: Sample, cost: float) -> None:
+        time.sleep(0.1)
+        learn(mission, sample, cost)
+
+    monkeypatch.setattr(outcomes, "learn", slowly)
+    with running(tmp_path / "m.db") as (client, engine):
+        fly(client, report, range(6))
+        mission = engine.missions.awake[0]
+        time.sleep(0.5)
+        assert 0 < mission.learner.updates < 15
+        assert mission.feedback == 15
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+        store = Store(str(copied))
+        kept = store.load("test")
+        store.close()
+        assert kept is not None
+        assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+
+
+def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
+    sample = attended(mission, uav()).pending(mission, "a" * 32, 1, 7).sample
+    assert sample is not None
+
+    def broken(*_: object) -> float:
+        raise RuntimeError("not today")
+
+    monkeypatch.setattr(mission.learner, "update", broken)
+    outcomes.learn(mission, sample, 0.5)
+
+
+async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again() -> None:
+    repeats = Repeats(8)
+    begun = asyncio.Event()
+
+    async def never() -> str:
+        begun.set()
+        await asyncio.sleep(60)
+        return "never"
+
+    first = asyncio.create_task(repeats.once("k", "request", never, lambda _: None))
+    await begun.wait()
+    second = asyncio.create_task(repeats.once("k", "request", never, lambda _: None))
+    await asyncio.sleep(0)
+    first.cancel()
+    with pytest.raises(Unavailable):
+        await second
+    with pytest.raises(asyncio.CancelledError):
+        await first
+
+    async def answer() -> str:
+        return "answer"
+
+    assert await repeats.once("k", "request", answer, lambda _: None) == "answer"
+    with pytest.raises(Refused):
+        await repeats.once("k", "another request", answer, lambda _: None)
+
+
+def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path, report: Report) -> None:
+    with running(tmp_path / "m.db") as (client, engine):
+        first = client.post("/decide", json=report()).json()
+        body = report(step=1, outcome={"decision_id": first["decision_id"], "cost": 0.5})
+        answer = client.post("/decide", json=body, headers={"Idempotency-Key": "k"}).json()
+        engine.missions.awake[0]._applied.clear()
+        again = client.post("/decide", json=body, headers={"Idempotency-Key": "k"})
+        assert (again.status_code, again.json()["decision_id"]) == (200, answer["decision_id"])
+        assert Outcome.model_validate(body["outcome"]).cost == 0.5
+
+
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_a_traceback_shows_no_variables(form: str) -> None:
+    script = (
+        "import logging\n"
+        "from service import logs\n"
+        f"logs.configure('info', '{form}')\n"
+        "def fail(key):\n"
+        "    raise ValueError('it failed')\n"
+        "try:\n"
+        "    fail('sk-' + 'secret')\n"
+        "except ValueError:\n"
+        "    logging.getLogger('x').exception('caught')\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert "it failed" in ran.stderr
+    assert "sk-secret" not in ran.stderr
