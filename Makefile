@@ -1,4 +1,4 @@
-# make install | demo | test | check | faults | soak | compose | clean
+# make install | demo | test | check | faults | fuzz | soak | compose | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
@@ -9,7 +9,7 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
-.PHONY: help install demo test check faults soak compose clean
+.PHONY: help install demo test check faults fuzz soak compose clean
 .DEFAULT_GOAL := help
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make test      install, run the tests"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
+	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
 	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
 
@@ -45,6 +46,9 @@ check: install
 
 faults: install
 	$(BIN)/pytest -m faults --capture=tee-sys tests/faults
+
+fuzz: install
+	$(BIN)/pytest -m fuzz --capture=tee-sys tests/faults
 
 soak: install
 	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)

@@ -16,7 +16,6 @@ from service import problems
 from service.engine import Engine
 from service.guard import CarefulHeaders, Guard
 from service.keys import Keys
-from service.learner import rehearse
 from service.limits import BodyLimit, Crowd
 from service.llm.servers import Servers
 from service.metrics import Metrics
@@ -55,7 +54,6 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         metrics = Metrics()
         llm = Servers(settings, metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
-        await asyncio.to_thread(rehearse)
         engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine
         llm.start()

@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Literal
 
 from service.journal import Journal, Keeper
-from service.learner import Sample
+from service.learner import Sample, rehearse
 from service.metrics import Metrics
 from service.mission import Mission
 from shared.wire import Outcome
@@ -27,6 +27,8 @@ class Outcomes:
         self._keeper = keeper
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._room = threading.Semaphore(_MAX_LESSONS)
+        # Before the first lesson, and beside the first decisions.
+        self._learning.submit(rehearse)
 
     def apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         """Record an outcome, unless it is recorded already; raises as :meth:`Mission.find`."""

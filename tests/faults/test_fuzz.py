@@ -16,7 +16,7 @@ from schemathesis.core.result import Ok
 from tests.e2e.processes import run, serving_edge
 from tests.faults.table import Tables
 
-pytestmark = [pytest.mark.faults, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.fuzz, pytest.mark.timeout(1800)]
 
 CASES = 10_000
 OPEN = ("/healthz", "/readyz")

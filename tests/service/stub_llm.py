@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from functools import cache
 from typing import Any
 
 import httpx
@@ -111,9 +112,14 @@ def saying(status: bytes, body: bytes) -> Handler:
     return fault
 
 
-async def _compressed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+@cache
+def _bomb() -> bytes:
     """A few kilobytes that would unpack to half a gigabyte."""
-    bomb = zstandard.compress(b" " * 500_000_000)
+    return zstandard.compress(b" " * 500_000_000)
+
+
+async def _compressed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    bomb = _bomb()
     writer.write(b"HTTP/1.1 200 OK\r\ncontent-encoding: zstd\r\ncontent-length: %d\r\n\r\n%s" % (len(bomb), bomb))
     await writer.drain()
 
