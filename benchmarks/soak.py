@@ -31,6 +31,7 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
+from simulator.client import EdgeClient
 from simulator.demo import HOST, usable_port
 
 MISSIONS, GUIDED, UAVS, SENSORS = 200, 10, 3, 10
@@ -173,9 +174,9 @@ def main() -> int:
 
 
 def _fly(url: str, pid: int, missions: list[Mission], minutes: float, console: Console) -> tuple[list[Sample], int]:
+    with EdgeClient(url, timeout_s=30) as waiting:
+        waiting.wait_ready(300)
     with httpx.Client(base_url=url, timeout=300) as client:
-        while client.get("/readyz").json()["llm"] == "loading":
-            time.sleep(0.5)
         for mission in missions:
             client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
     shares = [missions[:GUIDED], *(missions[GUIDED + worker :: WORKERS] for worker in range(WORKERS))]
