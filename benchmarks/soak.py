@@ -163,7 +163,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         port = usable_port(0)
         url = f"http://{HOST}:{port}"
-        settings = {"AICVDS_STORE": f"{folder}/missions.db", "AICVDS_LOG_LEVEL": "warning"}
+        settings = {"AICVDS_STORE": f"{folder}/missions.db", "AICVDS_LOG_LEVEL": "error"}
         command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
         with subprocess.Popen(command, env={**os.environ, **settings}) as edge:
             try:

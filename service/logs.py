@@ -72,7 +72,9 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
         [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
         if form == "json"
         # The other formatters print local variables, keys among them.
-        else [structlog.dev.ConsoleRenderer(sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)]
+        else [
+            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)
+        ]
     )
     handler = _Patient(queue.Queue(_MOST_WAITING))
     handler.setFormatter(

@@ -299,3 +299,5 @@ def test_a_traceback_shows_no_variables(form: str) -> None:
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
     assert "it failed" in ran.stderr
     assert "sk-secret" not in ran.stderr
+    # Colours are for terminals.
+    assert "\x1b" not in ran.stderr
