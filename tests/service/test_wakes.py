@@ -27,9 +27,9 @@ from service.settings import Settings
 from service.store import Checkpoint, Entry, Item, Kept, Store
 from shared.wire import MissionSpec, Outcome
 from tests.running import listening
+from tests.service.keeping import copy_of, fly, locked, running, same, state
 from tests.service.making import attended, uav
 from tests.service.stub_llm import misbehaving, saying, wait_for
-from tests.service.test_durability import copy_of, fly, locked, running, same, state
 
 Report = Callable[..., dict[str, Any]]
 

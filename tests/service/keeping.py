@@ -1,0 +1,84 @@
+"""Edges with a store, missions flown on them, and what is left on disk."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from service.app import create_app
+from service.engine import Engine
+from service.mission import Mission
+from service.settings import Settings
+from service.store import Store
+from tests.running import serving
+
+Body = dict[str, Any]
+Report = Callable[..., Body]
+
+
+@contextmanager
+def running(path: Path | str, **settings: Any) -> Iterator[tuple[httpx.Client, Engine]]:
+    app = create_app(Settings(**{"mode": "value", **settings}), Store(str(path)))
+    with serving(app) as url, httpx.Client(base_url=url, timeout=30) as client:
+        yield client, app.state.engine
+
+
+def state(mission: Mission) -> Body:
+    return {**mission.state_dict(), "learner": mission.learner.state_dict()}
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and one.dtype == other.dtype and np.array_equal(one, other, equal_nan=True)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
+    return bool(one == other)
+
+
+def fly(client: httpx.Client, report: Report, steps: range, owed: dict[int, Body] | None = None) -> dict[int, Body]:
+    """Decisions of three UAVs, each with the outcome of the one before; every fourth transmission fails."""
+    owed = {} if owed is None else owed
+    for step in steps:
+        for uav in range(3):
+            body = report(step=step, uav_id=uav)
+            body["sensors"]["queue"][uav] = 10 + step % 40
+            if uav in owed:
+                body["outcome"] = owed[uav]
+            answer = client.post("/decide", json=body)
+            assert answer.status_code == 200, answer.text
+            assert answer.json()["stored"] is True
+            failed = (step + uav) % 4 == 0
+            owed[uav] = {"decision_id": answer.json()["decision_id"], "cost": 0.1 * uav + failed, "failed": failed}
+    return owed
+
+
+def copy_of(path: Path, to: Path) -> Path:
+    """What is on disk now, as after a power failure."""
+    for suffix in ("", "-wal"):
+        if Path(f"{path}{suffix}").exists():
+            shutil.copy(f"{path}{suffix}", f"{to}{suffix}")
+    return to
+
+
+def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
+    ends = time.monotonic() + 10
+    while mission.learner.updates < updates and time.monotonic() < ends:
+        time.sleep(0.01)
+    assert mission.learner.updates == updates
+    return mission
+
+
+def locked(path: Path) -> sqlite3.Connection:
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    return other
