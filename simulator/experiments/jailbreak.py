@@ -10,7 +10,7 @@ from simulator.experiments.schemes import ASKED, CHANCE, WORST, Scheme, edge_pol
 def _schemes(setup: Setup) -> list[Scheme]:
     asked = "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"
     of_llms = [
-        over_edge(f"{name}_{verify}", f"{label}, rules {verify}", backing=backing, verify=verify)
+        over_edge(f"{name}_{verify}", f"{label}, rules {verify}", backing=backing, verify=verify, planner="off")
         for name, label, backing in (
             ("turned", "LLM turned against the fleet", WORST),
             ("draws", "uniform draws", CHANCE),
@@ -19,7 +19,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         for verify in ("off", "on")
     ]
     alone = guided("guided_alone_worst", "guided, no planner, LLM turned", planner="off", backing=WORST)
-    return [*of_llms, guided("guided_worst", "guided, LLM turned", backing=WORST), alone, edge_policy(), local("eof")]
+    return [*of_llms, alone, edge_policy(), local("eof")]
 
 
 EXPERIMENT = Experiment(
@@ -36,6 +36,7 @@ EXPERIMENT = Experiment(
         "an LLM, or a server, that was turned all the same. In mode llm it names, of the rows, the farthest sensor at "
         "velocity 0; in mode guided the emptiest queue as fast as can be.",
         "The rules: the sensor is in reach after the step at that velocity, its battery is not flat, and no other UAV "
-        "was given it. An answer that breaks one gives way to one step of look-ahead or the plan.",
+        "was given it. An answer that breaks one gives way to one step of look-ahead; nobody plans here, so that what "
+        "the rules do is not the planner's doing.",
     ),
 )
