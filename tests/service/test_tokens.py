@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 
 from service.settings import Settings
-from service.tokens import TokenCounter, VocabularyDamaged, ensure_vocabulary, price_usd
+from service.tokens import TokenCounter, price_usd
+from service.vocabulary import VocabularyDamaged, ensure_vocabulary
 
 
 def test_counts_as_gpt_4o_mini_does_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
