@@ -26,7 +26,7 @@ def test_a_damaged_vocabulary_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     package = tmp_path / "package"
     (package / "data").mkdir(parents=True)
     (package / "data" / "o200k_base.tiktoken.gz").write_bytes(gzip.compress(b"IQ== 0\n"))
-    monkeypatch.setattr("service.tokens.files", lambda _: package)
+    monkeypatch.setattr("service.vocabulary.files", lambda _: package)
     with pytest.raises(VocabularyDamaged):
         ensure_vocabulary(tmp_path / "cache")
     assert not (tmp_path / "cache").exists()
