@@ -34,7 +34,7 @@ from scipy import stats
 from simulator.client import EdgeClient
 from simulator.demo import HOST, usable_port
 
-MISSIONS, GUIDED, UAVS, SENSORS = 200, 10, 3, 10
+MISSIONS, UAVS, SENSORS = 200, 3, 10
 # Outcomes after which a mission remembers no more than before.
 FULL = 300
 SAMPLE_S = 2.0
@@ -48,6 +48,8 @@ class Soak:
 
     minutes: float = 10.0
     """How long to measure, once every mission of mode value remembers as much as it can."""
+    guided: int = 10
+    """Of the missions, how many are flown in mode guided, with the embedded LLM; with 0 none is loaded."""
     out: Path = Path("runs/soak.json")
     """Where to write the figures."""
 
@@ -159,40 +161,43 @@ def slope(samples: list[Sample]) -> tuple[float, float]:
 def main() -> int:
     """Returns 0 where nothing grows."""
     options, console = tyro.cli(Soak, description=__doc__), Console()
-    missions = [Mission(f"soak{n}", "guided" if n < GUIDED else "value") for n in range(MISSIONS)]
+    missions = [Mission(f"soak{n}", "guided" if n < options.guided else "value") for n in range(MISSIONS)]
     with tempfile.TemporaryDirectory() as folder:
         port = usable_port(0)
         url = f"http://{HOST}:{port}"
         settings = {"AICVDS_STORE": f"{folder}/missions.db", "AICVDS_LOG_LEVEL": "error"}
+        if not options.guided:
+            settings["AICVDS_MODE"] = "value"
         command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
         with subprocess.Popen(command, env={**os.environ, **settings}) as edge:
             try:
-                samples, decisions = _fly(url, edge.pid, missions, options.minutes, console)
+                samples, decisions = _fly(url, edge.pid, missions, options, console)
             finally:
                 edge.terminate()
     return _tell(samples, decisions, options, console)
 
 
-def _fly(url: str, pid: int, missions: list[Mission], minutes: float, console: Console) -> tuple[list[Sample], int]:
+def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Console) -> tuple[list[Sample], int]:
     with EdgeClient(url, timeout_s=30) as waiting:
         waiting.wait_ready(300)
     with httpx.Client(base_url=url, timeout=300) as client:
         for mission in missions:
             client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
-    shares = [missions[:GUIDED], *(missions[GUIDED + worker :: WORKERS] for worker in range(WORKERS))]
+    guided, others = missions[: options.guided], missions[options.guided :]
+    shares = [share for share in (guided, *(others[n::WORKERS] for n in range(WORKERS))) if share]
     workers = [Worker(url, share, seed) for seed, share in enumerate(shares)]
     for worker in workers:
         worker.start()
     process, samples = psutil.Process(pid), list[Sample]()
     with Progress(console=console) as progress:
         filling = progress.add_task("filling", total=FULL // UAVS)
-        while (least := min(mission.step for mission in missions[GUIDED:])) < FULL // UAVS:
+        while (least := min(mission.step for mission in others)) < FULL // UAVS:
             progress.update(filling, completed=least)
             _check(workers)
             time.sleep(1)
         began = time.monotonic()
-        measuring = progress.add_task("measuring", total=minutes * 60)
-        while time.monotonic() < began + minutes * 60:
+        measuring = progress.add_task("measuring", total=options.minutes * 60)
+        while time.monotonic() < began + options.minutes * 60:
             samples.append(sample(url, process, began))
             progress.update(measuring, completed=samples[-1].at_s)
             _check(workers)
