@@ -50,7 +50,7 @@ class Uav(threading.Thread):
                     while not self.over:
                         self.turn(client)
             except httpx.TransportError:
-                time.sleep(0.01)
+                time.sleep(0.05)
             except AssertionError as error:
                 self.error = str(error)
                 return
@@ -96,7 +96,7 @@ def test_kills_under_load(tmp_path: Path, report: Report, tables: Tables) -> Non
                     uav.over = True
                     uav.join(timeout=20)
                 break
-            time.sleep(chance.uniform(0.2, 1.5))
+            time.sleep(chance.uniform(0.2, 1.2))
             process.kill()
             process.wait()
             for uav in fleet:

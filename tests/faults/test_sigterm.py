@@ -20,7 +20,7 @@ from tests.service.stub_llm import misbehaving, saying, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 
-TIMES, UAVS, MOST_S = 10, 6, 10.0
+TIMES, UAVS, MOST_S = 6, 6, 10.0
 
 
 async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -72,7 +72,7 @@ def test_sigterm_under_load(tmp_path: Path, report: Report, tables: Tables) -> N
                 fleet = [Uav(number, url, report) for number in range(UAVS)]
                 for uav in fleet:
                     uav.start()
-                time.sleep(1.0 + 0.07 * turn)
+                time.sleep(3.0 + 0.07 * turn)
                 began = time.perf_counter()
                 process.send_signal(signal.SIGTERM)
                 process.communicate(timeout=30)

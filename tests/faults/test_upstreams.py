@@ -17,7 +17,7 @@ from tests.e2e.processes import serving_edge
 from tests.faults.fleet import Report, ask, resident_mb
 from tests.faults.table import Tables
 from tests.running import Handler, listening
-from tests.service.stub_llm import FAULTS, misbehaving, saying, wait_for
+from tests.service.stub_llm import FAULTS, bomb, misbehaving, saying, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 
@@ -75,6 +75,8 @@ def test_a_server_that_turns_bad(name: str, report: Report, tables: Tables) -> N
         httpx.Client(base_url=url, timeout=10) as client,
     ):
         wait_for(client, "ready")
+        # Not while a UAV waits.
+        bomb()
         warm = ask(url, report, 300, DEADLINE_MS)
         assert warm.reasons["none"] > 250, warm.told()
         before_mb = resident_mb(process.pid)

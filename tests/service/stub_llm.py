@@ -113,14 +113,14 @@ def saying(status: bytes, body: bytes) -> Handler:
 
 
 @cache
-def _bomb() -> bytes:
+def bomb() -> bytes:
     """A few kilobytes that would unpack to half a gigabyte."""
     return zstandard.compress(b" " * 500_000_000)
 
 
 async def _compressed(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    bomb = _bomb()
-    writer.write(b"HTTP/1.1 200 OK\r\ncontent-encoding: zstd\r\ncontent-length: %d\r\n\r\n%s" % (len(bomb), bomb))
+    content = bomb()
+    writer.write(b"HTTP/1.1 200 OK\r\ncontent-encoding: zstd\r\ncontent-length: %d\r\n\r\n%s" % (len(content), content))
     await writer.drain()
 
 
