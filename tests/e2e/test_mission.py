@@ -19,7 +19,8 @@ def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
     assert (summary["decisions"], summary["late"]) == (18, 0)
     assert summary["by_source"]["llm"] > 9
     assert summary["by_source"]["onboard"] == 0
-    assert set(summary["by_reason"]) <= {"no_candidate"}
+    # The embedded model names sensors out of reach now and then: the verifier overrides it.
+    assert set(summary["by_reason"]) <= {"no_candidate", "rule_reach"}
     assert set(summary["lost_packets"]) == {"aic_vds", "eof", "wqcs"}
     assert summary["tokens"]["state_mean"] <= 0.5 * summary["tokens"]["state_uncompressed_mean"]
     decisions = read_decisions(tmp_path / "out" / "decisions.jsonl")
