@@ -8,6 +8,7 @@ import logging.handlers
 import queue
 import sys
 import threading
+import time
 from contextlib import suppress
 from typing import Literal
 
@@ -28,9 +29,12 @@ class _Patient(logging.handlers.QueueHandler):
     What does not fit into the queue is dropped, and how much that was is told when there is room again.
     """
 
+    queue: queue.Queue[str | None]
+
     def start(self) -> None:
         """Begin to write, until the process ends; then what is waiting gets a moment."""
         self._dropped = 0
+        self._ends = 0.0
         self._writer = threading.Thread(target=self._write, name="logs", daemon=True)
         self._writer.start()
         atexit.register(self._end)
@@ -46,12 +50,19 @@ class _Patient(logging.handlers.QueueHandler):
                 self._dropped = 0
         except queue.Full:
             self._dropped += 1
+        while self._ends and self.queue.unfinished_tasks and time.monotonic() < self._ends:
+            time.sleep(0.002)
+
+    def hurry(self) -> None:
+        """The process may end any moment: from now on lines are waited for, a second in all."""
+        self._ends = time.monotonic() + _LAST_WORDS_S
 
     def _write(self) -> None:
         while (line := self.queue.get()) is not None:
             # A full disk, say; it may have room again.
             with suppress(OSError, ValueError):
                 print(line, file=sys.stderr, flush=True)
+            self.queue.task_done()
 
     def _end(self) -> None:
         with suppress(queue.Full):
@@ -86,6 +97,13 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
     handler.start()
     # httpx logs every request at level info, address included.
     logging.getLogger("httpx").setLevel(logging.WARNING)
+
+
+def hurry() -> None:
+    """The process may end any moment, by a signal that leaves no time: lines are waited for from now on."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, _Patient):
+            handler.hurry()
 
 
 def bind(mission_id: str, step: int) -> None:

@@ -101,6 +101,8 @@ def _serve(listener: socket.socket, host: str) -> int:
             if (engine := getattr(app.state, "engine", None)) is not None:
                 engine.asking.hurry()
             await super().shutdown(sockets)
+            # What uvicorn does after this is to say goodbye, and to raise the signal again.
+            logs.hurry()
 
     Server(config).run(sockets=[listener])
     return 0
