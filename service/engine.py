@@ -177,16 +177,11 @@ class Engine:
             Unavailable: the store fails, or is slow; to be sent again.
         """
         mission = await self.missions.get(request.mission_id)
-        self.refuse_if_failing("decision_id")
+        self.missions.refuse_if_failing("decision_id")
         result = self._outcomes.apply(mission, request)
         self._outcomes.checkpoint(mission)
         await self.kept("decision_id")
         return FeedbackResponse(decision_id=request.decision_id, result=result)
-
-    def refuse_if_failing(self, field: str) -> None:
-        """Raises ``Unavailable`` while the store fails, before anything is recorded."""
-        if self.keeper.failing:
-            raise Unavailable(field, "the store fails: nothing was recorded, send it again")
 
     async def kept(self, field: str) -> None:
         """Wait until all that happened so far is on disk; raises ``Unavailable`` where it is not in time."""

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 from service.events import Decided, Event
 from service.metrics import Metrics
@@ -44,27 +44,6 @@ class Track:
         self.seq = seq
         self.since = since
         self.over = False
-
-
-class Keeper(Protocol):
-    """What missions are kept by."""
-
-    @property
-    def failing(self) -> bool:
-        """Whether the last attempt to write failed."""
-        ...
-
-    def begin(self, mission: Mission) -> None:
-        """A mission is made, and its events are heard from now on."""
-        ...
-
-    def end(self, mission_id: str) -> None:
-        """A mission is deleted."""
-        ...
-
-    async def stored(self, within_s: float) -> bool:
-        """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
-        ...
 
 
 class Unkept:

@@ -40,7 +40,7 @@ class _Patient(logging.handlers.QueueHandler):
         atexit.register(self._end)
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Never waits."""
+        """Never waits, but for the last lines: see :meth:`hurry`."""
         try:
             self.queue.put_nowait(record.getMessage())
             if self._dropped:

@@ -56,7 +56,7 @@ class Missions:
         """Those in memory."""
         return list(self._missions.values())
 
-    async def get(self, mission_id: str, within_s: float = _WAKE_S) -> Mission:
+    async def get(self, mission_id: str) -> Mission:
         """A mission, waited for where the store must be read.
 
         Raises:
@@ -64,7 +64,7 @@ class Missions:
             Unavailable: the store cannot be read, or takes longer.
             Conflict: what the store has of it is damaged.
         """
-        mission = await self._find(mission_id, within_s)
+        mission = await self._find(mission_id, _WAKE_S)
         if mission is None:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
@@ -107,7 +107,7 @@ class Missions:
         """
         mission = await self._find(mission_id, _WAKE_S)
         if mission is None:
-            self._refuse_if_failing()
+            self.refuse_if_failing("mission_id")
             mission = Mission(mission_id, spec, self._settings)
             self._add(mission)
         elif mission.asked_for != spec:
@@ -116,7 +116,7 @@ class Missions:
 
     async def delete(self, mission_id: str) -> None:
         """Forget a mission; raises :class:`NotFound`, or :class:`Unavailable` while the store fails."""
-        self._refuse_if_failing()
+        self.refuse_if_failing("mission_id")
         if (waking := self._waking.get(mission_id)) is not None:
             await asyncio.wait({waking})
         if mission_id not in self._missions and mission_id not in self._asleep:
@@ -126,9 +126,10 @@ class Missions:
         self._keeper.end(mission_id)
         self._count()
 
-    def _refuse_if_failing(self) -> None:
+    def refuse_if_failing(self, field: str) -> None:
+        """Raises :class:`Unavailable` while the store fails, before anything is recorded."""
         if self._keeper.failing:
-            raise Unavailable("mission_id", "the store fails: nothing was changed, send it again")
+            raise Unavailable(field, "the store fails: nothing was recorded, send it again")
 
     def close(self) -> None:
         """Read no more."""

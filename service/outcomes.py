@@ -7,7 +7,7 @@ import threading
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Literal
 
-from service.journal import Journal, Keeper
+from service.journal import Journal, Unkept
 from service.learner import Sample, rehearse
 from service.metrics import Metrics
 from service.mission import Mission
@@ -22,7 +22,7 @@ _MAX_LESSONS = 256
 class Outcomes:
     """One thread learns, in the order that the outcomes came, for every mission of a service."""
 
-    def __init__(self, metrics: Metrics, keeper: Keeper) -> None:
+    def __init__(self, metrics: Metrics, keeper: Journal | Unkept) -> None:
         self._metrics = metrics
         self._keeper = keeper
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")

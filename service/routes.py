@@ -125,7 +125,7 @@ async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStat
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
     """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
     mission = await engine.missions.get(mission_id)
-    engine.refuse_if_failing("answer")
+    engine.missions.refuse_if_failing("answer")
     mission.obey(body)
     await engine.kept("answer")
     return mission.guidance.told(mission_id)

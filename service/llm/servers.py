@@ -12,7 +12,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
-from service.llm.answer import Constraint, NoDecision
+from service.llm.answer import NoDecision
 from service.llm.client import Completion
 from service.llm.upstream import LOST, Upstream
 from service.settings import Settings
@@ -42,11 +42,6 @@ class Servers:
     def model(self) -> str | None:
         """The present one's."""
         return self.present.model
-
-    @property
-    def constraint(self) -> Constraint:
-        """How the present one is held to the answer's form."""
-        return self.present.constraint
 
     @property
     def logprobs(self) -> bool:

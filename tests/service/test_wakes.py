@@ -191,11 +191,16 @@ def test_a_store_that_hangs_keeps_no_other_mission_waiting_and_a_sleeping_one_no
 
 
 def test_while_the_store_fails_nothing_is_deleted_made_or_confirmed(tmp_path: Path, report: Report) -> None:
-    with running(tmp_path / "m.db") as (client, _):
+    with running(tmp_path / "m.db") as (client, engine):
         fly(client, report, range(2))
         other = locked(tmp_path / "m.db")
         try:
             client.post("/decide", json=report(step=2))
+            # Only what the edge knows can it refuse: a DELETE that comes before is carried out, and told as a 503.
+            ends = time.monotonic() + 30
+            while not engine.keeper.failing:
+                assert time.monotonic() < ends
+                time.sleep(0.01)
             structure = {"guidance": {"max_velocity": 5}}
             assert client.delete("/missions/test").status_code == 503
             assert client.put("/missions/new", json={}).status_code == 503
