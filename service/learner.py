@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from service.adam import Adam, lay_side_by_side
 from service.attention import Attention
 from service.features import FEATURES
 from service.reach import LEVEL_FEATURES
@@ -70,34 +72,44 @@ class Modules(nn.Module):
 class Learner:
     """Adam over one mission's modules.
 
-    ``update`` belongs to the learning thread; ``current`` may be read from any thread: it is a finished
-    copy, replaced whole after each update, so a decision never sees half a step and never waits for one.
+    ``update`` belongs to the learning thread; ``score`` and ``velocities`` may be called from any: they compute with
+    a copy that is renewed after each update, so a decision never sees half a step and hardly waits for one.
     """
 
     def __init__(self, modules: Modules, *, learning_rate: float) -> None:
         self._training = modules
-        self._adam = torch.optim.Adam(self._training.parameters(), lr=learning_rate)
-        self.current = copy.deepcopy(self._training).requires_grad_(False)
+        self._parameters = list(modules.parameters())
+        self._adam = Adam(self._parameters, learning_rate=learning_rate)
+        self._current = copy.deepcopy(modules).requires_grad_(False)
+        self._shown = lay_side_by_side(list(self._current.parameters()))
+        self._computing = threading.Lock()
         self.updates = 0
         self.last_loss: float | None = None
 
+    def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
+        """Scores ``(n,)`` and contexts ``(n, d')`` of n sensors' features ``(n, d)``."""
+        with self._computing:
+            return self._current.score(features)
+
+    def velocities(self, z: Tensor, approach: NDArray[np.float32]) -> Tensor:
+        """Values ``(levels,)`` of the velocities for one sensor, from its context ``(d',)``."""
+        with self._computing:
+            return self._current.velocities(z, approach)
+
     def update(self, sample: Sample, cost: float) -> float:
         """One step on one outcome; returns the loss before it."""
-        self._adam.zero_grad()
         loss = self._training.loss(sample, -cost)
-        loss.backward()  # type: ignore[no-untyped-call]
-        self._adam.step()
-        self.current = copy.deepcopy(self._training).requires_grad_(False)
+        self._adam.step(torch.autograd.grad(loss, self._parameters))
+        self._show()
         self.updates += 1
         self.last_loss = loss.item()
         return self.last_loss
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and Adam's moments as arrays; from the learning thread, or where there is none."""
-        adam = self._adam.state_dict()["state"]
         return {
             "weights": {name: tensor.numpy().copy() for name, tensor in self._training.state_dict().items()},
-            "adam": {index: {name: t.numpy().copy() for name, t in kept.items()} for index, kept in adam.items()},
+            "adam": self._adam.state_dict(),
             "updates": self.updates,
             "last_loss": self.last_loss,
         }
@@ -105,19 +117,18 @@ class Learner:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As it was when the state was taken; raises ``RuntimeError`` where that is of other modules."""
         self._training.load_state_dict({name: torch.from_numpy(array) for name, array in state["weights"].items()})
-        kept = self._adam.state_dict()
-        kept["state"] = {
-            index: {name: torch.from_numpy(array) for name, array in moments.items()}
-            for index, moments in state["adam"].items()
-        }
-        self._adam.load_state_dict(kept)
-        self.current = copy.deepcopy(self._training).requires_grad_(False)
+        self._adam.load_state_dict(state["adam"])
+        self._show()
         self.updates, self.last_loss = state["updates"], state["last_loss"]
+
+    def _show(self) -> None:
+        with self._computing:
+            self._shown.copy_(self._adam.weights)
 
 
 def rehearse() -> None:
-    """Update once on nothing: at its first update torch imports a second's worth of modules."""
+    """Update once on nothing: torch's first step back takes longer than the others."""
     features = np.zeros((2, FEATURES["paper"]), np.float32)
     learner = Learner(Modules("paper", 1, seed=0), learning_rate=1e-3)
     learner.update(Sample(features, 0, np.zeros(1, np.float32), 0), 0.0)
-    learner.current.score(features)
+    learner.score(features)

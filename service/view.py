@@ -66,7 +66,7 @@ class View:
         self._features = self.state.features(mission.scenario)
         if not self._admissible:
             return
-        scores, self._contexts = mission.learner.current.score(self._features)
+        scores, self._contexts = mission.learner.score(self._features)
         if self.asked is not None:
             # A score is minus a cost, and what counts in a cost are packets / W.
             added = self.asked.worth[:, self._admissible].max(axis=0) / mission.scenario.queue_capacity
@@ -95,7 +95,7 @@ class View:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]
         approach = self.state.approach(row, mission.scenario)
-        values = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], approach)
+        values = mission.learner.velocities(self._contexts[self._admissible.index(row)], approach)
         level = int(values.argmax())
         if self.asked is not None:
             level = self.asked.nearest(row, level)
@@ -106,7 +106,7 @@ class View:
         found = {}
         for row, candidate in zip(self.rows, self.candidates, strict=True):
             approach = self.state.approach(row, mission.scenario)
-            levels = mission.learner.current.velocities(self._contexts[self._admissible.index(row)], approach).numpy()
+            levels = mission.learner.velocities(self._contexts[self._admissible.index(row)], approach).numpy()
             found[candidate.sensor_id] = candidate.score + levels - levels.max()
         return found
 

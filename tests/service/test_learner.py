@@ -1,3 +1,6 @@
+import subprocess
+import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -40,22 +43,77 @@ def test_gradient_equals_a_finite_difference(preset: Features) -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_both_modules_learn_jointly_and_the_loss_falls(preset: Features) -> None:
     learner = Learner(Modules(preset, 15, seed=0), learning_rate=5e-3)
-    before = {name: p.clone() for name, p in learner.current.named_parameters()}
+    before = learner.state_dict()["weights"]
     losses = [learner.update(sample(preset), cost=1.0) for _ in range(200)]
     assert losses[-1] < 0.05 * losses[0]
-    moved = {name.split(".")[0] for name, p in learner.current.named_parameters() if not torch.equal(p, before[name])}
-    assert moved == {"attention", "velocity"}
+    after = learner.state_dict()["weights"]
+    assert {name.split(".")[0] for name in after if not np.array_equal(after[name], before[name])} == {
+        "attention",
+        "velocity",
+    }
     assert learner.updates == 200
 
 
-def test_a_decision_holds_a_finished_copy_while_learning_goes_on() -> None:
-    learner = Learner(Modules("paper", 15, seed=0), learning_rate=5e-3)
-    held = learner.current
-    scores, _ = held.score(sample().features)
-    learner.update(sample(), cost=1.0)
-    again, _ = held.score(sample().features)
-    assert torch.equal(scores, again)
-    assert learner.current is not held
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
+    modules = Modules(preset, 15, seed=1)
+    adam = torch.optim.Adam(modules.parameters(), lr=5e-3)
+    learner = Learner(Modules(preset, 15, seed=1), learning_rate=5e-3)
+    for seed in range(60):
+        adam.zero_grad()
+        modules.loss(sample(preset, seed), -0.3).backward()  # type: ignore[no-untyped-call]
+        adam.step()
+        learner.update(sample(preset, seed), cost=0.3)
+        assert torch.equal(learner.score(sample(preset, 99).features)[0], modules.score(sample(preset, 99).features)[0])
+    kept = learner.state_dict()
+    for name, weights in modules.state_dict().items():
+        assert np.array_equal(kept["weights"][name], weights.numpy()), name
+    for index, moments in adam.state_dict()["state"].items():
+        for name, value in moments.items():
+            assert np.array_equal(kept["adam"][index][name], value.numpy()), (index, name)
+
+
+def test_what_was_kept_goes_on_as_if_it_had_never_stopped() -> None:
+    through, first = (Learner(Modules("reach", 15, seed=1), learning_rate=5e-3) for _ in range(2))
+    for seed in range(20):
+        through.update(sample("reach", seed), cost=0.3)
+    for seed in range(10):
+        first.update(sample("reach", seed), cost=0.3)
+    again = Learner(Modules("reach", 15, seed=7), learning_rate=5e-3)
+    again.load_state_dict(first.state_dict())
+    for seed in range(10, 20):
+        again.update(sample("reach", seed), cost=0.3)
+    assert torch.equal(again.score(sample("reach").features)[0], through.score(sample("reach").features)[0])
+    with pytest.raises(RuntimeError):
+        Learner(Modules("paper", 15, seed=1), learning_rate=5e-3).load_state_dict(first.state_dict())
+
+
+def test_a_decision_never_sees_half_a_step() -> None:
+    features = sample("reach", 99).features
+    known, watched = (Learner(Modules("reach", 15, seed=1), learning_rate=0.1) for _ in range(2))
+    finished = {tuple(known.score(features)[0].tolist())}
+    for seed in range(300):
+        known.update(sample("reach", seed), cost=0.3)
+        finished.add(tuple(known.score(features)[0].tolist()))
+    seen: set[tuple[float, ...]] = set()
+    learning = threading.Thread(target=lambda: [watched.update(sample("reach", seed), 0.3) for seed in range(300)])
+    learning.start()
+    while learning.is_alive():
+        seen.add(tuple(watched.score(features)[0].tolist()))
+    assert len(seen) > 1
+    assert seen <= finished
+
+
+def test_nothing_brings_torchs_compiler_into_the_process() -> None:
+    # Its import takes seconds, on a busy machine longer than a decision may.
+    script = (
+        "import sys; from service.mission import Mission; from service.settings import Settings;"
+        "from shared.wire import MissionSpec; from service.learner import rehearse;"
+        "Mission('m', MissionSpec(), Settings()); rehearse();"
+        "print([m for m in ('torch._dynamo', 'torch._inductor', 'sympy') if m in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
 
 
 def test_the_seed_decides_the_initial_weights_and_leaves_torch_alone() -> None:
