@@ -40,4 +40,5 @@ class Attention(nn.Module):
 
 def top_k(scores: Tensor, k: int) -> list[int]:
     """Indices of the k best scores, best first; all of them where there are fewer than k."""
-    return [int(i) for i in torch.topk(scores, min(k, len(scores))).indices]
+    best: list[int] = torch.topk(scores, min(k, len(scores))).indices.tolist()
+    return best

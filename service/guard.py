@@ -36,7 +36,7 @@ def scope_of(method: str, path: str) -> Scope | None:
     return "admin" if path.startswith("/missions") else "decide"
 
 
-def may_make_missions(request: Request) -> bool:
+async def may_make_missions(request: Request) -> bool:
     """Whether who asks may make a mission by asking about one that there is not: with a key, only an admin."""
     scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
     return scopes is None or "admin" in scopes

@@ -45,7 +45,7 @@ EXAMPLE = {
 }
 
 
-def _engine(request: Request) -> Engine:
+async def _engine(request: Request) -> Engine:
     engine: Engine = request.state.engine
     return engine
 

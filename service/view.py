@@ -19,6 +19,9 @@ from service.mission import Mission
 from service.rows import cells
 from shared.wire import Candidate, UavState
 
+_NO_FEATURES = np.empty((0, 0), np.float32)
+_NO_CONTEXTS = torch.empty(0)
+
 
 @dataclass(slots=True)
 class View:
@@ -35,8 +38,8 @@ class View:
     rows: list[int] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     _admissible: list[int] = field(default_factory=list)
-    _features: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    _contexts: Tensor = field(default_factory=lambda: torch.empty(0))
+    _features: NDArray[np.float32] = field(default_factory=lambda: _NO_FEATURES)
+    _contexts: Tensor = field(default_factory=lambda: _NO_CONTEXTS)
 
     @classmethod
     def of(cls, mission: Mission, uav: UavState, step: int) -> Self:
@@ -73,9 +76,9 @@ class View:
             scores = scores + torch.from_numpy(added.astype(np.float32))
         kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(self._admissible)))
         self.rows = [self._admissible[i] for i in kept]
+        ids, told = self.state.ids[self.rows].tolist(), scores[kept].tolist()
         self.candidates = [
-            Candidate(sensor_id=int(self.state.ids[self._admissible[i]]), score=round(float(scores[i]), 6))
-            for i in kept
+            Candidate(sensor_id=sensor, score=round(score, 6)) for sensor, score in zip(ids, told, strict=True)
         ]
 
     def shown(self, mission: Mission) -> list[int]:

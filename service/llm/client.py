@@ -7,7 +7,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.request import getproxies, proxy_bypass
 
+import aiohttp
 import httpx
 
 from service.llm.answer import Constraint, NoDecision, constrain, constrain_labels
@@ -72,14 +74,24 @@ class LLMClient:
     def __init__(self, base_url: str, *, api_key: str | None = None, trust_env: bool = True) -> None:
         self.base_url = base_url
         # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before it is counted.
-        headers = {"Accept-Encoding": "identity"}
+        headers = {"Accept-Encoding": "identity", "Content-Type": "application/json"}
         if api_key:
             headers["Authorization"] = f"Bearer {api_key}"
-        self._http = httpx.AsyncClient(base_url=base_url + "/", headers=headers, timeout=None, trust_env=trust_env)
+        # How many ask at once is bounded before; the certificates are those that httpx trusts.
+        connector = aiohttp.TCPConnector(limit=0, ssl=httpx.create_ssl_context(trust_env=trust_env))
+        self._http = aiohttp.ClientSession(
+            headers=headers,
+            connector=connector,
+            timeout=aiohttp.ClientTimeout(total=None, sock_connect=None),
+            cookie_jar=aiohttp.DummyCookieJar(),
+            auto_decompress=False,
+        )
+        # aiohttp itself would look for a proxy at each call, in a thread.
+        self._by = _proxy_to(base_url) if trust_env else {}
 
     async def close(self) -> None:
         """Close every connection."""
-        await self._http.aclose()
+        await self._http.close()
 
     async def models(self) -> list[str]:
         """Names of the models that the server lists; raises :class:`NoDecision`."""
@@ -111,23 +123,26 @@ class LLMClient:
 
     async def _call(self, method: str, path: str, body: dict[str, Any] | None, most: int = _MAX_RESPONSE_BYTES) -> Any:
         content = bytearray()
+        sent = None if body is None else json.dumps(body, ensure_ascii=False, separators=(",", ":")).encode()
         try:
-            async with self._http.stream(method, path, json=body) as response:
-                if response.headers.get("content-encoding", "identity") != "identity":
+            async with self._http.request(
+                method, f"{self.base_url}/{path}", data=sent, allow_redirects=False, **self._by
+            ) as response:
+                if response.headers.get("Content-Encoding", "identity") != "identity":
                     raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
-                async for chunk in response.aiter_raw():
+                async for chunk in response.content.iter_any():
                     content += chunk
                     if len(content) > most:
                         raise NoDecision("llm_error", f"{self.base_url}: more than {most} bytes")
-        except httpx.ConnectError as error:
+        except aiohttp.ClientConnectorError as error:
             raise Unreachable("llm_error", f"{self.base_url}: {type(error).__name__}") from error
-        except (httpx.HTTPError, httpx.InvalidURL, UnicodeError) as error:
+        except (aiohttp.ClientError, OSError, ValueError) as error:
             # Its text may quote the Authorization header.
             raise NoDecision("llm_error", f"{self.base_url}: {type(error).__name__}") from error
-        if response.status_code in _NOT_UNDERSTOOD:
-            raise NotUnderstood("llm_status", f"{self.base_url}: HTTP {response.status_code}")
-        if response.status_code != 200:
-            raise NoDecision("llm_status", f"{self.base_url}: HTTP {response.status_code}")
+        if response.status in _NOT_UNDERSTOOD:
+            raise NotUnderstood("llm_status", f"{self.base_url}: HTTP {response.status}")
+        if response.status != 200:
+            raise NoDecision("llm_status", f"{self.base_url}: HTTP {response.status}")
         try:
             return json.loads(content)
         except (ValueError, RecursionError):
@@ -226,6 +241,22 @@ def rewriting_body(
 def draw_temperature(lists: Sequence[Sequence[str]]) -> float:
     """At which llama.cpp draws the labels of so many lists."""
     return 1.0 if len(lists) == 1 else _COOL
+
+
+def _proxy_to(url: str) -> dict[str, Any]:
+    """How aiohttp is told of the proxy that the environment names for a URL, if it names one."""
+    asked = httpx.URL(url)
+    proxies = getproxies()
+    named = proxies.get(asked.scheme) or proxies.get("all")
+    if not named or proxy_bypass(asked.host):
+        return {}
+    proxy = httpx.URL(named if "://" in named else f"http://{named}")
+    found: dict[str, Any] = {"proxy": str(proxy.copy_with(username=None, password=None))}
+    if proxy.username:
+        # Through a tunnel the server would see the request's own headers; without one the proxy sees no others.
+        where = "proxy_headers" if asked.scheme == "https" else "headers"
+        found[where] = {"Proxy-Authorization": aiohttp.encode_basic_auth(proxy.username, proxy.password)}
+    return found
 
 
 def _places(choice: Any) -> tuple[Place, ...]:

@@ -200,3 +200,22 @@ def test_without_its_model_file_the_edge_flies_on_and_says_what_to_run(
     client = edge(mode="llm", llm_gguf=tmp_path / "junk.gguf")
     wait_for(client, "unavailable")
     assert client.post("/decide", json=report()).status_code == 200
+
+
+def test_a_server_is_asked_by_the_proxy_that_the_environment_names(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, str]] = []
+
+    class Proxy(StubLlm):
+        async def complete(self, request: Request) -> Response:
+            asked.append((request.headers["host"], request.headers.get("proxy-authorization", "")))
+            return await super().complete(request)
+
+    with serving(Proxy().app) as url:
+        monkeypatch.setenv("HTTP_PROXY", url.replace("http://", "http://user:word@"))
+        monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+        client = edge(mode="llm", llm_url="http://llm.invalid/v1")
+        wait_for(client, "ready")
+        assert client.post("/decide", json=report()).json()["source"] == "llm"
+    assert set(asked) == {("llm.invalid", "Basic dXNlcjp3b3Jk")}

@@ -1,0 +1,53 @@
+"""The least that a Python service can do: a FastAPI application that passes JSON on with httpx, and answers what came.
+
+python benchmarks/bare_forwarder.py --port 9010 --upstream http://127.0.0.1:9009/v1
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import httpx
+import tyro
+import uvicorn
+from fastapi import FastAPI, Request
+
+
+@dataclass(frozen=True)
+class Forwarder:
+    """Serve until SIGTERM."""
+
+    port: int
+    """Port on loopback."""
+    upstream: str
+    """An OpenAI-compatible server, up to and including /v1."""
+
+
+def forwarder(upstream: str) -> FastAPI:
+    """``POST /decide`` is ``POST chat/completions`` of the upstream."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[dict[str, httpx.AsyncClient]]:
+        async with httpx.AsyncClient(base_url=upstream + "/", timeout=None) as client:
+            yield {"client": client}
+
+    app = FastAPI(lifespan=lifespan)
+
+    @app.post("/decide")
+    async def decide(request: Request) -> dict[str, Any]:
+        answer = await request.state.client.post("chat/completions", json=await request.json())
+        return dict(answer.json())
+
+    @app.get("/healthz")
+    async def healthz() -> dict[str, str]:
+        return {"status": "ok"}
+
+    return app
+
+
+if __name__ == "__main__":
+    options = tyro.cli(Forwarder, description=__doc__)
+    uvicorn.run(forwarder(options.upstream), host="127.0.0.1", port=options.port, log_level="warning", access_log=False)

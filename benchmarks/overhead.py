@@ -1,0 +1,311 @@
+"""What the edge adds to an LLM that answers at once, beside a bare forwarder and LiteLLM's proxy.
+
+    python benchmarks/overhead.py
+
+An LLM server that answers at once (``instant_llm.py``), and before it, each a process of its own on loopback:
+(a) ``bare``, a FastAPI application that only passes the same JSON on with httpx; (b) ``litellm``, LiteLLM's proxy with
+the same prompt as a chat completion, behind its one key; (c) ``edge``, ``POST /decide`` in mode ``llm`` with everything
+on: keys, attention, prompt, token counting, checks, SQLite store, metrics, and outcomes that it learns from;
+(d) ``edge, no outcomes``: the same without them. UAVs ask as fast as they are answered, 3 and 64 at once, in rounds
+that go through all of them, so that a noisy machine is noisy for all. Added latency is that at the UAV less that of
+the LLM server asked directly by the same load generator. Prints medians over rounds and their ratios with 95%
+bootstrap intervals over rounds, and writes the same as JSON. Goals: the edge adds at most 1.5 times what ``bare`` adds
+and 0.4 times what LiteLLM adds, and answers at least 0.6 and 3 times as many requests a second.
+LiteLLM is installed into a virtual environment of its own under runs/ the first time; --litellm none leaves it out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import secrets
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from simulator.demo import HOST, usable_port
+from simulator.experiments.intervals import paired
+
+LITELLM = "litellm[proxy]==1.106.2"
+FLEET, SENSORS = 3, 10
+HERE = Path(__file__).parent
+# Each entry: of whom, at most (latency) and at least (requests a second) so many times the other's.
+GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0)}
+
+
+@dataclass(frozen=True)
+class Overhead:
+    """Put load on the edge, on a bare forwarder and on LiteLLM's proxy."""
+
+    rounds: int = 7
+    """How often all are measured, one after the other."""
+    seconds: float = 2.0
+    """How long each is, each time, at each number of UAVs."""
+    uavs: tuple[int, ...] = (3, 64)
+    """How many ask at once."""
+    litellm: str = "install"
+    """`install`, the `litellm` program of your own, or `none`."""
+    out: Path = Path("runs/overhead.json")
+    """Where to write the figures."""
+
+
+@dataclass
+class Uav:
+    """One UAV: it reports, is told, and reports again with the outcome of what it was told."""
+
+    number: int
+    told: dict[str, Any] = field(default_factory=dict)
+    step: int = 0
+
+    def report(self, outcomes: bool) -> bytes:
+        """The next request's body."""
+        random = np.random.default_rng([self.number, self.step])
+        body: dict[str, Any] = {
+            "mission_id": f"fleet{self.number // FLEET}",
+            "step": self.step,
+            "uav_id": self.number % FLEET,
+            "position": [500.0, 450.0],
+            "sensors": {
+                "id": list(range(SENSORS)),
+                "x": [100.0 * n for n in range(SENSORS)],
+                "y": [90.0 * n for n in range(SENSORS)],
+                "queue": [float(q) for q in random.integers(0, 60, SENSORS)],
+                "battery": [40.0] * SENSORS,
+                "channel_gain": [round(float(g), 1) for g in random.uniform(-110, -80, SENSORS)],
+                "last_seen": [self.step] * SENSORS,
+            },
+        }
+        if outcomes and self.told:
+            body["outcome"] = {"decision_id": self.told["decision_id"], "cost": 0.2, "failed": False}
+        self.step += 1
+        return json.dumps(body).encode()
+
+
+@dataclass(frozen=True)
+class Target:
+    """A service under load: where, with which key, and what a UAV asks it."""
+
+    name: str
+    port: int
+    path: str
+    body: Callable[[Uav], bytes]
+    key: str | None = None
+
+    def request(self, uav: Uav) -> bytes:
+        """The whole of the UAV's next request."""
+        body = self.body(uav)
+        key = f"Authorization: Bearer {self.key}\r\n" if self.key else ""
+        head = f"POST {self.path} HTTP/1.1\r\nHost: {HOST}\r\nContent-Type: application/json\r\n{key}"
+        return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
+
+
+async def _flies(target: Target, uav: Uav, ends: float, took_ms: list[float]) -> None:
+    reader, writer = await asyncio.open_connection(HOST, target.port)
+    try:
+        while time.perf_counter() < ends:
+            asked = target.request(uav)
+            began = time.perf_counter()
+            writer.write(asked)
+            head = await reader.readuntil(b"\r\n\r\n")
+            length = int(head.lower().split(b"content-length:")[1].split(b"\r\n")[0])
+            answer = await reader.readexactly(length)
+            took_ms.append((time.perf_counter() - began) * 1e3)
+            if not head.startswith(b"HTTP/1.1 200"):
+                raise SystemExit(f"{target.name}: {answer[:500].decode()}")
+            uav.told = json.loads(answer)
+            # UAVs that ask at once may be answered with the same sensor, and one of them is then given another.
+            if uav.told.get("reason") not in (None, "answer_reserved"):
+                raise SystemExit(f"{target.name}: the LLM was not heard: {uav.told['reason']}")
+    finally:
+        writer.close()
+
+
+def load(target: Target, uavs: list[Uav], seconds: float) -> dict[str, float]:
+    """p50 and p99 in ms, and answers a second, of UAVs that ask at once."""
+
+    async def all_of_them() -> tuple[list[float], float]:
+        took_ms: list[float] = []
+        began = time.perf_counter()
+        await asyncio.gather(*(_flies(target, uav, began + seconds, took_ms) for uav in uavs))
+        return took_ms, time.perf_counter() - began
+
+    took_ms, lasted = asyncio.run(all_of_them())
+    p50, p99 = np.percentile(took_ms, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "rps": len(took_ms) / lasted}
+
+
+@contextmanager
+def running(command: list[str], health: str, env: dict[str, str] | None = None) -> Iterator[None]:
+    """A service as a process, until it answers ``health`` with 200."""
+    process = subprocess.Popen(command, env={**os.environ, **(env or {})}, stdout=subprocess.DEVNULL)
+    try:
+        ends = time.monotonic() + 120
+        while True:
+            try:
+                if httpx.get(health, timeout=5).status_code == 200:
+                    break
+            except httpx.HTTPError:
+                pass
+            if process.poll() is not None or time.monotonic() > ends:
+                raise SystemExit(f"{' '.join(command)}: did not start")
+            time.sleep(0.1)
+        yield
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+def litellm_program(choice: str, console: Console) -> str | None:
+    """LiteLLM's program, installed if that was asked for."""
+    if choice == "none":
+        return None
+    if choice != "install":
+        return choice
+    home = Path("runs/litellm").absolute()
+    program = home / "bin/litellm"
+    if not program.exists():
+        with console.status(f"installing {LITELLM} under {home.parent.name}/{home.name}"):
+            subprocess.run([sys.executable, "-m", "venv", home], check=True)
+            subprocess.run([home / "bin/pip", "install", "--quiet", LITELLM], check=True)
+    return str(program)
+
+
+def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
+    """Start everything; the LLM server itself is the first target."""
+    llm, bare, proxy, edge = (usable_port(0) for _ in range(4))
+    python, upstream = sys.executable, f"http://{HOST}:{llm}/v1"
+    stack.enter_context(running([python, str(HERE / "instant_llm.py"), "--port", str(llm)], f"{upstream}/models"))
+    forwarder = [python, str(HERE / "bare_forwarder.py"), "--port", str(bare), "--upstream", upstream]
+    stack.enter_context(running(forwarder, f"http://{HOST}:{bare}/healthz"))
+    keys = folder / "keys.json"
+    add = ["keys", "add", "load", "--file", str(keys), "--scopes", "decide", "admin", "--per-minute", "1000000"]
+    made = subprocess.run([python, "-m", "shared.cli", *add], check=True, capture_output=True, text=True)
+    key = made.stdout.split()[-1]
+    settings = {
+        "AICVDS_MODE": "llm",
+        "AICVDS_PLANNER": "off",
+        "AICVDS_LLM_URL": upstream,
+        "AICVDS_KEYS": str(keys),
+        "AICVDS_STORE": str(folder / "missions.db"),
+        "AICVDS_LOG_LEVEL": "warning",
+        # The LLM server's first word would break a hard rule now and then, and the policy's answer would be measured.
+        "AICVDS_VERIFY": "off",
+        # Of a busy machine the slowness is to be measured, not hidden by answers without the LLM.
+        "AICVDS_DEADLINE_MS": "20000",
+    }
+    serve = [python, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(edge)]
+    stack.enter_context(running(serve, f"http://{HOST}:{edge}/healthz", settings))
+    while httpx.get(f"http://{HOST}:{edge}/readyz").json()["llm"] != "ready":
+        time.sleep(0.1)
+    targets = [
+        Target("bare", bare, "/decide", lambda uav: uav.report(outcomes=False)),
+        Target("edge", edge, "/decide", lambda uav: uav.report(outcomes=True), key),
+        Target("edge, no outcomes", edge, "/decide", lambda uav: uav.report(outcomes=False), key),
+    ]
+    # What the edge asks is what LiteLLM is to pass on.
+    load(targets[1], [Uav(n) for n in range(FLEET)], 1.0)
+    asked = httpx.get(f"http://{HOST}:{llm}/last").json()
+    chat = json.dumps({"model": "instant", "messages": asked["messages"], "temperature": 0, "max_tokens": 12}).encode()
+    if litellm is not None:
+        model = {"model": "openai/instant", "api_base": upstream, "api_key": "none"}
+        master = "sk-" + secrets.token_hex(32)
+        config = folder / "litellm.json"
+        config.write_text(json.dumps({"model_list": [{"model_name": "instant", "litellm_params": model}]}))
+        command = [litellm, "--config", str(config), "--host", HOST, "--port", str(proxy)]
+        offline = {"LITELLM_LOCAL_MODEL_COST_MAP": "True", "LITELLM_LOG": "ERROR", "LITELLM_MASTER_KEY": master}
+        stack.enter_context(running(command, f"http://{HOST}:{proxy}/health/liveliness", offline))
+        targets.append(Target("litellm", proxy, "/v1/chat/completions", lambda _: chat, master))
+    return [Target("direct", llm, "/v1/chat/completions", lambda _: chat), *targets]
+
+
+Figures = dict[str, dict[int, dict[str, list[float]]]]
+
+
+def measure(targets: list[Target], options: Overhead, console: Console) -> Figures:
+    """By target, number of UAVs and quantity: one value a round."""
+    found: Figures = {t.name: {n: {"p50": [], "p99": [], "rps": []} for n in options.uavs} for t in targets}
+    # Each target's UAVs go on with their missions from round to round; the edge's two kinds fly in missions apart.
+    fleets = {t.name: [Uav(999 * i + n) for n in range(max(options.uavs))] for i, t in enumerate(targets)}
+    with Progress(console=console) as progress:
+        task = progress.add_task("measuring", total=(options.rounds + 1) * len(targets) * len(options.uavs))
+        for turn in range(options.rounds + 1):
+            for target in targets:
+                for count in options.uavs:
+                    figures = load(target, fleets[target.name][:count], options.seconds)
+                    # The first round warms up.
+                    for quantity, value in figures.items() if turn else ():
+                        found[target.name][count][quantity].append(value)
+                    progress.advance(task)
+    return found
+
+
+def compare(found: Figures, uavs: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Medians, and the edge's ratios to the others with their intervals."""
+    rows = []
+    for count in uavs:
+        for name, by_count in found.items():
+            row: dict[str, Any] = {"service": name, "uavs": count}
+            for quantity in ("p50", "p99", "rps"):
+                row[quantity] = round(float(np.median(by_count[count][quantity])), 2)
+            if name.startswith("edge"):
+                for other in (o for o in GOALS if o in found):
+                    row[f"to {other}"] = {q: _ratio(found, name, other, count, q) for q in ("p50", "p99", "rps")}
+            rows.append(row)
+    return rows
+
+
+def _ratio(found: Figures, name: str, other: str, count: int, quantity: str) -> list[float]:
+    mine, its = (np.array(found[n][count][quantity]) for n in (name, other))
+    if quantity != "rps":
+        direct = np.array(found["direct"][count][quantity])
+        mine, its = mine - direct, its - direct
+    told = next(p for p in paired(name, other, quantity, list(mine), list(its)) if p.kind == "ratio")
+    return [round(value, 2) for value in (told.mean, told.low, told.high)]
+
+
+def tell(rows: list[dict[str, Any]], console: Console) -> None:
+    """The table, and which goals are met."""
+    table = Table("UAVs", "service", "p50 ms", "p99 ms", "requests/s", "added p50", "added p99", "requests/s, ratio")
+    for row in rows:
+        ratios = [
+            "; ".join(
+                f"{row[f'to {o}'][q][0]} [{row[f'to {o}'][q][1]}, {row[f'to {o}'][q][2]}] × {o}"
+                for o in GOALS
+                if f"to {o}" in row
+            )
+            for q in ("p50", "p99", "rps")
+        ]
+        table.add_row(str(row["uavs"]), row["service"], *(f"{row[q]:.2f}" for q in ("p50", "p99", "rps")), *ratios)
+    console.print(table)
+
+
+def main(options: Overhead) -> None:
+    """Measure, print, write."""
+    console = Console()
+    program = litellm_program(options.litellm, console)
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        with console.status("starting"):
+            targets = start(Path(folder), program, stack)
+        found = measure(targets, options, console)
+    rows = compare(found, options.uavs)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps({"rounds": options.rounds, "rows": rows}, indent=2) + "\n")
+    tell(rows, console)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Overhead, description=__doc__))
