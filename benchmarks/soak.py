@@ -2,7 +2,7 @@
 
     python benchmarks/soak.py --minutes 60
 
-Starts an edge with its embedded LLM and a store, and flies 190 missions of mode ``value`` and 10 of mode ``guided`` at
+Starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided`` at
 once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, so
 the edge is measured once every mission has filled it: the slope of the resident memory by least squares, with its 95%
 interval, and the first and last count of tasks, connections and open files. Prints it, and writes the same as JSON.
@@ -47,8 +47,8 @@ class Soak:
     """Fly 200 missions and watch the edge's memory."""
 
     minutes: float = 10.0
-    """How long to measure, once every mission of mode value remembers as much as it can."""
-    guided: int = 10
+    """How long to measure, once every mission remembers as much as it can."""
+    guided: int = 2
     """Of the missions, how many are flown in mode guided, with the embedded LLM; with 0 none is loaded."""
     out: Path = Path("runs/soak.json")
     """Where to write the figures."""
@@ -191,7 +191,7 @@ def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Co
     process, samples = psutil.Process(pid), list[Sample]()
     with Progress(console=console) as progress:
         filling = progress.add_task("filling", total=FULL // UAVS)
-        while (least := min(mission.step for mission in others)) < FULL // UAVS:
+        while (least := min(mission.step for mission in missions)) < FULL // UAVS:
             progress.update(filling, completed=least)
             _check(workers)
             time.sleep(1)

@@ -1,8 +1,8 @@
 """The journal: what changes missions is on disk before it is acknowledged, many changes to a commit.
 
-One thread writes. While it commits, what comes meanwhile gathers for the next commit, so that under load a commit, and
-its fsync, serves many answers. Where the store fails, nothing that waits is lost: it is tried again, and meanwhile
-decisions go on while what must be on disk is refused.
+One thread writes, when somebody waits for it, so that what a decision changes is one commit. What comes while it
+commits gathers for the next, so that under load a commit, and its fsync, serves many answers. Where the store fails,
+nothing that waits is lost: it is tried again, and meanwhile decisions go on while what must be on disk is refused.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ _EVENTS = 256
 _SENSORS = 100
 _MOST_AT_ONCE = 1000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
+# The longest that what nobody waits for stays unwritten.
+_LINGER_S = 0.25
 
 
 class Track:
@@ -76,7 +78,7 @@ class Journal:
         self._tracks: dict[str, Track] = {}
         self._queue: deque[tuple[int, Item]] = deque()
         self._changed = threading.Condition()
-        self._added = self._written = 0
+        self._added = self._wanted = self._written = 0
         self._failing = self._closing = False
         self._waiting: list[tuple[int, asyncio.Future[bool]]] = []
         self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
@@ -148,6 +150,9 @@ class Journal:
             return False
         mine = self._added, self._loop.create_future()
         self._waiting.append(mine)
+        with self._changed:
+            self._wanted = self._added
+            self._changed.notify()
         try:
             async with asyncio.timeout(max(0.0, within_s)):
                 return bool(await mine[1])
@@ -169,15 +174,16 @@ class Journal:
         """The caller holds the lock."""
         self._added += 1
         self._queue.append((self._added, item))
-        self._changed.notify()
 
     def _write(self) -> None:
         pause_s = _FIRST_PAUSE_S
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._queue or self._closing)
-                if not self._queue:
+                self._changed.wait_for(lambda: self._wanted > self._written or self._closing, timeout=_LINGER_S)
+                if not self._queue and self._closing:
                     return
+                if not self._queue:
+                    continue
                 batch = [self._queue[i] for i in range(min(len(self._queue), _MOST_AT_ONCE))]
             begun = time.perf_counter()
             try:

@@ -97,10 +97,14 @@ class Guidance(Wire):
 
     def allows(self, velocity: int) -> bool:
         """Whether this velocity may be flown."""
-        return bool(self.allowed(velocity + 1)[velocity])
+        slow = self.min_velocity is not None and velocity < self.min_velocity
+        fast = self.max_velocity is not None and velocity > self.max_velocity
+        return not (slow or fast or velocity in self.forbidden_velocities)
 
     def nearest(self, velocity: int, levels: int) -> int:
         """The velocity of 0..levels - 1 that may be flown nearest to this one, the slower of two."""
+        if 0 <= velocity < levels and self.allows(velocity):
+            return velocity
         choices = np.flatnonzero(self.allowed(levels))
         return int(choices[np.abs(choices - velocity).argmin()])
 

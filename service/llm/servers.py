@@ -96,6 +96,8 @@ class Servers:
         if self._hedge_s is not None and len(waiting) == 1:
             # Behind one address there may be several machines.
             waiting.append(waiting[0])
+        if len(waiting) == 1:
+            return replace(await ask(waiting[0]), model=waiting[0].model)
         running: dict[asyncio.Task[Completion], Upstream] = {}
         failure: NoDecision | None = None
         later: list[asyncio.Task[Completion]] = []

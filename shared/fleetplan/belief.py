@@ -121,7 +121,7 @@ class FleetBelief:
                 last.progress_m += velocity * self._scenario.step_s
                 x, y = self._paths[uav].at(last.progress_m)
                 last.position = float(x), float(y)
-            packets = int(self.links(uav, [0])[0, sensor])
+            packets = int(packets_per_step(self.distances(uav, [0])[0, sensor], self._scenario))
             if packets and (sensor, last.step) not in served:
                 served.add((sensor, last.step))
                 self.collect(sensor, packets, last.step)

@@ -62,7 +62,11 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
 def test_a_restarted_edge_flies_on(address: str, report: Report) -> None:
     with running(address) as (client, _):
         owed = fly(client, report, range(5))
-        before = client.get("/missions/test").json()
+        # Lessons come after the answers.
+        ends = time.monotonic() + 30
+        while (before := client.get("/missions/test").json())["learner_updates"] < 12:
+            assert time.monotonic() < ends
+            time.sleep(0.05)
     with running(address, top_k=2, mode="policy") as (client, engine):
         assert engine.missions.awake == []
         assert client.get("/missions/test").json() == before
