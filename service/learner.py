@@ -101,8 +101,9 @@ class Learner:
         loss = self._training.loss(sample, -cost)
         self._adam.step(torch.autograd.grad(loss, self._parameters))
         self._show()
-        self.updates += 1
+        # Who sees that it was learned sees the loss too.
         self.last_loss = loss.item()
+        self.updates += 1
         return self.last_loss
 
     def state_dict(self) -> dict[str, Any]:
