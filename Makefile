@@ -1,4 +1,4 @@
-# make install | demo | test | check | faults | fuzz | soak | compose | clean
+# make install | demo | test | check | faults | fuzz | soak | bench | compose | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
@@ -9,7 +9,7 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
-.PHONY: help install demo test check faults fuzz soak compose clean
+.PHONY: help install demo test check faults fuzz soak bench compose clean
 .DEFAULT_GOAL := help
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
 	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
+	@echo "make bench     measure how long the edge takes to start"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
 
 install: .venv/installed
@@ -52,6 +53,9 @@ fuzz: install
 
 soak: install
 	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)
+
+bench: install
+	$(BIN)/python benchmarks/startup.py
 
 compose:
 	tests/e2e/compose.sh

@@ -14,7 +14,8 @@ from fastapi.openapi.utils import get_openapi
 
 from service import problems
 from service.engine import Engine
-from service.guard import CarefulHeaders, Guard
+from service.guard import Guard
+from service.headers import CarefulHeaders
 from service.keys import Keys
 from service.limits import BodyLimit, Crowd
 from service.llm.servers import Servers

@@ -1,4 +1,4 @@
-"""The guard before the door: who asks, whether that key may, and how often; and headers that keep browsers careful."""
+"""The guard before the door: who asks, whether that key may, and how often."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from limits import RateLimitItemPerMinute
 from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
-from starlette.datastructures import MutableHeaders
 from starlette.requests import Request
-from starlette.types import ASGIApp, Message, Receive, Send
+from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Asked
 
 from service.keys import Key, Keys, Scope
@@ -21,12 +20,6 @@ from service.problems import problem_response
 _OPEN = frozenset(("/healthz", "/readyz"))
 # Where the guard leaves the key's scopes for the routes.
 SCOPES = "aicvds.scopes"
-_CAREFUL = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-    "X-Frame-Options": "DENY",
-}
 
 
 def scope_of(method: str, path: str) -> Scope | None:
@@ -82,23 +75,6 @@ class Guard:
             return None
         stats = await self._rates.get_window_stats(rate, key.name)
         return max(1, math.ceil(stats.reset_time - time.time()))
-
-
-class CarefulHeaders:
-    """Pure ASGI middleware: answers are not cached, not framed, and not taken for another content type."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-
-    async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
-        async def careful(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                for name, value in _CAREFUL.items():
-                    headers.setdefault(name, value)
-            await send(message)
-
-        await self.app(scope, receive, careful if scope["type"] == "http" else send)
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:

@@ -7,10 +7,16 @@ import ipaddress
 import socket
 import sys
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from pydantic import ValidationError
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+    from service.settings import Settings
 
 # In-flight decisions are hurried to end within 4 s; past this, shutting down does not wait for them. With the last
 # checkpoints and the last commit it is less than the 10 s after which `docker stop` kills.
@@ -46,7 +52,7 @@ def main(argv: list[str]) -> int:
         return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}")
     host = f"[{args.host}]" if ":" in args.host else args.host
     try:
-        # The system queues requests from here on; they are answered once torch is loaded.
+        # The system queues requests from here on. /healthz is answered at once, the others when torch is loaded.
         print(
             f"aicvds serve: running on http://{host}:{listener.getsockname()[1]}, loading", file=sys.stderr, flush=True
         )
@@ -81,19 +87,12 @@ def _serve(listener: socket.socket, host: str) -> int:
     import uvicorn
 
     from service import logs
-    from service.app import create_app
-    from service.keys import BadKeys
-    from service.store import Store, StoreUnusable
+    from service.loading import Loading
 
     logs.configure(settings.log_level, settings.log_format)
-    try:
-        app = create_app(settings, None if settings.store == "none" else Store(settings.store))
-    except BadKeys as error:
-        return _refused(f"AICVDS_KEYS: {error}")
-    except StoreUnusable as error:
-        return _refused(f"AICVDS_STORE: {error}. Give another, or `none` to keep nothing")
+    loading = Loading(partial(_application, settings), lambda: setattr(server, "should_exit", True))
     config = uvicorn.Config(
-        app,
+        loading,
         log_config=None,
         log_level=settings.log_level,
         timeout_graceful_shutdown=_SHUTDOWN_S,
@@ -108,14 +107,37 @@ def _serve(listener: socket.socket, host: str) -> int:
             gc.freeze()
 
         async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-            if (engine := getattr(app.state, "engine", None)) is not None:
-                engine.asking.hurry()
+            if loading.app is not None:
+                loading.app.state.engine.asking.hurry()
             await super().shutdown(sockets)
             # What uvicorn does after this is to say goodbye, and to raise the signal again.
             logs.hurry()
 
-    Server(config).run(sockets=[listener])
+    server = Server(config)
+    server.run(sockets=[listener])
+    if isinstance(loading.error, _Unusable):
+        return _refused(str(loading.error))
+    if loading.error is not None:
+        raise loading.error
     return 0
+
+
+def _application(settings: Settings) -> FastAPI:
+    """Import torch and make the edge; raises ``_Unusable``."""
+    from service.app import create_app
+    from service.keys import BadKeys
+    from service.store import Store, StoreUnusable
+
+    try:
+        return create_app(settings, None if settings.store == "none" else Store(settings.store))
+    except BadKeys as error:
+        raise _Unusable(f"AICVDS_KEYS: {error}") from None
+    except StoreUnusable as error:
+        raise _Unusable(f"AICVDS_STORE: {error}. Give another, or `none` to keep nothing") from None
+
+
+class _Unusable(Exception):
+    """What a setting names cannot be used."""
 
 
 def _is_loopback(host: str) -> bool:

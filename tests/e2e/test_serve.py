@@ -1,6 +1,7 @@
 """``aicvds`` and ``aicvds serve`` as processes."""
 
 import asyncio
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -21,6 +22,20 @@ def test_help_names_every_command() -> None:
     assert shown.returncode == 0
     for command in ("serve", "simulate", "demo", "keys", "model"):
         assert command in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "without"),
+    [
+        ([], {"torch", "numpy", "fastapi", "pydantic", "scipy", "tyro", "rich", "httpx"}),
+        (["serve"], {"torch", "numpy", "fastapi", "scipy", "sqlalchemy", "httpx", "rich", "uvicorn"}),
+    ],
+)
+def test_help_imports_nothing_that_takes_long(words: list[str], without: set[str]) -> None:
+    shown = run(*words, "--help", PYTHONPROFILEIMPORTTIME="1")
+    imported = set(re.findall(r"^import time:.*\| +(\S+)$", shown.stderr, re.MULTILINE))
+    assert "shared.cli" in imported
+    assert not imported & without
 
 
 @pytest.mark.parametrize("command", ["serve", "simulate", "demo", "keys", "model"])
@@ -86,9 +101,25 @@ def test_ctrl_c_while_loading_is_quiet() -> None:
 
 
 @pytest.mark.parametrize("ask", [signal.SIGTERM, signal.SIGINT])
-def test_the_edge_stops_when_asked(ask: signal.Signals) -> None:
+def test_it_stops_when_asked_in_its_first_second(ask: signal.Signals) -> None:
     with serving_edge() as (url, process):
         assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
+        process.send_signal(ask)
+        output, _ = process.communicate(timeout=15)
+    assert process.returncode in (0, 130, -ask)
+    assert "Traceback" not in output
+
+
+def test_a_decision_asked_for_before_it_is_loaded_is_answered(report: Callable[..., dict[str, Any]]) -> None:
+    with serving_edge(AICVDS_MODE="policy") as (url, _):
+        answer = httpx.post(f"{url}/decide", json=report(deadline_ms=60_000), timeout=60)
+    assert (answer.status_code, answer.json()["source"]) == (200, "policy")
+
+
+@pytest.mark.parametrize("ask", [signal.SIGTERM, signal.SIGINT])
+def test_the_edge_stops_when_asked(ask: signal.Signals) -> None:
+    with serving_edge() as (url, process):
+        assert httpx.get(f"{url}/readyz", timeout=60).status_code == 200
         process.send_signal(ask)
         assert process.wait(timeout=15) in (0, 130, -ask)
 

@@ -1,0 +1,105 @@
+"""The edge while it loads: it says that it lives; whatever else is asked waits, and is answered rather than refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from service.app import create_app
+from service.loading import Loading
+from service.settings import Settings
+from tests.running import serving
+
+
+@contextmanager
+def held(make: Callable[[], FastAPI]) -> Iterator[tuple[str, Loading, threading.Event, threading.Event]]:
+    """An edge whose loading waits: its URL, itself, what lets it load, and what tells that it asked for its end."""
+    may, stopped = threading.Event(), threading.Event()
+
+    def load() -> FastAPI:
+        may.wait(timeout=60)
+        return make()
+
+    loading = Loading(load, stopped.set)
+    try:
+        with serving(loading) as url:
+            yield url, loading, may, stopped
+    finally:
+        may.set()
+
+
+def test_alive_is_told_and_a_decision_waits_until_it_is_loaded(report: Callable[..., dict[str, Any]]) -> None:
+    with (
+        held(lambda: create_app(Settings(mode="policy"))) as (url, _, may, _),
+        httpx.Client(base_url=url, timeout=60) as client,
+        ThreadPoolExecutor() as pool,
+    ):
+        asked = pool.submit(httpx.post, f"{url}/decide", json=report(), timeout=60)
+        ready = pool.submit(httpx.get, f"{url}/readyz", timeout=60)
+        early = client.get("/healthz")
+        with pytest.raises(NotYet):
+            asked.result(timeout=0.5)
+        assert not ready.done()
+        may.set()
+        answer = asked.result(timeout=60)
+        assert (answer.status_code, answer.json()["source"]) == (200, "policy")
+        assert ready.result(timeout=60).json()["llm"] == "off"
+        late = client.get("/healthz")
+    assert (early.status_code, early.json()) == (late.status_code, late.json()) == (200, {"status": "ok"})
+    # The same headers too, the time apart: nobody can tell the two from each other.
+    assert {**early.headers, "date": ""} == {**late.headers, "date": ""}
+    assert early.headers["x-frame-options"] == "DENY"
+
+
+def test_only_a_plain_question_after_its_life_is_answered_early() -> None:
+    with (
+        held(lambda: create_app(Settings(mode="policy"))) as (url, _, may, _),
+        ThreadPoolExecutor() as pool,
+    ):
+        posted = pool.submit(httpx.post, f"{url}/healthz", timeout=60)
+        assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
+        assert not posted.done()
+        may.set()
+        assert posted.result(timeout=60).status_code == 405
+
+
+def test_what_cannot_be_loaded_ends_the_server_and_leaves_nobody_waiting() -> None:
+    def broken() -> FastAPI:
+        raise RuntimeError("no such module")
+
+    with held(broken) as (url, loading, may, stopped), ThreadPoolExecutor() as pool:
+        asked = pool.submit(httpx.get, f"{url}/readyz", timeout=60)
+        assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
+        may.set()
+        answer = asked.result(timeout=60)
+        assert stopped.wait(timeout=10)
+        assert str(loading.error) == "no such module"
+        assert httpx.get(f"{url}/healthz", timeout=60).status_code == 503
+    assert (answer.status_code, answer.headers["content-type"]) == (503, "application/problem+json")
+
+
+def test_nothing_slow_is_imported_before_the_first_answer() -> None:
+    slow = ("torch", "numpy", "scipy", "fastapi", "sqlalchemy", "alembic", "ortools", "tiktoken", "xllamacpp")
+    told = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import sys, uvicorn, service.serve, service.settings, service.logs, service.loading\n"
+            f"print([name for name in {slow} if name in sys.modules])",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert told.stdout.strip() == "[]"
