@@ -33,8 +33,19 @@ COPY shared/ shared/
 COPY service/ service/
 RUN pip wheel --no-deps --wheel-dir /wheels .
 
+# What a running edge never opens, as docker/check_edge.py proves below:
+# - symbol tables of shared libraries (237 MB: 89 torch's, 80 llama.cpp's), which serve debuggers. Not of those in
+#   *.libs: the wheels' makers have moved their parts about, and strip breaks them;
+# - the packages' own tests (90 MB);
+# - torch's compiled tests and protoc (52 MB). It does not start without torch_shm_manager.
+# Bytecode (__pycache__, 165 MB) stays: with a read-only root it would be made anew at every start.
 FROM dependencies AS slim
-RUN python -m pip uninstall --quiet --yes pip
+RUN apt-get update -q && apt-get install -y -q --no-install-recommends binutils
+RUN python -m pip uninstall --quiet --yes pip \
+ && cd /opt/aicvds/lib/python3.11/site-packages \
+ && find . -type f \( -name '*.so' -o -name '*.so.*' \) ! -path './*.libs/*' -exec strip --strip-unneeded {} + \
+ && find . -type d -name tests -prune -exec rm -rf {} + \
+ && find torch/bin -type f ! -name torch_shm_manager -delete
 
 # Layers from the largest and steadiest to the smallest: an edit of the source ships kilobytes.
 FROM python:3.11-slim-bookworm
@@ -54,6 +65,8 @@ RUN python -m pip --python /opt/aicvds/bin/python install \
 RUN install --directory --owner=aicvds --group=aicvds /store
 ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none
 USER 10001:10001
+COPY docker/check_edge.py /opt/aicvds/
+RUN python /opt/aicvds/check_edge.py
 EXPOSE 8000
 # Healthy: it decides, and its LLM is no longer on its way (ready, off, or known to be unavailable).
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 CMD ["python", "-c", \
