@@ -11,16 +11,21 @@ from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
 from service.headers import CarefulHeaders
+from shared.wire import Problem
 
 # As service.routes has it: the process lives, and nothing else is said.
 _ALIVE = CarefulHeaders(JSONResponse({"status": "ok"}))
+_PROBLEM = Problem(title="Service Unavailable", status=503, detail="the edge ends before it has started", errors=[])
+_REFUSED = CarefulHeaders(
+    JSONResponse(_PROBLEM.model_dump(), 503, headers={"Retry-After": "1"}, media_type="application/problem+json")
+)
 
 
 class Loading:
     """An ASGI application that becomes another one as soon as that is loaded.
 
     Until then ``GET /healthz`` is answered, and every other request waits. Where the other cannot be loaded, those get
-    a 503, ``error`` says why, and ``stop`` is called.
+    a 503, ``error`` says why, and ``stop`` is called. Where the server is to end before, they get a 503 too.
 
     Args:
         load: imports and makes the other, in a thread.
@@ -46,11 +51,13 @@ class Loading:
                 return
             await self._settled.wait()
         if self.app is None:
-            from service.problems import problem_response
-
-            await problem_response(503, "the edge could not start; its log says why")(scope, receive, send)
+            await _REFUSED(scope, receive, send)
             return
         await self.app({**scope, "state": dict(self._state)}, receive, send)
+
+    def give_up(self) -> None:
+        """Have nobody wait any longer: the server ends."""
+        self._settled.set()
 
     async def _live(self, receive: Receive, send: Send) -> None:
         """Started at once; ended when the other has ended, or at once where it is not loaded yet."""
@@ -58,7 +65,7 @@ class Loading:
         await send({"type": "lifespan.startup.complete"})
         running = asyncio.create_task(self._run(), name="application")
         await receive()
-        if not self._settled.is_set():
+        if self.app is None:
             running.cancel()
         self._ended.set()
         await asyncio.gather(running, return_exceptions=True)

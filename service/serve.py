@@ -107,6 +107,7 @@ def _serve(listener: socket.socket, host: str) -> int:
             gc.freeze()
 
         async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            loading.give_up()
             if loading.app is not None:
                 loading.app.state.engine.asking.hurry()
             await super().shutdown(sockets)

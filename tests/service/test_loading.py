@@ -88,6 +88,16 @@ def test_what_cannot_be_loaded_ends_the_server_and_leaves_nobody_waiting() -> No
     assert (answer.status_code, answer.headers["content-type"]) == (503, "application/problem+json")
 
 
+def test_nobody_waits_for_an_edge_that_ends() -> None:
+    with held(lambda: create_app(Settings(mode="policy"))) as (url, loading, _, _), ThreadPoolExecutor() as pool:
+        asked = pool.submit(httpx.get, f"{url}/readyz", timeout=60)
+        assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
+        assert not asked.done()
+        loading.give_up()
+        answer = asked.result(timeout=60)
+    assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
+
+
 def test_nothing_slow_is_imported_before_the_first_answer() -> None:
     slow = ("torch", "numpy", "scipy", "fastapi", "sqlalchemy", "alembic", "ortools", "tiktoken", "xllamacpp")
     told = subprocess.run(
