@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -77,6 +78,9 @@ class Loading:
             app = await asyncio.to_thread(self._load)
             async with app.router.lifespan_context(app) as state:
                 self.app, self._state = app, state or {}
+                # A million objects of torch and others stay as long as the process: no collection need look at them,
+                # which takes a tenth of a second in the midst of a decision.
+                gc.freeze()
                 self._settled.set()
                 await self._ended.wait()
         except Exception as error:

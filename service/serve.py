@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import ipaddress
 import socket
 import sys
@@ -100,12 +99,6 @@ def _serve(listener: socket.socket, host: str) -> int:
     )
 
     class Server(uvicorn.Server):
-        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-            await super().startup(sockets=sockets)
-            # A million objects of torch and others stay as long as the process: no collection need look at them, which
-            # takes a tenth of a second in the midst of a decision.
-            gc.freeze()
-
         async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
             loading.give_up()
             if loading.app is not None:
