@@ -19,7 +19,8 @@ from service.critic import Action
 from service.features import State
 from service.prompt import Prompt, Template, note_block
 from service.reach import Reach, distances_ahead
-from service.rows import Cells, cells, full_cells
+from service.rows import Cells, Csv, cells
+from service.uncompressed import Uncompressed
 from shared.channel import FloatArray
 from shared.scenario import Scenario
 
@@ -112,7 +113,7 @@ class GuidedTemplate(Template):
             static=self.static,
             experiences="".join(experiences),
             state=last + offer.rows,
-            state_uncompressed=last + _whole(state),
+            uncompressed=_whole(state).under(last),
         )
 
     def together(
@@ -123,7 +124,7 @@ class GuidedTemplate(Template):
         The static block and the experiences are the first one's; the user message is the shares' in order.
         """
         shares = {
-            uav: Prompt("", "", _list(uav, offer.numbered_rows()), _list(uav, _whole(state)))
+            uav: Prompt("", "", _list(uav, offer.numbered_rows()), _whole(state).under(_list(uav, "")))
             for uav, (offer, state) in offers.items()
         }
         uav, first = next(iter(shares.items()))
@@ -132,7 +133,7 @@ class GuidedTemplate(Template):
             static=self.static_together,
             experiences="".join(experiences),
             state=last + first.state,
-            state_uncompressed=last + first.state_uncompressed,
+            uncompressed=first.uncompressed.under(last),
         )
         return shares
 
@@ -217,8 +218,8 @@ def velocities(reach: Reach, row: int, count: int) -> list[int]:
     return [int(level) for level in np.rint(np.linspace(good[0], good[-1], count))]
 
 
-def _whole(state: State) -> str:
-    return "".join(",".join(full_cells(state, row).values()) + "\n" for row in range(len(state.ids)))
+def _whole(state: State) -> Uncompressed:
+    return Uncompressed(state, Csv().row)
 
 
 def _list(uav: int, rows: str) -> str:

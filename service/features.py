@@ -115,8 +115,8 @@ def augment(
     """
     sensors = uav.sensors
     ids = np.asarray(sensors.id, dtype=np.int64)
-    heard = np.array([s is not None for s in sensors.last_seen])
-    fresh = np.array([s == step for s in sensors.last_seen])
+    beacon = filled(sensors.last_seen, -1.0)
+    heard, fresh = beacon >= 0, beacon == step
     position = (uav.position[0], uav.position[1])
     places = np.stack((sensors.x, sensors.y), axis=1)
     distance = np.linalg.norm(places - position, axis=1)
@@ -149,4 +149,6 @@ def augment(
 
 def filled(column: Sequence[float | None], missing: float = 0.0) -> FloatArray:
     """A column as an array ``(J,)``, with ``missing`` for nulls."""
-    return np.array([missing if value is None else value for value in column], dtype=np.float64)
+    # numpy makes NaN of None, and the wire lets no other NaN in.
+    values = np.array(column, dtype=np.float64)
+    return np.where(np.isnan(values), missing, values)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from service.demonstrations import Solved
 from service.features import State
-from service.rows import FORMATS, UNKNOWN, Cells, cells, columns, full_cells, meanings
+from service.rows import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
+from service.uncompressed import Uncompressed
 from shared.scenario import Scenario
 from shared.wire import Features, PromptStyle
 
@@ -44,7 +45,7 @@ _EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """One prompt. ``state_uncompressed`` is the last block as it would be without attention and masks.
+    """One prompt. ``uncompressed`` is the last block as it would be without attention and masks.
 
     Experiences retrieved for this decision alone stand in the last block, in both: they are never cached.
     """
@@ -52,7 +53,7 @@ class Prompt:
     static: str
     experiences: str
     state: str
-    state_uncompressed: str
+    uncompressed: Uncompressed
 
     @property
     def user(self) -> str:
@@ -129,7 +130,7 @@ class Template:
             static=self.static,
             experiences=(header if experiences else "") + "".join(experiences),
             state=last + self._table([cells(state, row) for row in kept_rows]),
-            state_uncompressed=last + self._table([full_cells(state, row) for row in range(len(state.ids))]),
+            uncompressed=Uncompressed(state, self._format.row, last + self._format.header(full_columns(state))),
         )
 
     def _demonstration(self, solved: Solved) -> str:

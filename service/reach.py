@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -39,7 +40,7 @@ def distances_ahead(
     return np.asarray(np.linalg.norm(places[None] - ahead[:, None], axis=2))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Reach:
     """One UAV's reach after a step at each of V velocity levels to each of J sensors; arrays ``(V, J)``.
 
@@ -58,12 +59,12 @@ class Reach:
         velocities = np.arange(len(distance), dtype=np.float64)
         return cls(distance, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
 
-    @property
+    @cached_property
     def best(self) -> NDArray[np.int64]:
         """For each sensor the velocity level of greatest worth, ``(J,)``."""
         return np.asarray(self.worth.argmax(axis=0))
 
-    @property
+    @cached_property
     def best_packets(self) -> FloatArray:
         """Packets that can be moved at the best velocity, ``(J,)``."""
         return np.asarray(np.take_along_axis(self.packets, self.best[None], axis=0)[0])

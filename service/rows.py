@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from typing import Literal
+from typing import Any, Literal
+
+from numpy.typing import NDArray
 
 from service.features import State
 from shared.wire import Features
@@ -14,6 +16,8 @@ from shared.wire import Features
 Cells = Mapping[str, str]
 
 UNKNOWN = "?"
+# The columns that need no beacon.
+ALWAYS_KNOWN = ("sensor_id", "age", "distance")
 
 _MEANINGS = {
     "queue": "packets waiting",
@@ -43,28 +47,29 @@ def cells(state: State, row: int) -> dict[str, str]:
 
     No battery: a sensor that cannot send is masked before, so that the LLM need not judge it.
     """
-    numbers = {
-        "sensor_id": state.ids[row],
-        "queue": state.queue[row],
-        "gain": state.gain[row],
-        "age": state.since_visit[row],
-        "distance": state.distance[row],
+    return {name: str(round(float(column[row]))) for name, column in _columns_of(state).items()}
+
+
+def full_columns(state: State) -> dict[str, NDArray[Any]]:
+    """Every sensor as an LLM would have to see it if nothing were pruned or masked for it, by column ``(J,)``.
+
+    With the battery; what is not in ``ALWAYS_KNOWN`` means nothing for a sensor never heard.
+    """
+    known = _columns_of(state)
+    return {"sensor_id": known["sensor_id"], "queue": known["queue"], "battery": state.battery, **known}
+
+
+def _columns_of(state: State) -> dict[str, NDArray[Any]]:
+    columns: dict[str, NDArray[Any]] = {
+        "sensor_id": state.ids,
+        "queue": state.queue,
+        "gain": state.gain,
+        "age": state.since_visit,
+        "distance": state.distance,
     }
     if state.reach is not None:
-        numbers |= {"best": state.reach.best[row], "movable": state.reach.best_packets[row]}
-    return {name: f"{number:.0f}" for name, number in numbers.items()}
-
-
-def full_cells(state: State, row: int) -> dict[str, str]:
-    """One sensor as an LLM would have to see it if nothing were pruned or masked for it.
-
-    With the battery, and unknown where only a beacon could tell.
-    """
-    known = cells(state, row)
-    full = {"sensor_id": known["sensor_id"], "queue": known["queue"], "battery": f"{state.battery[row]:.0f}", **known}
-    if state.heard[row]:
-        return full
-    return {name: text if name in ("sensor_id", "age", "distance") else UNKNOWN for name, text in full.items()}
+        columns |= {"best": state.reach.best, "movable": state.reach.best_packets}
+    return columns
 
 
 class Format(ABC):

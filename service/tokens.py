@@ -35,7 +35,7 @@ class TokenCounter:
         static = self.count_repeated(prompt.static)
         experiences = sum(self.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
         state = self.count(prompt.state)
-        state_uncompressed = self.count(prompt.state_uncompressed)
+        state_uncompressed = prompt.uncompressed.tokens(self.count_repeated)
         return Tokens(
             tokenizer=self.name,
             static=static,

@@ -35,7 +35,7 @@ def channel_gain_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 def link_holds(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.bool_]:
     """Whether a transfer can succeed: within the radio radius and below the path-loss threshold."""
     d = np.asarray(distance_m, dtype=np.float64)
-    return np.asarray((d <= scenario.radio_radius_m) & (path_loss_db(d, scenario) < scenario.path_loss_limit_db))
+    return _holds(d, path_loss_db(d, scenario), scenario)
 
 
 def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
@@ -43,14 +43,25 @@ def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 
     The threshold is not applied here; see :func:`link_holds`.
     """
-    power_dbm = 10.0 * np.log10(scenario.transmit_power_w * 1e3)
-    noise_dbm = scenario.noise_dbm_hz + 10.0 * np.log10(scenario.bandwidth_hz) + scenario.noise_figure_db
-    snr = 10.0 ** ((power_dbm - path_loss_db(distance_m, scenario) - noise_dbm) / 10.0)
-    efficiency = np.minimum(np.log2(1.0 + snr), scenario.spectral_cap)
-    return np.asarray(scenario.link_share * scenario.bandwidth_hz * efficiency)
+    return _rate(path_loss_db(distance_m, scenario), scenario)
 
 
 def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.int64]:
     """Whole packets that one step can move at that distance; 0 where the link fails."""
-    moved = np.floor(rate_bps(distance_m, scenario) * scenario.step_s / scenario.packet_bits + 1e-9)
-    return np.where(link_holds(distance_m, scenario), moved, 0.0).astype(np.int64)
+    d = np.asarray(distance_m, dtype=np.float64)
+    # Once for both: with many sensors it is most of what a decision takes but for attention.
+    loss = path_loss_db(d, scenario)
+    moved = np.floor(_rate(loss, scenario) * scenario.step_s / scenario.packet_bits + 1e-9)
+    return np.where(_holds(d, loss, scenario), moved, 0.0).astype(np.int64)
+
+
+def _holds(distance_m: FloatArray, loss_db: FloatArray, scenario: Scenario) -> NDArray[np.bool_]:
+    return np.asarray((distance_m <= scenario.radio_radius_m) & (loss_db < scenario.path_loss_limit_db))
+
+
+def _rate(loss_db: FloatArray, scenario: Scenario) -> FloatArray:
+    power_dbm = 10.0 * np.log10(scenario.transmit_power_w * 1e3)
+    noise_dbm = scenario.noise_dbm_hz + 10.0 * np.log10(scenario.bandwidth_hz) + scenario.noise_figure_db
+    snr = 10.0 ** ((power_dbm - loss_db - noise_dbm) / 10.0)
+    efficiency = np.minimum(np.log2(1.0 + snr), scenario.spectral_cap)
+    return np.asarray(scenario.link_share * scenario.bandwidth_hz * efficiency)

@@ -103,8 +103,11 @@ class SensorColumns(Wire):
             seen: set[int] = set()
             twice = next(i for i in self.id if i in seen or seen.add(i))  # type: ignore[func-returns-value]
             raise ValueError(f"column id names sensor {twice} more than once")
-        for row, heard in enumerate(zip(self.queue, self.battery, self.channel_gain, self.last_seen, strict=True)):
-            if 0 < sum(value is None for value in heard) < 4:
+        never = [value is None for value in self.queue]
+        for column in (self.battery, self.channel_gain, self.last_seen):
+            missing = [value is None for value in column]
+            if missing != never:
+                row = next(i for i, pair in enumerate(zip(missing, never, strict=True)) if pair[0] != pair[1])
                 raise ValueError(
                     f"sensor {self.id[row]}: queue, battery, channel_gain and last_seen are all null or none is"
                 )

@@ -54,7 +54,7 @@ def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
     view = attended(m, uav(step=6, queue=[30.0, None, 60.0, 15.0]), 6)
     prompt = m.template.prompt(view.state, view.shown(m), [])
     assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.offered
-    assert prompt.state_uncompressed.splitlines() == [
+    assert prompt.uncompressed.text.splitlines() == [
         "0,30,50,-90,2,0",
         "1,?,?,?,6,100",
         "2,60,50,-90,6,200",
@@ -90,7 +90,7 @@ def test_json_is_an_object_a_line() -> None:
 def test_json_has_null_for_what_was_never_heard() -> None:
     m = mission(MissionSpec(prompt=PromptStyle(format="json")))
     view = attended(m, uav(queue=[30.0, None]))
-    whole = m.template.prompt(view.state, view.shown(m), []).state_uncompressed.splitlines()
+    whole = m.template.prompt(view.state, view.shown(m), []).uncompressed.text.splitlines()
     unheard = {"sensor_id": 1, "queue": None, "battery": None, "gain": None, "age": 0, "distance": 100}
     assert json.loads(whole[1]) == unheard
     assert json.loads(whole[0])["battery"] == 50
@@ -109,7 +109,7 @@ def test_markdown_is_a_table_with_its_header_and_experiences_are_another() -> No
         "",
         *header,
     ]
-    assert last.state_uncompressed.splitlines()[1].startswith("| sensor_id | queue | battery | gain |")
+    assert last.uncompressed.text.splitlines()[1].startswith("| sensor_id | queue | battery | gain |")
 
 
 @pytest.mark.parametrize("row_format", FORMATS)

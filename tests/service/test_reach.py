@@ -147,8 +147,8 @@ def test_a_row_tells_the_best_velocity_and_what_it_collects() -> None:
     prompt = m.template.prompt(view.state, view.shown(m), [])
     assert "with seven numbers:\nsensor_id,queue,gain,age,distance,best,movable\n" in prompt.static
     assert prompt.state.endswith(f",{best},{movable}\n")
-    assert prompt.state_uncompressed.splitlines()[0].startswith("0,60,50,-90,0,")
-    assert prompt.state_uncompressed.splitlines()[1].endswith(",?,?")
+    assert prompt.uncompressed.text.splitlines()[0].startswith("0,60,50,-90,0,")
+    assert prompt.uncompressed.text.splitlines()[1].endswith(",?,?")
     plain = mission().template.static
     assert "movable" not in plain
     assert "with five numbers" in plain

@@ -17,8 +17,10 @@ from service.asking import Word
 from service.candidates import GuidedTemplate
 from service.llm.answer import constrain_labels
 from service.prompt import Prompt
+from service.rows import FORMATS
+from service.uncompressed import Uncompressed
 from tests.running import serving
-from tests.service.making import PAPER
+from tests.service.making import PAPER, attended, mission, uav
 from tests.service.stub_llm import PROBE, StubLlm, said, wait_for
 
 Report = Callable[..., dict[str, Any]]
@@ -198,7 +200,7 @@ def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
 
 def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     """A velocity forbidden meanwhile counts as the nearest that is offered; of sensors given away nothing is left."""
-    prompt = Prompt("", "", "", "")
+    prompt = Prompt("", "", "", Uncompressed(attended(mission(), uav()).state, FORMATS["csv"].row))
     word = Word(prompt, {(1, 9): 0.3, (1, 2): 0.1, (4, 7): 0.6}, None, None, calibrated=False, model=None)
     told = word.of([(1, 3), (1, 7), (2, 7)])
     assert told is not None

@@ -1,11 +1,20 @@
 import gzip
+import random
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from service.rows import FORMATS
 from service.settings import Settings
 from service.tokens import TokenCounter, price_usd
+from service.uncompressed import Uncompressed
 from service.vocabulary import VocabularyDamaged, ensure_vocabulary
+from shared.scenario import Scenario
+from shared.wire import Features, MissionSpec, PromptStyle
+from tests.service.making import attended, mission, uav
+
+COUNTER = TokenCounter(Settings().cache_dir)
 
 
 def test_counts_as_gpt_4o_mini_does_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,3 +44,30 @@ def test_a_damaged_vocabulary_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
 def test_price() -> None:
     settings = Settings(price_input=0.15, price_cached=0.075, price_output=0.6)
     assert price_usd(settings, 1000, 800, 5) == pytest.approx((200 * 0.15 + 800 * 0.075 + 5 * 0.6) / 1e6)
+
+
+def test_every_number_of_up_to_three_digits_is_one_token_and_longer_ones_are_split_by_three() -> None:
+    assert [COUNTER.count(str(n)) for n in range(1000)] == [1] * 1000
+    assert [COUNTER.count("7" * digits) for digits in range(1, 11)] == [1, 1, 1, 2, 2, 2, 3, 3, 3, 4]
+
+
+@pytest.mark.parametrize("row_format", FORMATS)
+@pytest.mark.parametrize("features", get_args(Features))
+def test_the_uncompressed_state_is_counted_as_if_it_were_written(row_format: str, features: Features) -> None:
+    """Numbers of 1 to 7 digits, zeros, negative ones and unknown ones, with lines above them and without."""
+    spec = MissionSpec.model_validate(
+        {
+            "scenario": Scenario(sensors=300, queue_capacity=100_000, area_m=1e6),
+            "prompt": PromptStyle.model_validate({"format": row_format}),
+            "features": features,
+        }
+    )
+    m = mission(spec)
+    drawn = random.Random(features + row_format)
+    queue = [None if drawn.random() < 0.3 else float(int(10 ** drawn.uniform(0, 5)) - 1) for _ in range(300)]
+    view = attended(m, uav(step=3000, x=[10 ** drawn.uniform(0, 6) for _ in queue], queue=queue), 3000)
+    for lines in ([], ["20,-90,0,100 > 1 7: 0.1\n"]):
+        whole = m.template.prompt(view.state, view.shown(m), [], lines).uncompressed
+        assert len(whole.text.splitlines()) >= 300
+        assert whole.tokens(COUNTER.count) == COUNTER.count(whole.text)
+    assert Uncompressed(view.state, FORMATS["csv"].row).tokens(COUNTER.count) > 300 * 11
