@@ -1,0 +1,272 @@
+"""How the edge's own share of a decision, its memory and the wire grow with the sensors J.
+
+    python benchmarks/sensors.py
+
+Flies missions of 10 to 10,000 sensors in turn against real edges with a store: one of mode ``value``, which has no LLM,
+and one of mode ``llm`` whose LLM answers at once. The share is what the edge took by its own clock, ``latency_ms``,
+less the LLM's; the round trip, less the LLM's too, has also the HTTP and the parsing. Every decision brings the last
+one's outcome, as a UAV's does; its lesson may run beside it, but earlier ones are waited for, as a UAV asks once in ten
+seconds. Then the wire: bytes of a request, plain, gzip and zstd, and the time that the edge needs to unpack and to
+parse it, taken as the round trip of a request that it refuses after that. Prints tables, writes JSON.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import re
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import psutil
+import tyro
+import zstandard
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from shared.scenario import Scenario
+from shared.wire import DecideRequest, Mode
+from simulator.client import EdgeClient
+from simulator.demo import HOST, edge_process, usable_port
+from simulator.mission import Choice, EdgePilot, fly
+from simulator.site import Site
+from simulator.world import Observation
+
+GOALS = {"share_1000_to_10": 3.0, "share_10000_to_10": 40.0, "memory_mb": 200.0}
+MODES: tuple[Mode, ...] = ("value", "llm")
+ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
+    "plain": lambda body: body,
+    "gzip": lambda body: gzip.compress(body, 6, mtime=0),
+    "zstd": lambda body: zstandard.compress(body, 3),
+}
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Measure the edge's share, memory and wire by the number of sensors."""
+
+    sensors: tuple[int, ...] = (10, 100, 1000, 10_000)
+    """Numbers of sensors J, ascending."""
+    steps: int = 6
+    """Steps of a mission; three UAVs decide at each."""
+    rounds: int = 3
+    """Missions of each J and mode, flown in turn."""
+    out: Path = Path("runs/sensors.json")
+    """Where to write."""
+
+
+@dataclass
+class Edge:
+    """A process, and what its decisions took: by J, one dict of milliseconds a decision."""
+
+    mode: Mode
+    url: str
+    process: psutil.Process
+    took: dict[int, list[dict[str, float]]] = field(default_factory=dict)
+
+    def peak_mb(self) -> float:
+        """The most memory that the process ever had resident."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return float(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 1e3
+
+
+class Pilot(EdgePilot):
+    """Asks when every earlier lesson is over, and keeps the requests."""
+
+    def __init__(self, client: EdgeClient, edge: Edge, scenario: Scenario, mission_id: str) -> None:
+        super().__init__(client, mission_id, scenario, 0, mode=edge.mode)
+        self._status = f"{edge.url}/missions/{mission_id}"
+        self.requests: list[DecideRequest] = []
+        self.on_request = self.requests.append
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The edge's choice."""
+        while (told := httpx.get(self._status, timeout=60).json())["learner_updates"] < told["feedback"]:
+            time.sleep(0.005)
+        return super().decide(uav, observation, taken)
+
+
+class Prompt(BaseHTTPRequestHandler):
+    """An LLM that is no time: it names the first sensor and the first velocity of the grammar."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        """The list of models."""
+        self._say({"data": [{"id": "prompt"}]})
+
+    def do_POST(self) -> None:
+        """A chat completion."""
+        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        firsts = re.findall(r'\("([0-9]+)"', body.get("grammar", ""))
+        self._say({"choices": [{"message": {"content": " ".join(firsts)}}]})
+
+    def log_message(self, *_: object) -> None:
+        """Nothing."""
+
+    def _say(self, answer: dict[str, Any]) -> None:
+        data = json.dumps(answer).encode()
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+
+@contextmanager
+def prompt_llm() -> Iterator[str]:
+    """The LLM that is no time, in a thread; its base URL."""
+    server = ThreadingHTTPServer((HOST, 0), Prompt)
+    # Else what is left of an answer waits for an acknowledgement of its head.
+    Prompt.wbufsize = -1
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://{HOST}:{server.server_address[1]}/v1"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@contextmanager
+def edge_of(mode: Mode, folder: Path, llm: str) -> Iterator[Edge]:
+    """A real edge with a store."""
+    port = usable_port(0)
+    url = f"http://{HOST}:{port}"
+    settings = {"AICVDS_MODE": mode, "AICVDS_STORE": str(folder / f"{mode}.db"), "AICVDS_LOG_LEVEL": "error"}
+    settings |= {"AICVDS_LLM_URL": llm} if mode == "llm" else {}
+    with edge_process(port, folder / f"{mode}.log", {**os.environ, **settings}) as process:
+        with EdgeClient(url, timeout_s=60) as client:
+            client.wait_ready(120)
+        yield Edge(mode, url, psutil.Process(process.pid))
+
+
+def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest]:
+    """Fly one mission, note what its decisions took, and forget it; returns its requests."""
+    scenario = Scenario(sensors=sensors, steps=steps)
+    with EdgeClient(edge.url, timeout_s=60) as client:
+        pilot = Pilot(client, edge, scenario, name)
+        client.put_mission(name, pilot.spec)
+        flight = fly(Site(scenario), pilot, seed=0)
+    for decision in flight.decisions:
+        if decision.source != edge.mode or decision.latency_ms is None or decision.rtt_ms is None:
+            raise SystemExit(f"sensors: {edge.mode} with {sensors}: {decision.source}, {decision.reason}")
+        llm = decision.latency_ms.get("llm", 0.0)
+        own = {"share": decision.latency_ms["total"] - llm, "round_trip": decision.rtt_ms - llm}
+        edge.took.setdefault(sensors, []).append({**decision.latency_ms, **own})
+    httpx.delete(f"{edge.url}/missions/{name}", timeout=60).raise_for_status()
+    return pilot.requests
+
+
+def wire(edge: Edge, request: DecideRequest, repeats: int) -> dict[str, dict[str, float]]:
+    """Bytes and milliseconds of one request, by encoding."""
+    scenario = Scenario(sensors=len(request.sensors.id))
+    name = f"wire-{scenario.sensors}"
+    # No UAV of that number flies, which the edge sees once it has read all of it.
+    body = request.model_copy(update={"mission_id": name, "uav_id": 99, "outcome": None}).model_dump_json().encode()
+    packed = {encoding: pack(body) for encoding, pack in ENCODINGS.items()}
+    took: dict[str, list[float]] = {encoding: [] for encoding in packed}
+    with httpx.Client(base_url=edge.url, timeout=60) as client:
+        client.put(f"/missions/{name}", json={"scenario": scenario.model_dump()}).raise_for_status()
+        for _ in range(repeats):
+            for encoding, content in packed.items():
+                headers = {"Content-Type": "application/json"}
+                headers |= {} if encoding == "plain" else {"Content-Encoding": encoding}
+                began = time.perf_counter()
+                answer = client.post("/decide", content=content, headers=headers)
+                took[encoding].append((time.perf_counter() - began) * 1e3)
+                assert answer.status_code == 422 and "uav_id" in answer.text, answer.text
+    return {e: {"bytes": len(packed[e]), "read_ms": round(float(np.median(took[e])), 2)} for e in packed}
+
+
+def main(args: Sensors) -> int:
+    """Measure, print, write."""
+    console = Console()
+    peaks: dict[int, float] = {}
+    found_wire: dict[int, dict[str, dict[str, float]]] = {}
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack, Progress(console=console) as progress:
+        llm = stack.enter_context(prompt_llm())
+        edges = [stack.enter_context(edge_of(mode, Path(folder), llm)) for mode in MODES]
+        flying = progress.add_task("flying", total=args.rounds * len(args.sensors) * len(edges))
+        for edge in edges:
+            flown(edge, args.sensors[0], args.steps, "warm-up")
+            edge.took.clear()
+        for number in range(args.rounds):
+            for sensors in args.sensors:
+                for edge in edges:
+                    requests = flown(edge, sensors, args.steps, f"{sensors}-{number}")
+                    progress.advance(flying)
+                    if edge.mode == "value" and number == 0:
+                        peaks[sensors] = edge.peak_mb()
+                        found_wire[sensors] = wire(edge, requests[-1], repeats=20)
+        took = {edge.mode: {str(sensors): _summary(edge.took[sensors]) for sensors in args.sensors} for edge in edges}
+    first = peaks[args.sensors[0]]
+    found = {
+        "command": sys.argv,
+        "decisions_each": 3 * args.steps * args.rounds,
+        "took_ms": took,
+        "share_ratio": {mode: _ratios(took[mode], "share") for mode in took},
+        "round_trip_ratio": {mode: _ratios(took[mode], "round_trip") for mode in took},
+        "peak_memory_growth_mb": {str(sensors): round(peak - first, 1) for sensors, peak in peaks.items()},
+        "wire_full": {str(sensors): told for sensors, told in found_wire.items()},
+        "goals": GOALS,
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    _tell(console, found, args)
+    return 0
+
+
+def _summary(took: list[dict[str, float]]) -> dict[str, Any]:
+    stages = sorted({stage for one in took for stage in one})
+    medians = {s: round(float(np.median([one.get(s, 0.0) for one in took])), 3) for s in stages}
+    return {"p50": medians, "share_p95": round(float(np.percentile([one["share"] for one in took], 95)), 3)}
+
+
+def _ratios(by_sensors: dict[str, Any], what: str) -> dict[str, float]:
+    p50 = {sensors: told["p50"][what] for sensors, told in by_sensors.items()}
+    first = next(iter(p50.values()))
+    return {sensors: round(value / first, 2) for sensors, value in p50.items()}
+
+
+def _tell(console: Console, found: dict[str, Any], args: Sensors) -> None:
+    stages = Table("J", "mode", "share p50 ms", "ratio", "p95", "round trip", "ratio", "most of it", "memory MB")
+    for sensors in map(str, args.sensors):
+        for mode in found["took_ms"]:
+            p50 = found["took_ms"][mode][sensors]["p50"]
+            own = {s: v for s, v in p50.items() if s not in ("total", "share", "round_trip", "llm")}
+            most = sorted(own, key=lambda s: -own[s])[:3]
+            stages.add_row(
+                f"{int(sensors):,}",
+                mode,
+                f"{p50['share']:.2f}",
+                f"{found['share_ratio'][mode][sensors]:.1f}",
+                f"{found['took_ms'][mode][sensors]['share_p95']:.2f}",
+                f"{p50['round_trip']:.2f}",
+                f"{found['round_trip_ratio'][mode][sensors]:.1f}",
+                ", ".join(f"{s} {own[s]:.1f}" for s in most),
+                f"+{found['peak_memory_growth_mb'][sensors]:.0f}" if mode == "value" else "",
+            )
+    console.print(stages)
+    encodings = Table("J", *(f"{encoding} {what}" for encoding in ENCODINGS for what in ("bytes", "ms")))
+    for sensors, told in found["wire_full"].items():
+        cells = [f"{told[e][what]:,.{places}f}" for e in ENCODINGS for what, places in (("bytes", 0), ("read_ms", 2))]
+        encodings.add_row(f"{int(sensors):,}", *cells)
+    console.print(encodings)
+    console.print(f"goals: share at 1,000 to 10 at most {GOALS['share_1000_to_10']:g}, at 10,000 under", end=" ")
+    console.print(f"{GOALS['share_10000_to_10']:g}; memory under {GOALS['memory_mb']:g} MB. Wrote {args.out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Sensors, description=__doc__)))
