@@ -2,11 +2,30 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from service.settings import usable_cores
+
 WIDTH = 32
+# Sensors from which on their queries are shared among cores, and the number of queries that torch's kernel takes at a
+# time when there are so many: parts of whole blocks give what all at once give, to the bit.
+_MANY, _BLOCK = 4096, 256
+
+
+class AttentionWeights(NamedTuple):
+    """``W_q``, ``W_k``, ``W_v`` ``(d', d)``, and the score's ``w`` ``(1, d')`` and ``b`` ``(1,)``."""
+
+    query: Tensor
+    key: Tensor
+    value: Tensor
+    score: Tensor
+    bias: Tensor
 
 
 class Attention(nn.Module):
@@ -25,17 +44,46 @@ class Attention(nn.Module):
         self.score = nn.Linear(width, 1)
 
     def forward(self, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
+        """As :func:`attend`."""
+        linear = self.query.weight, self.key.weight, self.value.weight
+        return attend(AttentionWeights(*linear, self.score.weight, self.score.bias), x, admissible)
 
-        Args:
-            admissible: ``(..., n)`` booleans; what comes out for the others means nothing. Default: all are.
-        """
-        # Only with four axes (batch, head, n, d') does torch take the kernel that keeps no n x n tensor.
-        n, d = x.shape[-2:]
-        q, k, v = (project(x.reshape(-1, 1, n, d)) for project in (self.query, self.key, self.value))
+
+def attend(weights: AttentionWeights, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
+
+    Args:
+        admissible: ``(..., n)`` booleans; what comes out for the others means nothing. Default: all are.
+    """
+    # Only with four axes (batch, head, n, d') does torch take the kernel that keeps no n x n tensor.
+    n, d = x.shape[-2:]
+    wide = x.reshape(-1, 1, n, d)
+    q, k, v = (functional.linear(wide, w) for w in (weights.query, weights.key, weights.value))
+    if admissible is None and n >= _MANY and torch.is_inference_mode_enabled():
+        z = _by_cores(q, k, v)
+    else:
         mask = None if admissible is None else admissible.reshape(-1, 1, 1, n)
-        z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).reshape(*x.shape[:-1], -1)
-        return self.score(z)[..., 0], z
+        z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    z = z.reshape(*x.shape[:-1], -1)
+    return functional.linear(z, weights.score, weights.bias)[..., 0], z
+
+
+def _by_cores(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+    """All queries' contexts, each core's share of them beside the others'."""
+
+    @torch.inference_mode()
+    def share(queries: Tensor) -> Tensor:
+        return functional.scaled_dot_product_attention(queries, k, v)
+
+    cores = usable_cores()
+    blocks = -(-q.shape[2] // _BLOCK)
+    shares = torch.split(q, -(-blocks // cores) * _BLOCK, dim=2)
+    return torch.cat([*_threads(cores).map(share, shares)], dim=2)
+
+
+@cache
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="attention")
 
 
 def top_k(scores: Tensor, k: int) -> list[int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from service.learner import Modules
+from service.learner import Modules, Weights
 from shared.wire import Features, Init
 
 # Only preset `paper` has weights for each velocity level.
@@ -28,6 +28,18 @@ def initial_modules(init: Init, preset: Features, levels: int, seed: int) -> Mod
             weights = {k: v[:levels] if k in _LEVEL_TENSORS else v for k, v in weights.items()}
         modules.load_state_dict(weights)
     return modules
+
+
+def initial_weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
+    """Those of :func:`initial_modules`; pretrained, the same for every mission."""
+    return (
+        _pretrained(preset, levels) if init == "pretrained" else initial_modules(init, preset, levels, seed).weights()
+    )
+
+
+@cache
+def _pretrained(preset: Features, levels: int) -> Weights:
+    return initial_modules("pretrained", preset, levels, seed=0).weights()
 
 
 def save(modules: Modules, path: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from service.attention import top_k
 from service.features import State, augment
-from service.learner import Modules
+from service.learner import Weights
 from service.rows import Cells, cells
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, SensorId, Step, UavState, Wire
@@ -67,7 +67,7 @@ class Solved:
     velocity: int
 
 
-def solved(spec: MissionSpec, features: Features, scenario: Scenario, modules: Modules, k: int | None) -> list[Solved]:
+def solved(spec: MissionSpec, features: Features, scenario: Scenario, weights: Weights, k: int | None) -> list[Solved]:
     """As many demonstrations as the mission wants, with the rows that it would have offered, in its order.
 
     One whose answer the mission could not give is left out: a sensor that its modules do not keep among the k, or a
@@ -77,8 +77,8 @@ def solved(spec: MissionSpec, features: Features, scenario: Scenario, modules: M
         spec: the mission's.
         features: what its modules see.
         scenario: its world.
-        modules: its own.
-        k: rows of each that the modules keep; None keeps every admissible one, in the request's order.
+        weights: its modules'.
+        k: rows of each that these keep; None keeps every admissible one, in the request's order.
     """
     found: list[Solved] = []
     if spec.prompt.demonstrations == 0:
@@ -88,7 +88,7 @@ def solved(spec: MissionSpec, features: Features, scenario: Scenario, modules: M
         state = demonstration.state(pool.scenario, features)
         rows = np.flatnonzero(state.admissible)
         if k is not None:
-            rows = rows[top_k(modules.score(state.features(pool.scenario))[0], k)]
+            rows = rows[top_k(weights.score(state.features(pool.scenario))[0], k)]
         if spec.prompt.order == "shuffled":
             rows = np.random.default_rng([spec.seed, number]).permutation(rows)
         if demonstration.sensor_id in state.ids[rows] and demonstration.velocity <= scenario.max_velocity:

@@ -1,23 +1,30 @@
-"""Online value regression: both modules learn the realised cost of what was decided, one Adam step a feedback."""
+"""Online value regression: both modules learn the realised cost of what was decided, one Adam step a feedback.
+
+A mission keeps only numbers, its weights and Adam's moments: an edge flies thousands, and torch's modules take more
+memory than what they compute with. The modules are the learning thread's, lent for each lesson.
+"""
 
 from __future__ import annotations
 
-import copy
 import threading
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from service.adam import Adam, lay_side_by_side
-from service.attention import Attention
+from service.adam import Moments, stepped
+from service.attention import Attention, AttentionWeights, attend
 from service.features import FEATURES
 from service.reach import LEVEL_FEATURES
-from service.velocity import ReachVelocityScorer, VelocityScorer
+from service.velocity import ReachVelocityScorer, VelocityScorer, VelocityWeights, by_distance, by_reach
 from shared.wire import Features
+
+# Numbers that torch computes at once: a parameter of so many, or a multiple, is computed the same wherever it lies.
+_AT_ONCE = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +39,33 @@ class Sample:
     chosen: int
     approach: NDArray[np.float32]
     velocity: int
+
+
+class Weights:
+    """Modules as decisions use them: a finished copy that nothing changes.
+
+    Attributes:
+        layout: where in ``flat`` each parameter is.
+        flat: all of them.
+    """
+
+    __slots__ = ("_attention", "_velocity", "flat", "layout")
+
+    def __init__(self, layout: Layout, flat: Tensor) -> None:
+        self.layout, self.flat = layout, flat
+        views = layout.views(flat)
+        self._attention, self._velocity = AttentionWeights(*views[:5]), VelocityWeights(*views[5:])
+
+    @torch.inference_mode()
+    def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
+        """Scores ``(n,)`` and contexts ``(n, d')`` of the sensors."""
+        return attend(self._attention, torch.from_numpy(features))
+
+    @torch.inference_mode()
+    def velocities(self, z: Tensor, approach: NDArray[np.float32]) -> Tensor:
+        """Values ``(levels,)`` of the velocities for one sensor."""
+        values = by_distance if self.layout.preset == "paper" else by_reach
+        return values(self._velocity, z, torch.from_numpy(approach))
 
 
 class Modules(nn.Module):
@@ -56,80 +90,151 @@ class Modules(nn.Module):
         loss: Tensor = (scores[sample.chosen] - reward) ** 2 + (values[sample.velocity] - reward) ** 2
         return loss
 
-    @torch.inference_mode()
-    def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
-        """Scores ``(n,)`` and contexts ``(n, d')``, without gradients."""
-        scores, z = self.attention(torch.from_numpy(features))
-        return scores, z
+    def weights(self) -> Weights:
+        """A copy to decide by."""
+        layout = Layout.of(self)
+        return Weights(layout, layout.flat([p.detach() for p in self.parameters()]))
 
-    @torch.inference_mode()
-    def velocities(self, z: Tensor, approach: NDArray[np.float32]) -> Tensor:
-        """Values ``(levels,)`` of the velocities for one sensor, without gradients."""
-        values: Tensor = self.velocity(z, torch.from_numpy(approach))
-        return values
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where each parameter of a preset's modules stands in one array of numbers: those that fill lines first.
+
+    ``names`` and ``shapes`` are in the modules' own order.
+    """
+
+    preset: Features
+    names: tuple[str, ...]
+    shapes: tuple[torch.Size, ...]
+
+    @classmethod
+    def of(cls, modules: Modules) -> Self:
+        """The modules' own."""
+        names, parameters = zip(*modules.named_parameters(), strict=True)
+        return cls(modules.preset, names, tuple(p.shape for p in parameters))
+
+    @property
+    def _order(self) -> list[int]:
+        return sorted(range(len(self.shapes)), key=lambda index: self.shapes[index].numel() % _AT_ONCE != 0)
+
+    def views(self, flat: Tensor) -> list[Tensor]:
+        """The parameters' places in the array, in the modules' order."""
+        order = self._order
+        parts = torch.split(flat, [self.shapes[index].numel() for index in order])
+        placed = {index: part.view(self.shapes[index]) for index, part in zip(order, parts, strict=True)}
+        return [placed[index] for index in range(len(order))]
+
+    def flat(self, parameters: Sequence[Tensor]) -> Tensor:
+        """The array of parameters in the modules' order; raises ``RuntimeError`` where they have other shapes."""
+        if [p.shape for p in parameters] != list(self.shapes):
+            raise RuntimeError(f"of other modules than preset {self.preset}'s with these velocity levels")
+        return torch.cat([parameters[index].reshape(-1) for index in self._order])
+
+
+class Workbench:
+    """Modules that are whichever mission's learns just then: thousands share them."""
+
+    def __init__(self, layout: Layout) -> None:
+        # Preset `paper` has its levels in the last parameter; preset `reach` needs no number of them.
+        modules = Modules(layout.preset, layout.shapes[-1].numel(), seed=0)
+        self._modules, self._layout = modules, layout
+        self._parameters = list(modules.parameters())
+        self._weights = modules.weights().flat
+        for parameter, place in zip(self._parameters, layout.views(self._weights), strict=True):
+            parameter.data = place
+
+    def gradient(self, weights: Tensor, sample: Sample, cost: float) -> tuple[Tensor, float]:
+        """Of the loss of such weights on one outcome, ``(n,)``; and the loss."""
+        self._weights.copy_(weights)
+        loss = self._modules.loss(sample, -cost)
+        return self._layout.flat(torch.autograd.grad(loss, self._parameters)), loss.item()
+
+
+class _Benches(threading.local):
+    """One a thread: a mission that is read back learns beside those that fly."""
+
+    def __init__(self) -> None:
+        self._made: dict[Layout, Workbench] = {}
+
+    def of(self, layout: Layout) -> Workbench:
+        """The workbench for weights of this layout."""
+        if layout not in self._made:
+            self._made[layout] = Workbench(layout)
+        return self._made[layout]
+
+
+_benches = _Benches()
 
 
 class Learner:
-    """Adam over one mission's modules.
+    """Adam over one mission's weights.
 
-    ``update`` belongs to the learning thread; ``score`` and ``velocities`` may be called from any: they compute with
-    a copy that is renewed after each update, so a decision never sees half a step and hardly waits for one.
+    ``update`` belongs to the learning thread; ``score`` and ``velocities`` may be called from any: they compute with a
+    finished copy, replaced whole after each update, so a decision never sees half a step and never waits for one. Until
+    the first update the copy is every mission's that began with it.
     """
 
-    def __init__(self, modules: Modules, *, learning_rate: float) -> None:
-        self._training = modules
-        self._parameters = list(modules.parameters())
-        self._adam = Adam(self._parameters, learning_rate=learning_rate)
-        self._current = copy.deepcopy(modules).requires_grad_(False)
-        self._shown = lay_side_by_side(list(self._current.parameters()))
-        self._computing = threading.Lock()
+    def __init__(self, weights: Weights, *, learning_rate: float) -> None:
+        self._layout = weights.layout
+        self._learning_rate = learning_rate
+        self._moments: Moments | None = None
+        self._weights = weights
         self.updates = 0
         self.last_loss: float | None = None
 
     def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
         """Scores ``(n,)`` and contexts ``(n, d')`` of n sensors' features ``(n, d)``."""
-        with self._computing:
-            return self._current.score(features)
+        return self._weights.score(features)
 
     def velocities(self, z: Tensor, approach: NDArray[np.float32]) -> Tensor:
         """Values ``(levels,)`` of the velocities for one sensor, from its context ``(d',)``."""
-        with self._computing:
-            return self._current.velocities(z, approach)
+        return self._weights.velocities(z, approach)
 
     def update(self, sample: Sample, cost: float) -> float:
         """One step on one outcome; returns the loss before it."""
-        loss = self._training.loss(sample, -cost)
-        self._adam.step(torch.autograd.grad(loss, self._parameters))
-        self._show()
+        before = self._weights.flat
+        gradient, loss = _benches.of(self._layout).gradient(before, sample, cost)
+        self._moments = self._moments or Moments.none(len(before))
+        self._weights = Weights(self._layout, stepped(before, self._moments, gradient, self._learning_rate))
         # Who sees that it was learned sees the loss too.
-        self.last_loss = loss.item()
+        self.last_loss = loss
         self.updates += 1
-        return self.last_loss
+        return loss
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and Adam's moments as arrays; from the learning thread, or where there is none."""
+        views = self._layout.views
+        adam: dict[int, dict[str, NDArray[np.float32]]] = {}
+        if (kept := self._moments) is not None:
+            for index, (mean, square) in enumerate(zip(views(kept.mean), views(kept.square), strict=True)):
+                step = np.array(kept.steps, dtype=np.float32)
+                adam[index] = {"step": step, "exp_avg": mean.numpy().copy(), "exp_avg_sq": square.numpy().copy()}
+        weights = zip(self._layout.names, views(self._weights.flat), strict=True)
         return {
-            "weights": {name: tensor.numpy().copy() for name, tensor in self._training.state_dict().items()},
-            "adam": self._adam.state_dict(),
+            "weights": {name: tensor.numpy().copy() for name, tensor in weights},
+            "adam": adam,
             "updates": self.updates,
             "last_loss": self.last_loss,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As it was when the state was taken; raises ``RuntimeError`` where that is of other modules."""
-        self._training.load_state_dict({name: torch.from_numpy(array) for name, array in state["weights"].items()})
-        self._adam.load_state_dict(state["adam"])
-        self._show()
-        self.updates, self.last_loss = state["updates"], state["last_loss"]
 
-    def _show(self) -> None:
-        with self._computing:
-            self._shown.copy_(self._adam.weights)
+        def flat(arrays: Iterable[NDArray[np.float32]]) -> Tensor:
+            return self._layout.flat([torch.from_numpy(array) for array in arrays])
+
+        self._weights = Weights(self._layout, flat(state["weights"].values()))
+        kept = [state["adam"][index] for index in sorted(state["adam"])]
+        self._moments = None
+        if kept:
+            mean, square = flat(k["exp_avg"] for k in kept), flat(k["exp_avg_sq"] for k in kept)
+            self._moments = Moments(mean, square, int(kept[0]["step"]))
+        self.updates, self.last_loss = state["updates"], state["last_loss"]
 
 
 def rehearse() -> None:
     """Update once on nothing: torch's first step back takes longer than the others."""
     features = np.zeros((2, FEATURES["paper"]), np.float32)
-    learner = Learner(Modules("paper", 1, seed=0), learning_rate=1e-3)
+    learner = Learner(Modules("paper", 1, seed=0).weights(), learning_rate=1e-3)
     learner.update(Sample(features, 0, np.zeros(1, np.float32), 0), 0.0)
     learner.score(features)

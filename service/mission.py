@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.candidates import GuidedTemplate
-from service.checkpoint import initial_modules
+from service.checkpoint import initial_weights
 from service.demonstrations import solved
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
 from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
 from service.guidance import OperatorGuidance
-from service.learner import Learner, Modules, Sample
+from service.learner import Learner, Sample, Weights
 from service.planner import Planner, can_plan
 from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template, note_block
@@ -69,14 +69,14 @@ class Mission:
         self._selection: Selection = required(spec.prompt.selection)
         # Mode `value` has nothing else to decide by.
         self.attends = spec.attention == "on" or self.mode == "value"
-        modules = initial_modules(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
-        self.template = self._template(modules)
+        weights = initial_weights(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
+        self.template = self._template(weights)
         self._context = settings.llm_context
         self._check_prompt()
         self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
         self.decisions = 0
         self.feedback = 0
-        self.learner = Learner(modules, learning_rate=settings.learning_rate)
+        self.learner = Learner(weights, learning_rate=settings.learning_rate)
         self.records = Records(self.scenario)
         self.turns = Turns()
         self._pending: dict[str, Pending] = {}
@@ -90,7 +90,7 @@ class Mission:
         self.trust: dict[str, Trust] = {}
         self.record: Callable[[Event], None] = _forgotten
 
-    def _template(self, modules: Modules) -> Template:
+    def _template(self, weights: Weights) -> Template:
         spec = self.spec
         said: dict[str, Any] = {
             "experiences": self._experience_limit,
@@ -100,7 +100,7 @@ class Mission:
         if self.mode == "guided":
             return GuidedTemplate(self.scenario, rows=self.top_k if self.attends else self.scenario.sensors, **said)
         kept = self.top_k if self.attends else None
-        examples = solved(spec, self.features, self.scenario, modules, kept)
+        examples = solved(spec, self.features, self.scenario, weights, kept)
         return Template(self.scenario, spec.prompt, self.features, demonstrations=examples, **said)
 
     def obey(self, answer: GuidanceAnswer) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 from tyro.conf import arg
 
-from service.checkpoint import initial_modules, save
+from service.checkpoint import initial_weights, save
 from service.examples import Batch, Choices, Example, Reward, Speed, Target, replay
 from service.learner import Modules
 from service.recall import recall, references, velocity_agreement, velocity_error
@@ -121,11 +121,11 @@ def _check(args: Pretrain) -> None:
 
 def _report(modules: Modules, test: Sequence[Example], args: Pretrain, levels: int) -> Table:
     """Each teacher's held-out references against these modules, the shipped ones and random ones."""
-    ranked = {"random": Modules(args.features, levels, args.seed)}
+    ranked = {"random": Modules(args.features, levels, args.seed).weights()}
     # There may be none yet, or of another shape: then this command makes the first.
     with suppress(OSError, RuntimeError):
-        ranked["shipped"] = initial_modules("pretrained", args.features, levels, args.seed)
-    ranked["trained"] = modules
+        ranked["shipped"] = initial_weights("pretrained", args.features, levels, args.seed)
+    ranked["trained"] = modules.weights()
     table = Table("held-out missions", *ranked, title=f"Features {args.features}, target {args.target}")
     for teacher, taught in references(test).items():
         for k in (1, 3, 5):

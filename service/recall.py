@@ -8,7 +8,7 @@ import numpy as np
 
 from service.attention import top_k
 from service.examples import Example, Taught
-from service.learner import Modules
+from service.learner import Weights
 
 
 def references(examples: Sequence[Example]) -> dict[str, list[Taught]]:
@@ -20,27 +20,27 @@ def references(examples: Sequence[Example]) -> dict[str, list[Taught]]:
     return dict(sorted(found.items()))
 
 
-def recall(modules: Modules, references: Sequence[Taught], k: int) -> float:
+def recall(weights: Weights, references: Sequence[Taught], k: int) -> float:
     """How often the teacher's sensor is among the k best scored, of the decisions with more than k candidates."""
     hits = [
-        taught.sample.chosen in top_k(modules.score(taught.sample.features)[0], k)
+        taught.sample.chosen in top_k(weights.score(taught.sample.features)[0], k)
         for taught in references
         if len(taught.sample.features) > k
     ]
     return float(np.mean(hits)) if hits else float("nan")
 
 
-def velocity_error(modules: Modules, references: Sequence[Taught]) -> float:
+def velocity_error(weights: Weights, references: Sequence[Taught]) -> float:
     """Mean difference from the teacher's velocity, m/s, of the velocity valued highest for the teacher's sensor."""
-    return float(np.mean([abs(_fastest(modules, taught) - taught.sample.velocity) for taught in references]))
+    return float(np.mean([abs(_fastest(weights, taught) - taught.sample.velocity) for taught in references]))
 
 
-def velocity_agreement(modules: Modules, references: Sequence[Taught]) -> float:
+def velocity_agreement(weights: Weights, references: Sequence[Taught]) -> float:
     """How often the velocity valued highest for the teacher's sensor is the teacher's."""
-    return float(np.mean([_fastest(modules, taught) == taught.sample.velocity for taught in references]))
+    return float(np.mean([_fastest(weights, taught) == taught.sample.velocity for taught in references]))
 
 
-def _fastest(modules: Modules, taught: Taught) -> int:
+def _fastest(weights: Weights, taught: Taught) -> int:
     sample = taught.sample
-    _, z = modules.score(sample.features)
-    return int(modules.velocities(z[sample.chosen], sample.approach).argmax())
+    _, z = weights.score(sample.features)
+    return int(weights.velocities(z[sample.chosen], sample.approach).argmax())

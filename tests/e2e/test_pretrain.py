@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from service import checkpoint as checkpoints
-from service.checkpoint import initial_modules, save
+from service.checkpoint import initial_modules, initial_weights, save
 from service.examples import Batch, Example, Reward, replay
 from service.learner import Modules
 from service.pretrain import losses
@@ -54,8 +54,8 @@ def test_the_shipped_checkpoint_keeps_the_sensor_that_matters(
 ) -> None:
     taught = references(held_out(untaught if teacher == "look_ahead" else flown, features))[teacher]
     assert len(taught) > 50
-    shipped = recall(initial_modules("pretrained", features, 15, seed=0), taught, k)
-    random = recall(initial_modules("random", features, 15, seed=0), taught, k)
+    shipped = recall(initial_weights("pretrained", features, 15, seed=0), taught, k)
+    random = recall(initial_weights("random", features, 15, seed=0), taught, k)
     assert shipped >= least
     assert shipped > random + 0.1
 

@@ -52,6 +52,22 @@ def test_torchs_kernel_that_keeps_no_square_of_the_sensors_takes_it() -> None:
     assert (scores.shape, z.shape) == ((10,), (10, 32))
 
 
+@pytest.mark.parametrize("sensors", [4095, 4096, 5000, 10_000])
+def test_many_sensors_are_shared_among_cores_and_give_the_same_to_the_bit(
+    sensors: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(1)
+    attention, x = Attention(12), torch.rand(sensors, 12)
+    with torch.no_grad():
+        at_once = attention(x)
+    for cores in (1, 2, 3):
+        monkeypatch.setattr("service.attention.usable_cores", lambda cores=cores: cores)
+        with torch.inference_mode():
+            shared = attention(x)
+        assert torch.equal(shared[0], at_once[0])
+        assert torch.equal(shared[1], at_once[1])
+
+
 def test_a_masked_sensor_changes_nothing() -> None:
     """The reference agrees: whatever stands in a masked row, the others' numbers stay."""
     rng = np.random.default_rng(1)

@@ -122,19 +122,19 @@ def test_references_are_kept_apart_by_teacher_and_only_those_that_reach() -> Non
 
 
 def test_recall_is_one_where_everyone_is_kept_and_grows_with_k() -> None:
-    modules, found = Modules("reach", 15, seed=0), [taught(chosen) for chosen in range(8)]
-    shares = [recall(modules, found, k) for k in (1, 3, 5, 7)]
+    weights, found = Modules("reach", 15, seed=0).weights(), [taught(chosen) for chosen in range(8)]
+    shares = [recall(weights, found, k) for k in (1, 3, 5, 7)]
     assert shares == sorted(shares)
     assert shares[0] < shares[-1]
-    assert np.isnan(recall(modules, found, 8)), "with 8 candidates, keeping 8 is no feat"
+    assert np.isnan(recall(weights, found, 8)), "with 8 candidates, keeping 8 is no feat"
 
 
 def test_velocities_agree_with_themselves() -> None:
-    modules = Modules("reach", 15, seed=0)
-    _, z = modules.score(taught().sample.features)
-    best = int(modules.velocities(z[2], taught().sample.approach).argmax())
-    assert velocity_agreement(modules, [taught(velocity=best)]) == 1
-    assert velocity_error(modules, [taught(velocity=best)]) == 0
+    weights = Modules("reach", 15, seed=0).weights()
+    _, z = weights.score(taught().sample.features)
+    best = int(weights.velocities(z[2], taught().sample.approach).argmax())
+    assert velocity_agreement(weights, [taught(velocity=best)]) == 1
+    assert velocity_error(weights, [taught(velocity=best)]) == 0
     other = best - 3 if best >= 3 else best + 3
-    assert velocity_agreement(modules, [taught(velocity=other)]) == 0
-    assert velocity_error(modules, [taught(velocity=other)]) == 3
+    assert velocity_agreement(weights, [taught(velocity=other)]) == 0
+    assert velocity_error(weights, [taught(velocity=other)]) == 3

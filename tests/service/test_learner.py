@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from service.checkpoint import initial_weights
 from service.features import FEATURES
 from service.learner import Learner, Modules, Sample
 from service.reach import LEVEL_FEATURES
@@ -42,7 +43,7 @@ def test_gradient_equals_a_finite_difference(preset: Features) -> None:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_both_modules_learn_jointly_and_the_loss_falls(preset: Features) -> None:
-    learner = Learner(Modules(preset, 15, seed=0), learning_rate=5e-3)
+    learner = Learner(Modules(preset, 15, seed=0).weights(), learning_rate=5e-3)
     before = learner.state_dict()["weights"]
     losses = [learner.update(sample(preset), cost=1.0) for _ in range(200)]
     assert losses[-1] < 0.05 * losses[0]
@@ -58,13 +59,15 @@ def test_both_modules_learn_jointly_and_the_loss_falls(preset: Features) -> None
 def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
     modules = Modules(preset, 15, seed=1)
     adam = torch.optim.Adam(modules.parameters(), lr=5e-3)
-    learner = Learner(Modules(preset, 15, seed=1), learning_rate=5e-3)
+    learner = Learner(Modules(preset, 15, seed=1).weights(), learning_rate=5e-3)
     for seed in range(60):
         adam.zero_grad()
         modules.loss(sample(preset, seed), -0.3).backward()  # type: ignore[no-untyped-call]
         adam.step()
         learner.update(sample(preset, seed), cost=0.3)
-        assert torch.equal(learner.score(sample(preset, 99).features)[0], modules.score(sample(preset, 99).features)[0])
+        assert torch.equal(
+            learner.score(sample(preset, 99).features)[0], modules.weights().score(sample(preset, 99).features)[0]
+        )
     kept = learner.state_dict()
     for name, weights in modules.state_dict().items():
         assert np.array_equal(kept["weights"][name], weights.numpy()), name
@@ -74,23 +77,44 @@ def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
 
 
 def test_what_was_kept_goes_on_as_if_it_had_never_stopped() -> None:
-    through, first = (Learner(Modules("reach", 15, seed=1), learning_rate=5e-3) for _ in range(2))
+    through, first = (Learner(Modules("reach", 15, seed=1).weights(), learning_rate=5e-3) for _ in range(2))
     for seed in range(20):
         through.update(sample("reach", seed), cost=0.3)
     for seed in range(10):
         first.update(sample("reach", seed), cost=0.3)
-    again = Learner(Modules("reach", 15, seed=7), learning_rate=5e-3)
+    again = Learner(Modules("reach", 15, seed=7).weights(), learning_rate=5e-3)
     again.load_state_dict(first.state_dict())
     for seed in range(10, 20):
         again.update(sample("reach", seed), cost=0.3)
     assert torch.equal(again.score(sample("reach").features)[0], through.score(sample("reach").features)[0])
     with pytest.raises(RuntimeError):
-        Learner(Modules("paper", 15, seed=1), learning_rate=5e-3).load_state_dict(first.state_dict())
+        Learner(Modules("paper", 15, seed=1).weights(), learning_rate=5e-3).load_state_dict(first.state_dict())
+
+
+def test_missions_share_modules_and_until_they_learn_the_pretrained_weights() -> None:
+    one, other, alone = (Learner(initial_weights("pretrained", "reach", 15, n), learning_rate=5e-3) for n in range(3))
+    assert one._weights is other._weights
+    for seed in range(20):
+        one.update(sample("reach", seed), cost=0.3)
+        other.update(sample("reach", 100 + seed), cost=1.3)
+    for seed in range(20):
+        alone.update(sample("reach", seed), cost=0.3)
+    scores = [learner.score(sample("reach").features)[0] for learner in (one, other, alone)]
+    assert torch.equal(scores[0], scores[2])
+    assert not torch.equal(scores[0], scores[1])
+    assert not torch.equal(scores[0], initial_weights("pretrained", "reach", 15, 0).score(sample("reach").features)[0])
+
+
+def test_what_other_modules_learned_is_refused() -> None:
+    learner = Learner(Modules("paper", 15, seed=0).weights(), learning_rate=5e-4)
+    for other in (Modules("reach", 15, seed=0), Modules("paper", 9, seed=0)):
+        with pytest.raises(RuntimeError, match="other modules"):
+            learner.load_state_dict(Learner(other.weights(), learning_rate=5e-4).state_dict())
 
 
 def test_a_decision_never_sees_half_a_step() -> None:
     features = sample("reach", 99).features
-    known, watched = (Learner(Modules("reach", 15, seed=1), learning_rate=0.1) for _ in range(2))
+    known, watched = (Learner(Modules("reach", 15, seed=1).weights(), learning_rate=0.1) for _ in range(2))
     finished = {tuple(known.score(features)[0].tolist())}
     for seed in range(300):
         known.update(sample("reach", seed), cost=0.3)
@@ -120,6 +144,6 @@ def test_the_seed_decides_the_initial_weights_and_leaves_torch_alone() -> None:
     state = torch.random.get_rng_state()
     a, b, c = Modules("paper", 15, seed=1), Modules("paper", 15, seed=1), Modules("paper", 15, seed=2)
     assert torch.equal(torch.random.get_rng_state(), state)
-    scores = [m.score(sample().features)[0] for m in (a, b, c)]
+    scores = [m.weights().score(sample().features)[0] for m in (a, b, c)]
     assert torch.equal(scores[0], scores[1])
     assert not torch.equal(scores[0], scores[2])
