@@ -47,7 +47,7 @@ class Experience:
 
 
 class Experiences:
-    """One mission's memory.
+    """One mission's memory; with ``recent`` the block is all of it.
 
     Args:
         limit: the most lines of the block; 0 keeps none.
@@ -68,7 +68,8 @@ class Experiences:
         """Append the experience to the block, or compact it; what is in the block stays until the next compaction."""
         if self.limit == 0:
             return
-        self._remembered.append(experience)
+        if self.selection != "recent":
+            self._remembered.append(experience)
         self._since += 1
         if self.selection != "similar":
             self.block.append(experience.line)
@@ -101,7 +102,8 @@ class Experiences:
         """As it was when the state was taken."""
         self.block, self.compactions, self._since = state["block"], state["compactions"], state["since"]
         self._remembered.clear()
-        self._remembered.extend(Experience(*remembered) for remembered in state["remembered"])
+        if self.selection != "recent":
+            self._remembered.extend(Experience(*remembered) for remembered in state["remembered"])
 
     def _chosen(self, keep: int) -> list[str]:
         if self.selection == "recent":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -80,7 +79,8 @@ class Mission:
         self.records = Records(self.scenario)
         self.turns = Turns()
         self._pending: dict[str, Pending] = {}
-        self._applied: OrderedDict[str, tuple[float, bool]] = OrderedDict()
+        # The oldest first.
+        self._applied: dict[str, tuple[float, bool]] = {}
         self.repeats = Repeats(_PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
         wanted = spec.planner == "on"
@@ -270,8 +270,8 @@ class Mission:
             raise Conflict("step", f"UAV {decision.uav_id} asked again for step {decision.step} and was answered")
         if earlier is not None:
             self.records.withdraw(earlier.sensor_id, earlier.decision_id)
-        given = Given(decision.sensor_id, decision.decision_id, attempt)
-        self.turns.give(decision.step, decision.uav_id, given)
+        given = Given(decision.uav_id, decision.sensor_id, decision.decision_id, attempt)
+        self.turns.give(decision.step, given)
         self.records.presume(decision.sensor_id, decision.decision_id, decision.step)
         self._pending[decision.decision_id] = decision
         self.belief.tell(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
@@ -294,7 +294,7 @@ class Mission:
         decision = self._pending.pop(outcome.decision_id)
         self._applied[decision.decision_id] = outcome.cost, outcome.failed
         while len(self._applied) > _APPLIED_PER_UAV * self.scenario.uavs:
-            self._applied.popitem(last=False)
+            del self._applied[next(iter(self._applied))]
         self.feedback += 1
         if outcome.failed:
             self.records.withdraw(decision.sensor_id, decision.decision_id)
@@ -332,7 +332,7 @@ class Mission:
         """As it was when the state was taken, but for the plan, which is made again."""
         self.decisions, self.feedback = state["decisions"], state["feedback"]
         self._pending = {told["decision_id"]: Pending.of(told) for told in state["pending"]}
-        self._applied = OrderedDict((name, (cost, failed)) for name, cost, failed in state["applied"])
+        self._applied = {name: (cost, failed) for name, cost, failed in state["applied"]}
         self.repeats.load_state_dict(state["repeats"])
         self.memory.load_state_dict(state["memory"])
         self.records.load_state_dict(state["records"])

@@ -13,6 +13,7 @@ _STEPS = 64
 class Given:
     """The sensor that a UAV was given at a step, and by which of its attempts."""
 
+    uav_id: int
     sensor_id: int
     decision_id: str
     attempt: int
@@ -22,35 +23,44 @@ class Turns:
     """By step and UAV; the earliest of too many steps is forgotten."""
 
     def __init__(self) -> None:
-        self._given: dict[int, dict[int, Given]] = {}
+        # A step's in a tuple, and attempts only while they are under way: a mission has 64 steps of them.
+        self._given: dict[int, tuple[Given, ...]] = {}
         self._attempts: dict[int, dict[int, int]] = {}
 
     def reserved(self, step: int, uav_id: int) -> frozenset[int]:
         """Sensors that other UAVs were given this step."""
-        return frozenset(given.sensor_id for uav, given in self._given.get(step, {}).items() if uav != uav_id)
+        return frozenset(given.sensor_id for given in self._given.get(step, ()) if given.uav_id != uav_id)
 
     def attempt(self, step: int, uav_id: int) -> int:
         """Number a request of a UAV at a step: when it asks again, the later answer counts."""
+        answered = self.given(step, uav_id)
         attempts = self._attempts.setdefault(step, {})
-        attempts[uav_id] = attempts.get(uav_id, 0) + 1
+        attempts[uav_id] = 1 + max(attempts.get(uav_id, 0), 0 if answered is None else answered.attempt)
+        number = attempts[uav_id]
         _forget_lowest(self._attempts)
-        return attempts[uav_id]
+        return number
 
     def given(self, step: int, uav_id: int) -> Given | None:
         """What the UAV was told last at this step."""
-        return self._given.get(step, {}).get(uav_id)
+        return next((given for given in self._given.get(step, ()) if given.uav_id == uav_id), None)
 
-    def give(self, step: int, uav_id: int, given: Given) -> None:
+    def give(self, step: int, given: Given) -> None:
         """Reserve a sensor, and free what the UAV was given before at this step."""
-        self._given.setdefault(step, {})[uav_id] = given
+        others = tuple(other for other in self._given.get(step, ()) if other.uav_id != given.uav_id)
+        self._given[step] = (*others, given)
         _forget_lowest(self._given)
+        attempts = self._attempts.get(step, {})
+        if attempts.get(given.uav_id) == given.attempt:
+            del attempts[given.uav_id]
+            if not attempts:
+                del self._attempts[step]
 
     def state_dict(self) -> dict[str, Any]:
         """All of it, as copies."""
         return {
             "given": {
-                step: {uav: [g.sensor_id, g.decision_id, g.attempt] for uav, g in by_uav.items()}
-                for step, by_uav in self._given.items()
+                step: {g.uav_id: [g.sensor_id, g.decision_id, g.attempt] for g in given}
+                for step, given in self._given.items()
             },
             "attempts": {step: dict(by_uav) for step, by_uav in self._attempts.items()},
         }
@@ -58,7 +68,7 @@ class Turns:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As it was when the state was taken."""
         self._given = {
-            step: {uav: Given(*given) for uav, given in by_uav.items()} for step, by_uav in state["given"].items()
+            step: tuple(Given(uav, *given) for uav, given in by_uav.items()) for step, by_uav in state["given"].items()
         }
         self._attempts = state["attempts"]
 
