@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -51,7 +52,9 @@ class Fleet:
     each: int = 12
     """Decisions of each of the most missions, for the memory a mission."""
     veterans: int = 100
-    """Missions flown on to 100 decisions each, for theirs."""
+    """Missions flown on, for the memory of one that has flown for long."""
+    lifetime: int = 100
+    """Their decisions."""
     pace: float = 30.0
     """Decisions a second, for p99 with outcomes and without."""
     block: int = 150
@@ -110,7 +113,10 @@ class Radio:
         """The answer and its milliseconds."""
         content = json.dumps(body).encode()
         began = time.perf_counter()
-        self._http.request(method, path, content, {"Content-Type": "application/json"})
+        headers = {"Content-Type": "application/json"}
+        # As the UAVs of `aicvds simulate` do.
+        headers |= {"Idempotency-Key": uuid.uuid4().hex} if path.startswith("/decide") else {}
+        self._http.request(method, path, content, headers)
         response = self._http.getresponse()
         data = response.read()
         took_ms = (time.perf_counter() - began) * 1e3
@@ -213,12 +219,10 @@ def _measure(args: Fleet, port: int, edge: psutil.Process, console: Console) -> 
         memory["kb_a_mission"] = (edge.memory_info().rss - empty) / len(missions) / 1e3
         progress.advance(task)
         before, veterans = edge.memory_info().rss, missions[-args.veterans :]
-        had = sum(mission.told for mission in veterans) / len(veterans)
-        _fill(radios, veterans, 100)
-        memory["veterans"] = float(len(veterans))
+        _fill(radios, veterans, args.lifetime)
+        memory |= {"veterans": float(len(veterans)), "lifetime": float(args.lifetime)}
         grown = (edge.memory_info().rss - before) / len(veterans) / 1e3
-        memory["kb_a_mission_after_100"] = memory["kb_a_mission"] + grown
-        memory["veterans_had"] = had
+        memory["kb_a_veteran"] = memory["kb_a_mission"] + grown
         progress.advance(task)
     return {"rates": rates, "learning": learning, "memory": {k: round(v, 1) for k, v in memory.items()}}
 
@@ -275,7 +279,7 @@ def _tell(console: Console, found: dict[str, Any], args: Fleet) -> None:
     memory = found["memory"]
     console.print(
         f"memory a mission: {memory['kb_a_mission']:.0f} kB over {memory['missions']:.0f} missions of {args.each} "
-        f"decisions, {memory['kb_a_mission_after_100']:.0f} kB after 100 (goal under {GOAL_KB:g}). Wrote {args.out}"
+        f"decisions, {memory['kb_a_veteran']:.0f} kB after {args.lifetime} (goal under {GOAL_KB:g}). Wrote {args.out}"
     )
 
 

@@ -7,7 +7,10 @@ and one of mode ``llm`` whose LLM answers at once. The share is what the edge to
 less the LLM's; the round trip, less the LLM's too, has also the HTTP and the parsing. Every decision brings the last
 one's outcome, as a UAV's does; its lesson may run beside it, but earlier ones are waited for, as a UAV asks once in ten
 seconds. Then the wire: bytes of a request, plain, gzip and zstd, and the time that the edge needs to unpack and to
-parse it, taken as the round trip of a request that it refuses after that. Prints tables, writes JSON.
+parse it, taken as the round trip of a request that it refuses after that. Of the three uplinks of the design only
+``full`` is built: ``delta`` (the beacons that are news since the UAV's last request, without the places) and ``pruned``
+(the k sensors that an attention on board would keep) are what they would be; their time is that of a request in full
+about as many sensors. Prints tables, writes JSON.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, Mode
+from shared.wire import DecideRequest, Mode, SensorColumns
 from simulator.client import EdgeClient
 from simulator.demo import HOST, edge_process, usable_port
 from simulator.mission import Choice, EdgePilot, fly
@@ -45,6 +48,7 @@ from simulator.site import Site
 from simulator.world import Observation
 
 GOALS = {"share_1000_to_10": 3.0, "share_10000_to_10": 40.0, "memory_mb": 200.0}
+UAVS, TOP_K = 3, 5
 MODES: tuple[Mode, ...] = ("value", "llm")
 ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
     "plain": lambda body: body,
@@ -60,7 +64,7 @@ class Sensors:
     sensors: tuple[int, ...] = (10, 100, 1000, 10_000)
     """Numbers of sensors J, ascending."""
     steps: int = 6
-    """Steps of a mission; three UAVs decide at each."""
+    """Steps of a mission, at least 2; three UAVs decide at each."""
     rounds: int = 3
     """Missions of each J and mode, flown in turn."""
     out: Path = Path("runs/sensors.json")
@@ -169,32 +173,56 @@ def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest
     return pilot.requests
 
 
-def wire(edge: Edge, request: DecideRequest, repeats: int) -> dict[str, dict[str, float]]:
-    """Bytes and milliseconds of one request, by encoding."""
-    scenario = Scenario(sensors=len(request.sensors.id))
+def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) -> dict[str, Any]:
+    """Bytes and milliseconds of one request, in full and as less would be, by encoding."""
+    told = now.sensors
+    scenario = Scenario(sensors=len(told.id))
     name = f"wire-{scenario.sensors}"
+    news = [row for row, step in enumerate(told.last_seen) if step != before.sensors.last_seen[row]]
+    # What the paper's UAV would send: the sensors that its own attention kept, of those in range.
+    kept = [row for row, step in enumerate(told.last_seen) if step == now.step][:TOP_K] or [0]
     # No UAV of that number flies, which the edge sees once it has read all of it.
-    body = request.model_copy(update={"mission_id": name, "uav_id": 99, "outcome": None}).model_dump_json().encode()
-    packed = {encoding: pack(body) for encoding, pack in ENCODINGS.items()}
-    took: dict[str, list[float]] = {encoding: [] for encoding in packed}
+    common = {"mission_id": name, "uav_id": 99, "outcome": None}
+    bodies = {
+        rows: now.model_copy(update={**common, "sensors": _of(told, which)}).model_dump_json().encode()
+        for rows, which in (("full", list(range(len(told.id)))), ("delta", news or [0]), ("pruned", kept))
+    }
+    sizes = {"full": len(told.id), "delta": len(news), "pruned": len(kept)}
+    found: dict[str, Any] = {rows: {"sensors": size} for rows, size in sizes.items()}
     with httpx.Client(base_url=edge.url, timeout=60) as client:
         client.put(f"/missions/{name}", json={"scenario": scenario.model_dump()}).raise_for_status()
+        took: dict[tuple[str, str], list[float]] = {(rows, e): [] for rows in bodies for e in ENCODINGS}
         for _ in range(repeats):
-            for encoding, content in packed.items():
+            for rows, encoding in took:
                 headers = {"Content-Type": "application/json"}
                 headers |= {} if encoding == "plain" else {"Content-Encoding": encoding}
+                content = ENCODINGS[encoding](bodies[rows])
                 began = time.perf_counter()
                 answer = client.post("/decide", content=content, headers=headers)
-                took[encoding].append((time.perf_counter() - began) * 1e3)
+                took[rows, encoding].append((time.perf_counter() - began) * 1e3)
                 assert answer.status_code == 422 and "uav_id" in answer.text, answer.text
-    return {e: {"bytes": len(packed[e]), "read_ms": round(float(np.median(took[e])), 2)} for e in packed}
+    # A delta need not say again where its sensors are.
+    less = {**json.loads(bodies["delta"]), "base": before.step}
+    less["sensors"] = {column: values for column, values in less["sensors"].items() if column not in ("x", "y")}
+    sent = {**bodies, "delta": json.dumps(less, separators=(",", ":")).encode()}
+    for (rows, encoding), times in took.items():
+        found[rows][encoding] = {
+            "bytes": len(ENCODINGS[encoding](sent[rows])),
+            "read_ms": round(float(np.median(times)), 2),
+        }
+    return found
+
+
+def _of(sensors: SensorColumns, rows: list[int]) -> SensorColumns:
+    columns = {name: [values[row] for row in rows] for name, values in sensors.model_dump().items()}
+    return SensorColumns.model_validate(columns)
 
 
 def main(args: Sensors) -> int:
     """Measure, print, write."""
     console = Console()
     peaks: dict[int, float] = {}
-    found_wire: dict[int, dict[str, dict[str, float]]] = {}
+    found_wire: dict[int, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack, Progress(console=console) as progress:
         llm = stack.enter_context(prompt_llm())
         edges = [stack.enter_context(edge_of(mode, Path(folder), llm)) for mode in MODES]
@@ -209,17 +237,17 @@ def main(args: Sensors) -> int:
                     progress.advance(flying)
                     if edge.mode == "value" and number == 0:
                         peaks[sensors] = edge.peak_mb()
-                        found_wire[sensors] = wire(edge, requests[-1], repeats=20)
+                        found_wire[sensors] = wire(edge, requests[-1], requests[-1 - UAVS], repeats=20)
         took = {edge.mode: {str(sensors): _summary(edge.took[sensors]) for sensors in args.sensors} for edge in edges}
     first = peaks[args.sensors[0]]
     found = {
         "command": sys.argv,
-        "decisions_each": 3 * args.steps * args.rounds,
+        "decisions_each": UAVS * args.steps * args.rounds,
         "took_ms": took,
         "share_ratio": {mode: _ratios(took[mode], "share") for mode in took},
         "round_trip_ratio": {mode: _ratios(took[mode], "round_trip") for mode in took},
         "peak_memory_growth_mb": {str(sensors): round(peak - first, 1) for sensors, peak in peaks.items()},
-        "wire_full": {str(sensors): told for sensors, told in found_wire.items()},
+        "wire": {str(sensors): told for sensors, told in found_wire.items()},
         "goals": GOALS,
     }
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -259,10 +287,13 @@ def _tell(console: Console, found: dict[str, Any], args: Sensors) -> None:
                 f"+{found['peak_memory_growth_mb'][sensors]:.0f}" if mode == "value" else "",
             )
     console.print(stages)
-    encodings = Table("J", *(f"{encoding} {what}" for encoding in ENCODINGS for what in ("bytes", "ms")))
-    for sensors, told in found["wire_full"].items():
-        cells = [f"{told[e][what]:,.{places}f}" for e in ENCODINGS for what, places in (("bytes", 0), ("read_ms", 2))]
-        encodings.add_row(f"{int(sensors):,}", *cells)
+    encodings = Table("J", "rows", *(f"{encoding} {what}" for encoding in ENCODINGS for what in ("bytes", "ms")))
+    for sensors, payloads in found["wire"].items():
+        for name, told in payloads.items():
+            cells = [
+                f"{told[e][what]:,.{places}f}" for e in ENCODINGS for what, places in (("bytes", 0), ("read_ms", 2))
+            ]
+            encodings.add_row(f"{int(sensors):,}", f"{name} {told['sensors']:,}", *cells)
     console.print(encodings)
     console.print(f"goals: share at 1,000 to 10 at most {GOALS['share_1000_to_10']:g}, at 10,000 under", end=" ")
     console.print(f"{GOALS['share_10000_to_10']:g}; memory under {GOALS['memory_mb']:g} MB. Wrote {args.out}")

@@ -29,7 +29,8 @@ def verify(mission: Mission, view: View, sensor: int, velocity: int) -> None:
         raise NoDecision("rule_battery", f"the battery of sensor {sensor} is flat")
     state = view.state
     distance = distances_ahead(view.uav_id, state.position, state.progress_m, state.places, mission.scenario)
-    holds = link_holds(distance, mission.scenario)
     row = int(np.flatnonzero(state.ids == sensor)[0])
-    if not holds[velocity, row] and holds[:, state.admissible].any():
+    if link_holds(distance[velocity, row], mission.scenario):
+        return
+    if link_holds(distance[:, state.admissible], mission.scenario).any():
         raise NoDecision("rule_reach", f"sensor {sensor} is out of reach after a step at {velocity} m/s")
