@@ -1,4 +1,4 @@
-# make install | demo | test | check | faults | fuzz | soak | bench | compose | clean
+# make install | demo | test | check | docs | bench | faults | fuzz | soak | compose | release | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
@@ -9,7 +9,7 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
-.PHONY: help install demo test check faults fuzz soak bench compose clean
+.PHONY: help install demo test check docs bench faults fuzz soak compose clean
 .DEFAULT_GOAL := help
 
 help:
@@ -17,10 +17,10 @@ help:
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
 	@echo "make test      install, run the tests"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
+	@echo "make bench     how fast the edge and its LLM are, side by side with others: runs/*.json, 15 minutes"
 	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
 	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
-	@echo "make bench     measure how long the edge takes to start"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
 
 install: .venv/installed
@@ -45,6 +45,15 @@ check: install
 	PYTHONHASHSEED=0 $(BIN)/mypy benchmarks
 	$(BIN)/lint-imports
 
+bench: install
+	$(BIN)/python benchmarks/startup.py
+	$(BIN)/python benchmarks/overhead.py
+	$(BIN)/python benchmarks/tokens.py
+	$(BIN)/python benchmarks/llm.py
+	$(BIN)/python benchmarks/sensors.py
+	$(BIN)/python benchmarks/fleet.py
+	$(BIN)/python benchmarks/world.py
+
 faults: install
 	$(BIN)/pytest -m faults --capture=tee-sys tests/faults
 
@@ -53,9 +62,6 @@ fuzz: install
 
 soak: install
 	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)
-
-bench: install
-	$(BIN)/python benchmarks/startup.py
 
 compose:
 	tests/e2e/compose.sh

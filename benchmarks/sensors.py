@@ -3,8 +3,9 @@
     python benchmarks/sensors.py
 
 Flies missions of 10 to 10,000 sensors in turn against real edges with a store: one of mode ``value``, which has no LLM,
-and one of mode ``llm`` whose LLM answers at once. The share is what the edge took by its own clock, ``latency_ms``,
-less the LLM's; the round trip, less the LLM's too, has also the HTTP and the parsing. Every decision brings the last
+and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The share is what the edge took by its own
+clock, ``latency_ms``, less the LLM's; the round trip, less the LLM's too, has also the HTTP and the parsing. Decisions
+that fell to the LLM-free policy, as where no sensor was heard, are counted and left out. Every decision brings the last
 one's outcome, as a UAV's does; its lesson may run beside it, but earlier ones are waited for, as a UAV asks once in ten
 seconds. Then the wire: bytes of a request, plain, gzip and zstd, and the time that the edge needs to unpack and to
 parse it, taken as the round trip of a request that it refuses after that. Of the three uplinks of the design only
@@ -18,15 +19,13 @@ from __future__ import annotations
 import gzip
 import json
 import os
-import re
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +48,8 @@ from simulator.world import Observation
 
 GOALS = {"share_1000_to_10": 3.0, "share_10000_to_10": 40.0, "memory_mb": 200.0}
 UAVS, TOP_K = 3, 5
+# The longest that a lesson may take.
+NO_LESSON_S = 5.0
 MODES: tuple[Mode, ...] = ("value", "llm")
 ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
     "plain": lambda body: body,
@@ -79,6 +80,7 @@ class Edge:
     url: str
     process: psutil.Process
     took: dict[int, list[dict[str, float]]] = field(default_factory=dict)
+    left_out: int = 0
 
     def peak_mb(self) -> float:
         """The most memory that the process ever had resident."""
@@ -92,55 +94,35 @@ class Pilot(EdgePilot):
     def __init__(self, client: EdgeClient, edge: Edge, scenario: Scenario, mission_id: str) -> None:
         super().__init__(client, mission_id, scenario, 0, mode=edge.mode)
         self._status = f"{edge.url}/missions/{mission_id}"
+        self._untaught = 0
         self.requests: list[DecideRequest] = []
         self.on_request = self.requests.append
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
         """The edge's choice."""
-        while (told := httpx.get(self._status, timeout=60).json())["learner_updates"] < told["feedback"]:
+        known, since = -1, time.monotonic()
+        while (told := httpx.get(self._status, timeout=60).json())["feedback"] - self._untaught > told[
+            "learner_updates"
+        ]:
+            if told["learner_updates"] != known:
+                known, since = told["learner_updates"], time.monotonic()
+            elif time.monotonic() > since + NO_LESSON_S:
+                # A decision that the modules had no part in teaches nothing.
+                self._untaught = told["feedback"] - known
             time.sleep(0.005)
         return super().decide(uav, observation, taken)
 
 
-class Prompt(BaseHTTPRequestHandler):
-    """An LLM that is no time: it names the first sensor and the first velocity of the grammar."""
-
-    protocol_version = "HTTP/1.1"
-
-    def do_GET(self) -> None:
-        """The list of models."""
-        self._say({"data": [{"id": "prompt"}]})
-
-    def do_POST(self) -> None:
-        """A chat completion."""
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        firsts = re.findall(r'\("([0-9]+)"', body.get("grammar", ""))
-        self._say({"choices": [{"message": {"content": " ".join(firsts)}}]})
-
-    def log_message(self, *_: object) -> None:
-        """Nothing."""
-
-    def _say(self, answer: dict[str, Any]) -> None:
-        data = json.dumps(answer).encode()
-        self.send_response(200)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(data)))
-        self.end_headers()
-        self.wfile.write(data)
-
-
 @contextmanager
-def prompt_llm() -> Iterator[str]:
-    """The LLM that is no time, in a thread; its base URL."""
-    server = ThreadingHTTPServer((HOST, 0), Prompt)
-    # Else what is left of an answer waits for an acknowledgement of its head.
-    Prompt.wbufsize = -1
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://{HOST}:{server.server_address[1]}/v1"
-    finally:
-        server.shutdown()
-        server.server_close()
+def instant_llm() -> Iterator[str]:
+    """An LLM that answers at once, as a process; its base URL."""
+    port = usable_port(0)
+    script = Path(__file__).with_name("instant_llm.py")
+    with subprocess.Popen([sys.executable, str(script), "--port", str(port)]) as process:
+        try:
+            yield f"http://{HOST}:{port}/v1"
+        finally:
+            process.terminate()
 
 
 @contextmanager
@@ -165,7 +147,8 @@ def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest
         flight = fly(Site(scenario), pilot, seed=0)
     for decision in flight.decisions:
         if decision.source != edge.mode or decision.latency_ms is None or decision.rtt_ms is None:
-            raise SystemExit(f"sensors: {edge.mode} with {sensors}: {decision.source}, {decision.reason}")
+            edge.left_out += 1
+            continue
         llm = decision.latency_ms.get("llm", 0.0)
         own = {"share": decision.latency_ms["total"] - llm, "round_trip": decision.rtt_ms - llm}
         edge.took.setdefault(sensors, []).append({**decision.latency_ms, **own})
@@ -224,12 +207,13 @@ def main(args: Sensors) -> int:
     peaks: dict[int, float] = {}
     found_wire: dict[int, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack, Progress(console=console) as progress:
-        llm = stack.enter_context(prompt_llm())
+        llm = stack.enter_context(instant_llm())
         edges = [stack.enter_context(edge_of(mode, Path(folder), llm)) for mode in MODES]
         flying = progress.add_task("flying", total=args.rounds * len(args.sensors) * len(edges))
         for edge in edges:
             flown(edge, args.sensors[0], args.steps, "warm-up")
             edge.took.clear()
+            edge.left_out = 0
         for number in range(args.rounds):
             for sensors in args.sensors:
                 for edge in edges:
@@ -243,6 +227,7 @@ def main(args: Sensors) -> int:
     found = {
         "command": sys.argv,
         "decisions_each": UAVS * args.steps * args.rounds,
+        "left_out": {edge.mode: edge.left_out for edge in edges},
         "took_ms": took,
         "share_ratio": {mode: _ratios(took[mode], "share") for mode in took},
         "round_trip_ratio": {mode: _ratios(took[mode], "round_trip") for mode in took},
