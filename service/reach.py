@@ -37,7 +37,9 @@ def distances_ahead(
         ahead = np.broadcast_to(np.asarray(position, dtype=np.float64), (len(velocities), 2))
     else:
         ahead = path.at(progress + velocities * scenario.step_s)
-    return np.asarray(np.linalg.norm(places[None] - ahead[:, None], axis=2))
+    # Axis by axis: numpy's norm of pairs takes three times as long.
+    east, north = (places[None, :, axis] - ahead[:, None, axis] for axis in (0, 1))
+    return np.asarray(np.sqrt(east * east + north * north))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def channel_gain_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 def link_holds(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.bool_]:
     """Whether a transfer can succeed: within the radio radius and below the path-loss threshold."""
     d = np.asarray(distance_m, dtype=np.float64)
-    return _holds(d, path_loss_db(d, scenario), scenario)
+    return np.asarray((d <= scenario.radio_radius_m) & (path_loss_db(d, scenario) < scenario.path_loss_limit_db))
 
 
 def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
@@ -49,14 +49,13 @@ def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.int64]:
     """Whole packets that one step can move at that distance; 0 where the link fails."""
     d = np.asarray(distance_m, dtype=np.float64)
-    # Once for both: with many sensors it is most of what a decision takes but for attention.
-    loss = path_loss_db(d, scenario)
+    packets = np.zeros(d.shape, dtype=np.int64)
+    # The path loss is what takes the time, and most of many sensors are out of every reach.
+    near = d <= scenario.radio_radius_m
+    loss = path_loss_db(d[near], scenario)
     moved = np.floor(_rate(loss, scenario) * scenario.step_s / scenario.packet_bits + 1e-9)
-    return np.where(_holds(d, loss, scenario), moved, 0.0).astype(np.int64)
-
-
-def _holds(distance_m: FloatArray, loss_db: FloatArray, scenario: Scenario) -> NDArray[np.bool_]:
-    return np.asarray((distance_m <= scenario.radio_radius_m) & (loss_db < scenario.path_loss_limit_db))
+    packets[near] = np.where(loss < scenario.path_loss_limit_db, moved, 0.0)
+    return packets
 
 
 def _rate(loss_db: FloatArray, scenario: Scenario) -> FloatArray:
