@@ -13,9 +13,9 @@ from torch.nn import functional
 from service.settings import usable_cores
 
 WIDTH = 32
-# Sensors from which on their queries are shared among cores, and the number of queries that torch's kernel takes at a
-# time when there are so many: parts of whole blocks give what all at once give, to the bit.
-_MANY, _BLOCK = 4096, 256
+# Sensors from which on their queries are shared among cores. Of 768 queries and more torch's kernel takes 256 at a
+# time: shares of whole blocks, at least four of them, give what all at once give, to the bit.
+_MANY, _BLOCK, _LEAST_BLOCKS = 2048, 256, 4
 
 
 class AttentionWeights(NamedTuple):
@@ -75,10 +75,11 @@ def _by_cores(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     def share(queries: Tensor) -> Tensor:
         return functional.scaled_dot_product_attention(queries, k, v)
 
-    cores = usable_cores()
     blocks = -(-q.shape[2] // _BLOCK)
-    shares = torch.split(q, -(-blocks // cores) * _BLOCK, dim=2)
-    return torch.cat([*_threads(cores).map(share, shares)], dim=2)
+    cores = min(usable_cores(), blocks // _LEAST_BLOCKS)
+    rows = [_BLOCK * (blocks // cores + (core < blocks % cores)) for core in range(cores)]
+    rows[-1] -= _BLOCK * blocks - q.shape[2]
+    return torch.cat([*_threads(cores).map(share, torch.split(q, rows, dim=2))], dim=2)
 
 
 @cache

@@ -52,7 +52,7 @@ def test_torchs_kernel_that_keeps_no_square_of_the_sensors_takes_it() -> None:
     assert (scores.shape, z.shape) == ((10,), (10, 32))
 
 
-@pytest.mark.parametrize("sensors", [4095, 4096, 5000, 10_000])
+@pytest.mark.parametrize("sensors", [2047, 2048, 4097, 10_000])
 def test_many_sensors_are_shared_among_cores_and_give_the_same_to_the_bit(
     sensors: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -60,7 +60,7 @@ def test_many_sensors_are_shared_among_cores_and_give_the_same_to_the_bit(
     attention, x = Attention(12), torch.rand(sensors, 12)
     with torch.no_grad():
         at_once = attention(x)
-    for cores in (1, 2, 3):
+    for cores in (1, 2, 3, 16):
         monkeypatch.setattr("service.attention.usable_cores", lambda cores=cores: cores)
         with torch.inference_mode():
             shared = attention(x)
