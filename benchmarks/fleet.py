@@ -112,17 +112,27 @@ class Radio:
     def post(self, path: str, body: dict[str, Any], method: str = "POST") -> tuple[dict[str, Any], float]:
         """The answer and its milliseconds."""
         content = json.dumps(body).encode()
-        began = time.perf_counter()
         headers = {"Content-Type": "application/json"}
         # As the UAVs of `aicvds simulate` do.
         headers |= {"Idempotency-Key": uuid.uuid4().hex} if path.startswith("/decide") else {}
-        self._http.request(method, path, content, headers)
-        response = self._http.getresponse()
-        data = response.read()
-        took_ms = (time.perf_counter() - began) * 1e3
+        try:
+            response, data, took_ms = self._ask(method, path, content, headers)
+        except (ConnectionError, http.client.RemoteDisconnected):
+            # The edge closes what is not used for seconds; the key makes the second the same request.
+            self._http.close()
+            response, data, took_ms = self._ask(method, path, content, headers)
         if response.status >= 300:
             raise SystemExit(f"fleet: {path} answered {response.status}: {data[:300]!r}")
         return (json.loads(data) if data else {}), took_ms
+
+    def _ask(
+        self, method: str, path: str, content: bytes, headers: dict[str, str]
+    ) -> tuple[http.client.HTTPResponse, bytes, float]:
+        began = time.perf_counter()
+        self._http.request(method, path, content, headers)
+        response = self._http.getresponse()
+        data = response.read()
+        return response, data, (time.perf_counter() - began) * 1e3
 
     def _state(self, mission: Flown, uav: int) -> dict[str, Any]:
         sensors = {
