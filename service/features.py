@@ -12,7 +12,7 @@ from service.reach import Reach, distances_ahead
 from shared.channel import FloatArray, channel_gain_db
 from shared.fleetplan import FleetBelief
 from shared.scenario import Point, Scenario
-from shared.urgency import urgency
+from shared.urgency import overflow_probability, urgency
 from shared.wire import Features, UavState
 
 # Numbers a sensor in each preset.
@@ -47,6 +47,11 @@ class State:
     def able(self) -> NDArray[np.bool_]:
         """Whether each sensor was heard and has a battery."""
         return self.heard & (self.battery > 0)
+
+    def overflow_risk(self, scenario: Scenario) -> float:
+        """Share of the sensors heard that are expected to overflow before their next visit, 0..1; 0 of none."""
+        heard = self.heard
+        return float(overflow_probability(self.queue[heard], self.rate[heard], scenario).mean()) if heard.any() else 0.0
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """What attention sees of the admissible sensors, ``(n, d)``, each number 0..1.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+from collections.abc import Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Summary
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 
@@ -10,7 +12,8 @@ from shared.wire import DecideResponse
 
 _DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
 _OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)
-_TRUST_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
+_SHARE_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
+_STATUSES = ("loading", "ready", "unavailable", "off")
 
 
 class Metrics:
@@ -32,9 +35,13 @@ class Metrics:
         self.llm_breaker_opened = Counter(
             "aicvds_llm_breaker_opened", "Times the LLM was left alone for failing again and again", registry=r
         )
+        self.llm_breaker_open = Gauge(
+            "aicvds_llm_breaker_open", "LLM servers that are left alone now, for failing again and again", registry=r
+        )
+        self.llm_servers = Gauge("aicvds_llm_servers", "LLM servers by where they stand", ["status"], registry=r)
         self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
         self.llm_trust = Histogram(
-            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_TRUST_BUCKETS
+            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
         )
         self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
@@ -42,6 +49,15 @@ class Metrics:
             "aicvds_costs_clipped", "Outcomes whose cost was more than a step can cost", registry=r
         )
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
+        self.learner_update_loss = Summary(
+            "aicvds_learner_update_loss", "Value-regression loss of every update", registry=r
+        )
+        self.overflow_risk = Histogram(
+            "aicvds_overflow_risk",
+            "At each decision: share of the sensors that are expected to overflow before their next visit",
+            registry=r,
+            buckets=_SHARE_BUCKETS,
+        )
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
         self.missions = Gauge("aicvds_missions", "Missions held, in memory or in the store", registry=r)
@@ -49,6 +65,17 @@ class Metrics:
             "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
         )
         self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
+
+    def record_llm(self, statuses: Mapping[str, int], left_alone: int) -> None:
+        """Where the LLM servers stand now.
+
+        Args:
+            statuses: how many stand where.
+            left_alone: how many circuit breakers are open.
+        """
+        for status in _STATUSES:
+            self.llm_servers.labels(status).set(statuses.get(status, 0))
+        self.llm_breaker_open.set(left_alone)
 
     def record_decision(self, decision: DecideResponse) -> None:
         """Count one answered decision: source, stages, overhead, tokens, lateness."""

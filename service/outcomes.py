@@ -74,15 +74,18 @@ class Outcomes:
 
     def _learn(self, mission: Mission, sample: Sample, cost: float) -> None:
         try:
-            learn(mission, sample, cost)
-            self._metrics.learner_loss.set(mission.learner.last_loss or 0.0)
+            loss = learn(mission, sample, cost)
+            if loss is not None:
+                self._metrics.learner_loss.set(loss)
+                self._metrics.learner_update_loss.observe(loss)
         finally:
             self._room.release()
 
 
-def learn(mission: Mission, sample: Sample, cost: float) -> None:
-    """One lesson; one that fails is told and left out."""
+def learn(mission: Mission, sample: Sample, cost: float) -> float | None:
+    """One lesson, and the loss before it; one that fails is told and left out: None."""
     try:
-        mission.learner.update(sample, cost)
+        return mission.learner.update(sample, cost)
     except Exception:
         log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
+        return None

@@ -154,6 +154,8 @@ async def metrics(request: Request) -> Response:
     """Prometheus metrics."""
     owned: Metrics = request.state.metrics
     owned.tasks.set(len(asyncio.all_tasks()))
+    llm: Servers = request.state.llm
+    owned.record_llm(llm.statuses, llm.left_alone)
     return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 

@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,6 +49,7 @@ from simulator.uplink import LossyTransport
 
 # The world and matplotlib take a second to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
+    from simulator.metrics import FlightMetrics
     from simulator.mission import Choice, Flight, Pilot
 
 API_KEY = "AICVDS_API_KEY"
@@ -118,6 +120,11 @@ class Simulate:
     """Folder to write to, made if missing. Default: runs/ and the mission's ID, such as runs/paper-0-1f6c09ab."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
     """Write even where a mission's result is already."""
+    metrics_port: Annotated[int, arg(metavar="0-65535")] = 0
+    """Port on which Prometheus finds the flight's metrics while it lasts, and until it was there once more (20 s at
+    most); 0: none."""
+    metrics_host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address for that port; 0.0.0.0 for every interface. Whoever reaches it may read."""
 
 
 def main(argv: list[str]) -> int:
@@ -135,6 +142,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     """
     site = chosen_site(options.scenario, options.world, options.steps)
     check(options)
+    from simulator.metrics import FlightMetrics, served
     from simulator.mission import new_mission_id
 
     mission_id = new_mission_id(site.scenario, options.seed)
@@ -152,7 +160,14 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         reconnect_s=options.reconnect_s,
     )
     refuse_old_result(job.out, options.overwrite)
-    return conduct(job, console)
+    metrics = FlightMetrics(site.scenario.steps)
+    with served(metrics, options.metrics_host, options.metrics_port) as server:
+        code = conduct(job, console, metrics=metrics)
+        # All is written by now: Ctrl-C means only not to wait.
+        if server is not None and code != INTERRUPTED:
+            with console.status("Waiting until Prometheus has the last numbers"), suppress(KeyboardInterrupt):
+                server.await_last_scrape()
+    return code
 
 
 def check(options: Simulate) -> None:
@@ -165,6 +180,7 @@ def check(options: Simulate) -> None:
         raise BadUse(f"--policy {options.policy}: choose one of edge, {', '.join(POLICY_NAMES)}")
     check_deadline(options.deadline_ms)
     check_between("--reconnect-s", options.reconnect_s, 0, 3600)
+    check_between("--metrics-port", options.metrics_port, 0, 65_535)
     if options.policy == "edge":
         checked_edge(options.edge)
     elif options.edge is not None:
@@ -188,10 +204,12 @@ class Job:
     reconnect_s: float = 0.0
 
 
-def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None) -> int:
+def conduct(
+    job: Job, console: Console, alive: Callable[[], None] = lambda: None, metrics: FlightMetrics | None = None
+) -> int:
     """Wait for the edge, fly, compare, write and print; returns the exit code.
 
-    ``alive`` is called while waiting and raises if there is nothing to wait for.
+    ``alive`` is called while waiting and raises if there is nothing to wait for; ``metrics`` hears of the flight.
 
     Raises:
         BadUse: the folder cannot be written.
@@ -201,11 +219,11 @@ def conduct(job: Job, console: Console, alive: Callable[[], None] = lambda: None
 
     if job.edge is None:
         fresh_folder(job.out)
-        flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console)
+        flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _News(metrics))
         return _conclude(job, flight, None, None, console)
     with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _scout(job.edge) as scout:
         model = await_edge(ground, job.wait_s, console, alive)
-        news = _News()
+        news = _News(metrics)
         pilot = EdgePilot(
             radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
             scout=scout, reconnect_s=job.reconnect_s, on_wait=news.waiting,
@@ -272,9 +290,13 @@ def await_edge(
 
 
 class _News:
-    """What the progress line says: the packets lost and the deciders so far, and what is being waited for."""
+    """What the progress line says: the packets lost and the deciders so far, and what is being waited for.
 
-    def __init__(self) -> None:
+    ``metrics`` hears of the flight too.
+    """
+
+    def __init__(self, metrics: FlightMetrics | None) -> None:
+        self._metrics = metrics
         self._update: Callable[[str], None] = lambda text: None
         self._lost = 0
         self._sources: Counter[str] = Counter()
@@ -289,20 +311,23 @@ class _News:
 
     def decided(self, choice: Choice) -> None:
         """One UAV knows where to go."""
+        if self._metrics is not None:
+            self._metrics.decided(choice)
         self._sources[choice.source] += 1
         trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
         self._update(f"{self._lost} lost; {choice.source} decides{trip}")
 
     def stepped(self, flight: Flight) -> None:
         """The whole fleet has flown a step."""
+        if self._metrics is not None:
+            self._metrics.stepped(flight)
         self._lost += flight.tally[-1].lost_packets
         self._update(f"{self._lost} lost; {told_sources(BySource(**self._sources))}")
 
 
-def _fly(job: Job, pilot: Pilot, console: Console, news: _News | None = None) -> Flight:
+def _fly(job: Job, pilot: Pilot, console: Console, news: _News) -> Flight:
     from simulator.mission import fly
 
-    news = news or _News()
     with naming_out(job.out):
         log = DecisionLog(job.out / DECISIONS)
     columns = (

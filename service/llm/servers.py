@@ -7,7 +7,7 @@ Each has its own health and circuit breaker. Optionally a second one is asked be
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -61,6 +61,16 @@ class Servers:
     def coming(self) -> bool:
         """Whether one that is not ready may yet be, without anybody's doing."""
         return any(server.coming for server in self._each)
+
+    @property
+    def statuses(self) -> Counter[str]:
+        """How many servers stand where."""
+        return Counter(server.status for server in self._each)
+
+    @property
+    def left_alone(self) -> int:
+        """How many servers' circuit breakers are open."""
+        return sum(server.left_alone for server in self._each)
 
     def readiness(self) -> Readiness:
         """What ``/readyz`` says: of the present one, and how many more are well."""

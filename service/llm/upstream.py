@@ -54,6 +54,8 @@ _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema
 class _Status:
     llm: Literal["loading", "ready", "unavailable", "off"]
     detail: str | None = None
+    # Whether the circuit breaker is open.
+    left_alone: bool = False
 
 
 class Upstream:
@@ -88,6 +90,11 @@ class Upstream:
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
         """Where the LLM stands."""
         return self._status.llm
+
+    @property
+    def left_alone(self) -> bool:
+        """Whether its circuit breaker is open."""
+        return self._status.left_alone
 
     def readiness(self) -> Readiness:
         """What ``/readyz`` says."""
@@ -209,7 +216,8 @@ class Upstream:
         if self.status != "ready" or not self._breaker.failed():
             return
         pause_s = self._breaker.pause_s
-        self._status = _Status("unavailable", f"failed too often, the last time by {reason}: left alone {pause_s:g} s")
+        detail = f"failed too often, the last time by {reason}: left alone {pause_s:g} s"
+        self._status = _Status("unavailable", detail, left_alone=True)
         log.warning("LLM %s", self._status.detail)
         self._on_open()
         self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())

@@ -55,6 +55,9 @@ def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_w
         assert reasons == ["llm_timeout"] * 3 + ["llm_unavailable"] * 2
         ready = client.get("/readyz").json()
         assert ready["llm"] == "unavailable" and "llm_timeout" in ready["detail"]
+        told = client.get("/metrics").text
+        assert "aicvds_llm_breaker_open 1.0" in told
+        assert 'aicvds_llm_servers{status="unavailable"} 1.0' in told
         # The probe finds it well, and the next decision finds that it is not: one waits, not three.
         wait_for(client, "ready")
         reasons = [client.post("/decide", json=report(step=step)).json()["reason"] for step in range(5, 8)]
@@ -63,7 +66,10 @@ def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_w
         wait_for(client, "ready")
         reasons = [client.post("/decide", json=report(step=step)).json()["reason"] for step in range(8, 10)]
         assert reasons == [None, None]
-        assert "aicvds_llm_breaker_opened_total 2.0" in client.get("/metrics").text
+        told = client.get("/metrics").text
+        assert "aicvds_llm_breaker_opened_total 2.0" in told
+        assert "aicvds_llm_breaker_open 0.0" in told
+        assert 'aicvds_llm_servers{status="ready"} 1.0' in told
 
 
 def test_who_hardly_waits_does_not_open_it(edge: Edge, report: Report) -> None:
