@@ -62,7 +62,10 @@ def usable_cores(cpu_max: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
 # Read by `aicvds simulate` and docker-compose.yml, often from the same .env file.
 _SIMULATORS = {
     f"AICVDS_{name}"
-    for name in ("API_KEY", "BIND", "BUILD_NETWORK", "KEYS_DIR", "PORT", "RUNS", "SCENARIO", "SEED", "USER")
+    for name in (
+        *("API_KEY", "AWAIT_LLM", "BIND", "BUILD_NETWORK", "KEYS_DIR", "PORT", "RUNS", "SCENARIO", "SEED", "USER"),
+        "WAIT_S",
+    )
 }
 
 

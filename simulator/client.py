@@ -6,7 +6,7 @@ import math
 import random
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
@@ -143,24 +143,26 @@ class EdgeClient:
         self._http.close()
 
     def wait_ready(
-        self, timeout_s: float, want_llm: bool = True, on_wait: Callable[[str], None] | None = None
+        self,
+        timeout_s: float,
+        wait_out: Collection[str] = ("loading",),
+        on_wait: Callable[[str], None] | None = None,
     ) -> Readiness:
-        """Poll ``/readyz`` until the edge can decide and, with ``want_llm``, its LLM loads no more.
+        """Poll ``/readyz`` until the edge can decide and its LLM's state is none of ``wait_out``.
 
-        After ``timeout_s`` seconds an edge that decides while its LLM still loads is returned as it is.
-        ``on_wait`` hears, before each pause, what is being waited for.
+        After ``timeout_s`` seconds an edge that decides is returned as it is. ``on_wait`` hears, before each pause,
+        what is being waited for.
         """
         deadline = time.monotonic() + timeout_s
         while True:
             readiness: Readiness | None = None
             try:
                 readiness = self._parse(Readiness, self._once("GET", "/readyz"), "/readyz")
-                cause = (
-                    "the LLM is loading" if readiness.ready else f"not ready: {readiness.detail or 'no reason given'}"
-                )
+                state = f"the LLM is {readiness.llm}" if readiness.ready else "not ready"
+                cause = f"{state}: {readiness.detail}" if readiness.detail else state
             except _TryAgain as again:
                 cause = again.cause
-            if readiness is not None and readiness.ready and not (want_llm and readiness.llm == "loading"):
+            if readiness is not None and readiness.ready and readiness.llm not in wait_out:
                 return readiness
             left = deadline - time.monotonic()
             if left <= 0:

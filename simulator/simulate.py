@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import httpx
 from rich.console import Console
@@ -114,6 +114,8 @@ class Simulate:
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
     """Seconds to wait for the edge and its LLM. One still loading its LLM then decides without it."""
+    await_llm: Annotated[Literal["on", "off"], arg(metavar="on|off")] = "off"
+    """on: an LLM that is out of reach is waited for too, as one that loads is."""
     reconnect_s: Annotated[float, arg(metavar="S")] = 10.0
     """Seconds, in all per outage, to wait in the air for a lost edge and its LLM, 0 to 3600; 0 never waits."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
@@ -157,6 +159,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         mode=options.mode,
         deadline_ms=options.deadline_ms,
         wait_s=options.wait_s,
+        wait_out=("loading", "unavailable") if options.await_llm == "on" else ("loading",),
         reconnect_s=options.reconnect_s,
     )
     refuse_old_result(job.out, options.overwrite)
@@ -189,7 +192,10 @@ def check(options: Simulate) -> None:
 
 @dataclass(frozen=True)
 class Job:
-    """One mission to conduct. ``policy`` is ``edge`` or a local policy's name; ``edge`` is ``None`` for those."""
+    """One mission to conduct. ``policy`` is ``edge`` or a local policy's name; ``edge`` is ``None`` for those.
+
+    ``wait_out`` are the LLM's states that are waited out before take-off, ``wait_s`` seconds at most.
+    """
 
     site: Site
     seed: int
@@ -201,6 +207,7 @@ class Job:
     mode: Mode | None = None
     deadline_ms: int | None = None
     wait_s: float = 120.0
+    wait_out: tuple[str, ...] = ("loading",)
     reconnect_s: float = 0.0
 
 
@@ -222,7 +229,7 @@ def conduct(
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _News(metrics))
         return _conclude(job, flight, None, None, console)
     with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _scout(job.edge) as scout:
-        model = await_edge(ground, job.wait_s, console, alive)
+        model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
         news = _News(metrics)
         pilot = EdgePilot(
             radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
@@ -264,9 +271,13 @@ def _scout(edge: str) -> EdgeClient:
 
 
 def await_edge(
-    ground: EdgeClient, wait_s: float, console: Console, alive: Callable[[], None] = lambda: None
+    ground: EdgeClient,
+    wait_s: float,
+    console: Console,
+    alive: Callable[[], None] = lambda: None,
+    wait_out: tuple[str, ...] = ("loading",),
 ) -> str | None:
-    """Wait until the edge can decide and its LLM loads no more; returns the LLM's name, if it has one.
+    """Wait until the edge can decide and its LLM is none of ``wait_out``; returns the LLM's name, if it has one.
 
     Raises:
         EdgeError: no edge answers as one within ``wait_s`` seconds.
@@ -277,7 +288,7 @@ def await_edge(
             alive()
             status.update(f"Waiting for the edge at {ground.base_url}: {escape(cause)}")
 
-        readiness = ground.wait_ready(wait_s, on_wait=waiting)
+        readiness = ground.wait_ready(wait_s, wait_out, on_wait=waiting)
         alive()
     if readiness.llm == "ready":
         console.print(f"The edge is ready; its LLM is {escape(readiness.model or 'unnamed')}.")

@@ -92,6 +92,8 @@ DOCKERFILE
   say "Debian's Prometheus is built"
 fi
 compose down --volumes --remove-orphans >/dev/null 2>&1 || true
+for profile in grafana llama vllm ollama postgres; do quietly compose --profile "$profile" config; done
+say "Compose accepts the file with every profile"
 quietly compose build
 say "edge and simulator are built"
 
@@ -125,15 +127,23 @@ say "the simulator flew 90 decisions and ended with exit code 0"
 counted=$(answered)
 [[ $counted == 90 ]] || fail "/metrics counts $counted decisions"
 prometheus=$(published prometheus 9090)
-for _ in {1..30}; do
-  scraped=$(fetch "$prometheus/api/v1/query?query=sum(aicvds_decisions_total)" 2>/dev/null | python3 -c '
-import json, sys
-print(*(sample["value"][1] for sample in json.load(sys.stdin)["data"]["result"]))' 2>/dev/null) || true
-  [[ $scraped == 90 ]] && break
-  sleep 1
+asked() { # PromQL: the values
+  python3 -c 'import json, sys, urllib.parse, urllib.request as u
+url = sys.argv[1] + "/api/v1/query?" + urllib.parse.urlencode({"query": sys.argv[2]})
+answer = json.load(u.build_opener(u.ProxyHandler({})).open(url, timeout=5))
+print(*(sample["value"][1] for sample in answer["data"]["result"]))' "$prometheus" "$1" 2>/dev/null || true
+}
+# The simulator has ended, but not before its last numbers were fetched.
+for query in 'sum(aicvds_decisions_total)' 'sum(last_over_time(aicvds_flight_decisions_total[10m]))'; do
+  for _ in {1..30}; do
+    scraped=$(asked "$query")
+    [[ $scraped == 90 ]] && break
+    sleep 1
+  done
+  [[ $scraped == 90 ]] || fail "Prometheus answers '$scraped' to $query"
 done
-[[ $scraped == 90 ]] || fail "Prometheus knows of '$scraped' decisions"
-say "/metrics counts 90 decisions, and Prometheus has scraped them"
+[[ $(asked 'aicvds:edge:up') == 1 ]] || fail "Prometheus has not read the rules"
+say "/metrics counts 90 decisions, and Prometheus has scraped them from the edge and from the simulator"
 
 # --- killed in mid-mission -------------------------------------------------------------------------------------------
 flown=$(answered)

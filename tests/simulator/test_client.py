@@ -162,7 +162,7 @@ def test_an_edge_whose_llm_still_loads_can_be_flown(stub: EdgeStub) -> None:
     stub.readiness = [(True, "loading")]
     with client(stub.url) as edge:
         assert edge.wait_ready(0).llm == "loading"
-        assert edge.wait_ready(30, want_llm=False).llm == "loading"
+        assert edge.wait_ready(30, wait_out=()).llm == "loading"
     assert stub.polled == 2
 
 

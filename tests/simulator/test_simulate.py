@@ -47,6 +47,17 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
         assert words in printed
 
 
+@pytest.mark.parametrize(("awaited", "polled", "told"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
+def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, told: str
+) -> None:
+    stub.readiness = [(True, "unavailable"), (True, "unavailable"), (True, "ready")]
+    arguments = ["--edge", stub.url, "--steps", "1", "--await-llm", awaited, "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert stub.polled == polled
+    assert told in capsys.readouterr().out
+
+
 def test_an_old_result_is_kept_unless_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
     assert simulate.main(arguments) == 0

@@ -1,0 +1,68 @@
+"""docker-compose.yml as text: what it mounts is there, what it takes is in .env.example. `make compose` runs it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docker-compose.yml").read_text()
+SERVICES = yaml.safe_load(TEXT)["services"]
+LINES = dict(re.findall(r"^#(\w+)=(.*?)(?:  # .*)?$", (ROOT / ".env.example").read_text(), re.MULTILINE))
+# Taken by Compose itself, or by programs in the containers, under their own names.
+PASSED_ON = {"HF_TOKEN", "COMPOSE_PROFILES"}
+
+
+def test_every_variable_is_told_of_with_its_default() -> None:
+    defaults = dict(re.findall(r"\$\{(\w+):-([^}]*)\}", TEXT))
+    assert len(defaults) == len({*re.findall(r"\$\{(\w+)", TEXT)})
+    # Examples rather than defaults, as their comments say.
+    examples = {"AICVDS_RUNS", "AICVDS_USER", "AICVDS_KEYS_DIR", "TORCH_INDEX"}
+    assert {name: LINES.get(name) for name in defaults if name not in examples} == {
+        name: default for name, default in defaults.items() if name not in examples
+    }
+    assert examples | PASSED_ON <= LINES.keys()
+
+
+def test_every_example_is_of_a_variable_that_something_reads() -> None:
+    listed = {name for service in SERVICES.values() for name in service.get("environment", ())}
+    read = {*re.findall(r"\$\{(\w+)", TEXT), *(name.split("=")[0] for name in listed)}
+    assert LINES.keys() - read == {"COMPOSE_PROFILES"}
+
+
+def test_without_a_profile_there_are_the_edge_the_simulator_and_prometheus() -> None:
+    assert {name for name, service in SERVICES.items() if "profiles" not in service} == {
+        "edge",
+        "simulator",
+        "prometheus",
+    }
+    profiles = {profile for service in SERVICES.values() for profile in service.get("profiles", ())}
+    assert profiles == {"grafana", "llama", "vllm", "ollama", "postgres"}
+    assert all(f"#   {profile} " in TEXT for profile in profiles)
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_a_service_is_of_one_version_and_sees_no_more_than_it_needs(name: str) -> None:
+    service = SERVICES[name]
+    if "image" in service:
+        assert re.fullmatch(r"\$\{\w+:-[\w./-]+:[\w.-]*\d[\w.-]*\}", service["image"])
+    assert service["cap_drop"] == ["ALL"] and service["security_opt"] == ["no-new-privileges:true"]
+    for mount in service.get("volumes", ()):
+        source = mount.split(":")[0]
+        if source.startswith("./"):
+            assert (ROOT / source).exists() and mount.endswith(":ro")
+    for port in service.get("ports", ()):
+        assert port.startswith("${AICVDS_BIND:-127.0.0.1}:")
+    # Every LLM server and store is named to the edge as the comment at the top says.
+    if service.get("profiles", ["grafana"]) != ["grafana"] and name != "ollama-pull":
+        assert f"//{name}:" in TEXT or f"@{name}/" in TEXT
+
+
+def test_prometheus_scrapes_where_the_containers_listen() -> None:
+    config = yaml.safe_load((ROOT / "docker" / "prometheus.yml").read_text())
+    targets = {job["static_configs"][0]["targets"][0] for job in config["scrape_configs"]}
+    port = next(word.split("=")[1] for word in SERVICES["simulator"]["command"] if word.startswith("--metrics-port="))
+    assert targets == {"edge:8000", f"simulator:{port}"}
