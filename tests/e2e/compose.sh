@@ -1,11 +1,13 @@
 #!/usr/bin/env bash
 # Builds the containers, flies the paper's mission in them, and checks what came of it. Needs a Docker engine, Compose
-# (either one) and python3; fails without them. Prometheus is Debian's package in an image made here, unless
-# PROMETHEUS_IMAGE names another.
+# (either one) and python3; fails without them. Prometheus and PostgreSQL are Debian's packages in images made here, unless
+# PROMETHEUS_IMAGE and POSTGRES_IMAGE name others. What needs other images (profiles grafana, llama, vllm, ollama) is only
+# read.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 
-readonly PROJECT=aicvds-test FLIGHT_S=300 LLM_S=120 STOP_S=10
+# Two runs on one engine need two names.
+readonly PROJECT=${COMPOSE_PROJECT_NAME:-aicvds-test} FLIGHT_S=300 LLM_S=120 STOP_S=10
 WORK=$(mktemp -d)
 OFFLINE=$PROJECT-offline
 
@@ -90,6 +92,25 @@ USER nobody
 ENTRYPOINT ["/usr/bin/prometheus"]
 DOCKERFILE
   say "Debian's Prometheus is built"
+fi
+if [[ -z ${POSTGRES_IMAGE:-} ]]; then
+  # As far as docker-compose.yml goes, it does what the official image does.
+  export POSTGRES_IMAGE=aicvds-test-postgres
+  quietly docker build --network "$AICVDS_BUILD_NETWORK" --tag "$POSTGRES_IMAGE" - <<'DOCKERFILE'
+FROM python:3.11-slim-bookworm
+RUN apt-get update -q && apt-get install -y -q --no-install-recommends postgresql && rm -rf /var/lib/apt/lists/* \
+ && install --directory --owner=postgres --group=postgres --mode=700 /var/lib/postgresql/data
+ENV PATH=/usr/lib/postgresql/15/bin:$PATH PGDATA=/var/lib/postgresql/data
+USER postgres
+CMD ["bash", "-ec", "\
+  if [[ ! -s $PGDATA/PG_VERSION ]]; then \
+    initdb --username=$POSTGRES_USER --pwfile=<(echo $POSTGRES_PASSWORD) --auth=scram-sha-256; \
+    echo host all all all scram-sha-256 >>$PGDATA/pg_hba.conf; \
+    echo CREATE DATABASE $POSTGRES_DB | postgres --single postgres; \
+  fi; \
+  exec postgres -c listen_addresses=*"]
+DOCKERFILE
+  say "Debian's PostgreSQL is built"
 fi
 compose down --volumes --remove-orphans >/dev/null 2>&1 || true
 for profile in grafana llama vllm ollama postgres; do quietly compose --profile "$profile" config; done
@@ -200,6 +221,31 @@ for name in $settings; do
   grep -q "^#$name=" .env.example || fail ".env.example does not tell of $name"
 done
 say "both run as a plain user and hold only their own; every setting is passed on and told of"
+
+# --- missions in PostgreSQL ------------------------------------------------------------------------------------------
+export AICVDS_STORE=postgresql://aicvds:aicvds@postgres/aicvds
+quietly compose up --detach --no-deps edge
+edge=$(container edge)
+begin=$SECONDS
+until (($(docker inspect --format '{{.RestartCount}}' "$edge") > 0)); do
+  ((SECONDS - begin < LLM_S)) || fail "without its store the edge is not started again"
+  sleep 1
+done
+quietly compose --profile postgres up --detach --no-deps postgres
+begin=$SECONDS
+until [[ $(docker inspect --format '{{.State.Health.Status}}' "$edge") == healthy ]]; do
+  ((SECONDS - begin < LLM_S)) || fail "the edge does not find PostgreSQL"
+  sleep 1
+done
+export AICVDS_SEED=2
+quietly compose up --detach --no-deps --force-recreate simulator
+simulator=$(container simulator)
+code=$(timeout "$FLIGHT_S" docker wait "$simulator") || fail "the third simulator did not end within $FLIGHT_S s"
+[[ $code == 0 ]] || fail "the third simulator ended with exit code $code"
+kept=$(docker exec --env PGPASSWORD=aicvds "$(container postgres)" \
+  psql --host=localhost --username=aicvds --tuples-only --no-align --command='SELECT count(*) FROM missions' aicvds)
+[[ $kept == 1 ]] || fail "PostgreSQL holds '$kept' missions"
+say "an edge whose PostgreSQL came later found it, and its mission is there"
 
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 result=$(stopped "$edge" compose stop --timeout "$STOP_S" edge)
