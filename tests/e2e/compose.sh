@@ -43,7 +43,7 @@ clean_up() {
     compose logs --no-color --tail 40 >&2 || true
   fi
   docker rm --force "$OFFLINE" >/dev/null 2>&1 || true
-  compose down --volumes --remove-orphans >/dev/null 2>&1 || true
+  compose --profile postgres down --volumes --remove-orphans >/dev/null 2>&1 || true
   rm -rf "$WORK"
   exit "$status"
 }
@@ -112,7 +112,7 @@ CMD ["bash", "-ec", "\
 DOCKERFILE
   say "Debian's PostgreSQL is built"
 fi
-compose down --volumes --remove-orphans >/dev/null 2>&1 || true
+compose --profile postgres down --volumes --remove-orphans >/dev/null 2>&1 || true
 for profile in grafana llama vllm ollama postgres; do quietly compose --profile "$profile" config; done
 say "Compose accepts the file with every profile"
 quietly compose build
@@ -250,7 +250,7 @@ say "an edge whose PostgreSQL came later found it, and its mission is there"
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 result=$(stopped "$edge" compose stop --timeout "$STOP_S" edge)
 say "the edge stopped: $result"
-compose down --volumes >/dev/null 2>&1
+compose --profile postgres down --volumes >/dev/null 2>&1
 
 # --- without a network -----------------------------------------------------------------------------------------------
 start_offline() { # as locked up as the compose file has it, and with no network at all
