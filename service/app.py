@@ -18,6 +18,7 @@ from service.guard import Guard
 from service.headers import CarefulHeaders
 from service.keys import Keys
 from service.limits import BodyLimit, Crowd
+from service.live import routes as live_routes
 from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.routes import router
@@ -61,6 +62,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         try:
             yield {"engine": engine, "llm": llm, "metrics": metrics}
         finally:
+            engine.live.close()
             await engine.compiler.close()
             await engine.asking.close()
             await llm.close()
@@ -76,6 +78,8 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         lifespan=lifespan,
     )
     app.include_router(router)
+    app.include_router(live_routes.router)
+    app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
     app.add_middleware(Crowd, most=settings.max_requests)
     if settings.keys is not None:

@@ -19,6 +19,7 @@ from service.compiler import Compiler
 from service.events import Counsel
 from service.guided import Deliberation
 from service.journal import Journal, Unkept
+from service.live.watch import Live
 from service.llm.answer import NoDecision, check_answer
 from service.llm.client import Completion
 from service.llm.servers import Servers
@@ -83,7 +84,8 @@ class Engine:
         self._plans: set[asyncio.Task[None]] = set()
         self._own_s = _OWN_S
         self.keeper: Journal | Unkept = Unkept() if store is None else Journal(store, metrics)
-        self._outcomes = Outcomes(metrics, self.keeper)
+        self.live = Live()
+        self._outcomes = Outcomes(metrics, self.keeper, self.live)
         self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
 
     def close(self) -> None:
@@ -221,6 +223,7 @@ class Engine:
             self._metrics.record_decision(answer)
             self._traces.decided(answer)
             logs.decided(answer)
+            self.live.answered(answer)
         return told
 
     async def _decide(self, mission: Mission, turn: Turn) -> DecideResponse:
@@ -270,6 +273,7 @@ class Engine:
         )
         counsel = None if choice.advice is None else Counsel(choice.model or "", choice.advice)
         mission.commit(pending, turn.attempt, counsel)
+        self.live.drafted(mission, uav, prompt, answer)
         waited_ms = watch.stages.get("llm", 0.0) + watch.stages.get("plan", 0.0)
         self._own_s += ((answer.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
         return answer

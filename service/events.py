@@ -85,7 +85,8 @@ class Guided:
 
 # Requests carry more; and the outcome that comes with a report is an event of its own.
 _REPORT = set(UavState.model_fields) - {"outcome"}
-_OUTCOME = set(Outcome.model_fields)
+# Of an outcome, what the mission's state follows from.
+_OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}
 
 Event = Reported | Decided | Settled | Guided | Answered
 Kind = Literal["reported", "decided", "settled", "guided", "answered"]

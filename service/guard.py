@@ -17,16 +17,24 @@ from service.keys import Key, Keys, Scope
 from service.problems import problem_response
 
 # What says nothing of missions: probes of containers and load balancers carry no key.
-_OPEN = frozenset(("/healthz", "/readyz"))
+_OPEN = frozenset(("/healthz", "/readyz", "/"))
+# The page's scripts and styles; what it shows it asks for with a key.
+_OPEN_BELOW = "/static/"
 # Where the guard leaves the key's scopes for the routes.
 SCOPES = "aicvds.scopes"
+# For answers that go on: where the guard leaves a function that says whether the key is known still.
+STILL_KNOWN = "aicvds.still_known"
 
 
 def scope_of(method: str, path: str) -> Scope | None:
     """What a key must be allowed for a request; None where none is needed, or any will do for reading."""
-    if path in _OPEN or method in ("GET", "HEAD"):
+    if method in ("GET", "HEAD"):
         return None
     return "admin" if path.startswith("/missions") else "decide"
+
+
+def _is_open(path: str) -> bool:
+    return path in _OPEN or path.startswith(_OPEN_BELOW)
 
 
 async def may_make_missions(request: Request) -> bool:
@@ -47,10 +55,11 @@ class Guard:
         self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
 
     async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in _OPEN:
+        if scope["type"] != "http" or _is_open(scope["path"]):
             await self.app(scope, receive, send)
             return
-        key = self._keys.find(_presented(scope["headers"]))
+        presented = _presented(scope["headers"])
+        key = self._keys.find(presented)
         needed = scope_of(scope["method"], scope["path"])
         if key is None:
             refusal = problem_response(401, "give a key that is known as `Authorization: Bearer KEY`")
@@ -62,6 +71,7 @@ class Guard:
             refusal.headers["Retry-After"] = str(wait_s)
         else:
             scope[SCOPES] = key.scopes
+            scope[STILL_KNOWN] = lambda: self._keys.find(presented) is not None
             await self.app(scope, receive, send)
             return
         # The rest of what is sent is not waited for.

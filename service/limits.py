@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Callable
 
@@ -11,6 +12,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.problems import problem_response
 
 _NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
+# A page's stream lasts as long as the page: it has a limit of its own, and takes no decision's place.
+_STREAMS = re.compile(r"/missions/[^/]+/events")
 
 
 class _TooLarge(Exception):
@@ -22,7 +25,9 @@ class _Damaged(Exception):
 
 
 class Crowd:
-    """Pure ASGI middleware: past ``most`` requests in hand 503 with ``Retry-After``; probes and metrics do not count.
+    """Pure ASGI middleware: past ``most`` requests in hand 503 with ``Retry-After``.
+
+    Probes, metrics and the streams of pages do not count.
 
     Nothing of the refused body is read.
     """
@@ -33,7 +38,7 @@ class Crowd:
         self._inside = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in _NEVER_REFUSED:
+        if scope["type"] != "http" or scope["path"] in _NEVER_REFUSED or _STREAMS.fullmatch(scope["path"]):
             await self.app(scope, receive, send)
             return
         if self._inside >= self._most:

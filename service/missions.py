@@ -56,6 +56,11 @@ class Missions:
         """Those in memory."""
         return list(self._missions.values())
 
+    @property
+    def asleep(self) -> list[str]:
+        """Names of those that are only in the store."""
+        return sorted(self._asleep)
+
     async def get(self, mission_id: str) -> Mission:
         """A mission, waited for where the store must be read.
 

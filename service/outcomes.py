@@ -9,6 +9,7 @@ from typing import Literal
 
 from service.journal import Journal, Unkept
 from service.learner import Sample, rehearse
+from service.live.watch import Live
 from service.metrics import Metrics
 from service.mission import Mission
 from shared.wire import Outcome
@@ -22,8 +23,9 @@ _MAX_LESSONS = 256
 class Outcomes:
     """One thread learns, in the order that the outcomes came, for every mission of a service."""
 
-    def __init__(self, metrics: Metrics, keeper: Journal | Unkept) -> None:
+    def __init__(self, metrics: Metrics, keeper: Journal | Unkept, live: Live) -> None:
         self._metrics = metrics
+        self._live = live
         self._keeper = keeper
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._room = threading.Semaphore(_MAX_LESSONS)
@@ -41,6 +43,7 @@ class Outcomes:
                 outcome = outcome.model_copy(update={"cost": mission.most_cost})
             taught = self._room.acquire(blocking=False)
             sample = mission.apply(outcome, taught=taught)
+            self._live.settled(mission, outcome)
             if sample is not None and taught:
                 self._learning.submit(self._learn, mission, sample, outcome.cost)
             elif taught:

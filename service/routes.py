@@ -115,6 +115,7 @@ async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus
 async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     """Forget a mission and what it learned."""
     await engine.missions.delete(mission_id)
+    engine.live.forget(mission_id)
     await engine.kept("mission_id")
 
 
@@ -157,9 +158,3 @@ async def metrics(request: Request) -> Response:
     llm: Servers = request.state.llm
     owned.record_llm(llm.statuses, llm.left_alone)
     return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
-
-
-@router.get("/", tags=["operation"])
-async def index(request: Request) -> dict[str, str]:
-    """Where things are."""
-    return {"service": request.app.title, "version": request.app.version, "docs": "/docs", "metrics": "/metrics"}

@@ -103,6 +103,7 @@ def _serve(listener: socket.socket, host: str) -> int:
             loading.give_up()
             if loading.app is not None:
                 loading.app.state.engine.asking.hurry()
+                loading.app.state.engine.live.close()
             await super().shutdown(sockets)
             # What uvicorn does after this is to say goodbye, and to raise the signal again.
             logs.hurry()

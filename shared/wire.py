@@ -14,6 +14,8 @@ from shared.scenario import Scenario
 
 MAX_SENSORS = 10_000
 MAX_STEP = 1_000_000
+# A UAV that waited longer says so much.
+MAX_ROUND_TRIP_MS = 600_000.0
 # Characters of an operator's note: it stands in every prompt.
 MAX_NOTE = 280
 
@@ -120,6 +122,15 @@ class Outcome(Wire):
     decision_id: DecisionId
     cost: float = Field(ge=0, le=10_000, description="c, 0 is best; the value regression's target is -c")
     failed: bool = Field(False, description="the transmission failed (f = 1)")
+    # Left out where it is not told: a request that is sent again after an upgrade is the same request.
+    round_trip_ms: float | None = Field(
+        None,
+        ge=0,
+        le=MAX_ROUND_TRIP_MS,
+        exclude_if=lambda told: told is None,
+        description="from asking for that decision to its answer, as the UAV measured it, retries included; shown on "
+        "the mission page, and nothing is learned from it",
+    )
 
 
 class UavState(Wire):
@@ -332,6 +343,35 @@ class MissionStatus(Wire):
     learner_updates: int
     learner_loss: float | None
     visits: dict[int, int] = Field(description="sensor: step of the last visit")
+
+
+class MissionLine(Wire):
+    """One mission of the list. Of one that is only in the store, no more than its name is known."""
+
+    mission_id: MissionId
+    mode: Mode | None = None
+    decisions: int | None = None
+
+
+class MissionList(Wire):
+    """``GET /missions``: at most 200, the one that decided last first; ``more`` are not listed."""
+
+    missions: list[MissionLine]
+    more: int
+    newest: MissionId | None = Field(description="the one that decided last, since the edge started")
+
+
+class DecisionPrompt(Wire):
+    """``GET /missions/{id}/decisions/{decision_id}/prompt``, in the three blocks of the prompt.
+
+    ``asked`` says whether an LLM was asked by it; where none is, the prompt is made for the token accounting alone.
+    """
+
+    decision_id: DecisionId
+    asked: bool
+    static: str
+    experiences: str
+    state: str
 
 
 class Readiness(Wire):

@@ -17,12 +17,14 @@ from pydantic import BaseModel, ValidationError
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.wire import (
+    MAX_ROUND_TRIP_MS,
     DecideRequest,
     DecideResponse,
     FeedbackRequest,
     FeedbackResponse,
     MissionSpec,
     MissionStatus,
+    Outcome,
     Problem,
     Readiness,
 )
@@ -76,6 +78,12 @@ class Exchange:
     attempts: int
     request_bytes: int
     response_bytes: int
+
+    def outcome(self, cost: float, failed: bool) -> Outcome:
+        """What came of the decision, to be told with this UAV's next request."""
+        round_trip_ms = min(round(self.rtt_ms, 3), MAX_ROUND_TRIP_MS)
+        decision_id = self.response.decision_id
+        return Outcome(decision_id=decision_id, cost=cost, failed=failed, round_trip_ms=round_trip_ms)
 
 
 def edge_url(text: str) -> str:

@@ -168,8 +168,7 @@ class EdgePilot:
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
         """Keep the outcome for this UAV's next request."""
         if choice.exchange is not None:
-            decision_id = choice.exchange.response.decision_id
-            self._owed[uav] = Outcome(decision_id=decision_id, cost=cost, failed=failed)
+            self._owed[uav] = choice.exchange.outcome(cost, failed)
 
     def land(self) -> None:
         """Send the outcomes that no later request carried, as far as the edge still listens."""

@@ -225,9 +225,7 @@ class Asking:
         exchange = self._client.decide(request.model_copy(update=changes))
         compared = Compared(logged=flown, replayed=_decision(flown, exchange))
         if compared.same:
-            answer = exchange.response
-            outcome = Outcome(decision_id=answer.decision_id, cost=flown.cost, failed=flown.failed)
-            self._owed[request.uav_id] = outcome
+            self._owed[request.uav_id] = exchange.outcome(flown.cost, flown.failed)
             compared = compared.model_copy(update={"fed_back": True})
         self.compared.append(compared)
         return compared

@@ -1,0 +1,102 @@
+"""The newest decisions of all missions, so that a page opened late shows what was flown; bounded in number and size."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any
+
+from service.prompt import Prompt
+from shared.wire import DecideResponse, Outcome
+
+_MOST = 600
+# Of the prompts' text, without the static blocks, which a mission's prompts share.
+_MOST_CHARACTERS = 4_000_000
+
+
+@dataclass(slots=True)
+class Kept:
+    """One decision: where its UAV was, m, what was asked, what was answered, and what came of it.
+
+    ``order`` counts up as decisions are answered, 0 until then; ``settled`` is the order at which the outcome came.
+    """
+
+    mission_id: str
+    position: tuple[float, float]
+    prompt: Prompt | None
+    answer: DecideResponse
+    order: int = 0
+    outcome: Outcome | None = None
+    settled: int = 0
+
+    @property
+    def characters(self) -> int:
+        """Of the prompt, without the static block."""
+        return 0 if self.prompt is None else len(self.prompt.experiences) + len(self.prompt.state)
+
+    def told(self) -> dict[str, Any]:
+        """For the page, but for the prompt."""
+        return {"order": self.order, "position": self.position, "answer": self.answer, "outcome": self.outcome}
+
+
+class History:
+    """By decision, oldest first. Keeping one costs references to what is there anyway: nothing is made."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[str, Kept] = OrderedDict()
+        self._characters = 0
+        self.order = 0
+
+    def drafted(self, mission_id: str, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
+        """A decision was made; it is shown once it is answered."""
+        # The block as it would be uncompressed has a row for every sensor of 10,000.
+        prompt = Prompt(prompt.static, prompt.experiences, prompt.state, "")
+        kept = Kept(mission_id, position, prompt, answer)
+        self._kept[answer.decision_id] = kept
+        self._characters += kept.characters
+        while len(self._kept) > _MOST:
+            _, oldest = self._kept.popitem(last=False)
+            self._characters -= oldest.characters
+        if self._characters > _MOST_CHARACTERS:
+            self._shed_prompts()
+
+    def answered(self, answer: DecideResponse) -> None:
+        """It went out, with these times."""
+        if (kept := self._kept.get(answer.decision_id)) is not None:
+            self.order += 1
+            kept.answer, kept.order = answer, self.order
+
+    def settled(self, outcome: Outcome) -> None:
+        """This came of it."""
+        if (kept := self._kept.get(outcome.decision_id)) is not None:
+            self.order += 1
+            kept.outcome, kept.settled = outcome, self.order
+
+    def of(self, mission_id: str) -> list[Kept]:
+        """A mission's answered decisions, in the order answered."""
+        found = (kept for kept in self._kept.values() if kept.mission_id == mission_id and kept.order)
+        return sorted(found, key=lambda kept: kept.order)
+
+    def find(self, mission_id: str, decision_id: str) -> Kept | None:
+        """The mission's decision, if it is still kept."""
+        kept = self._kept.get(decision_id)
+        return kept if kept is not None and kept.mission_id == mission_id else None
+
+    def newest_first(self) -> list[str]:
+        """Missions that decisions are kept of."""
+        return list(dict.fromkeys(kept.mission_id for kept in reversed(self._kept.values())))
+
+    def forget(self, mission_id: str) -> None:
+        """Its mission was deleted."""
+        for decision_id, kept in list(self._kept.items()):
+            if kept.mission_id == mission_id:
+                self._characters -= kept.characters
+                del self._kept[decision_id]
+
+    def _shed_prompts(self) -> None:
+        """The oldest prompts go first; their decisions stay."""
+        for kept in self._kept.values():
+            if self._characters <= _MOST_CHARACTERS // 2:
+                return
+            self._characters -= kept.characters
+            kept.prompt = None

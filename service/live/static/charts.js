@@ -1,0 +1,93 @@
+// Loss, latency and tokens by step, with uPlot; beside each chart a sentence says what it shows now.
+
+import uPlot from "./vendor/uPlot.esm.js";
+import { named, onTheme } from "./colours.js";
+import { at, say, shown } from "./dom.js";
+
+const HEIGHT = 200;
+const REDRAWN_EVERY_MS = 500;
+
+const CHARTS = {
+  loss: {
+    series: [["cost so far", "--c1", []], ["failed so far", "--c2", [6, 4]]],
+    rows: (steps) => {
+      let cost = 0;
+      let failed = 0;
+      const sums = steps.map(([, s]) => [(cost += s.cost), (failed += s.failed)]);
+      return [sums.map((s) => s[0]), sums.map((s) => s[1])];
+    },
+    text: ([cost, failed], steps) => `Cost that the UAVs told since step ${steps[0][0]}: ${shown(cost.at(-1), 2)} (a failed transmission counts 1, a queue's worth of lost packets 1), ${failed.at(-1)} failed.`,
+  },
+  latency: {
+    series: [["round trip, mean", "--c1", []], ["edge, mean", "--c2", [6, 4]], ["edge, slowest", "--c3", [2, 3]]],
+    log: true,
+    rows: (steps) => [
+      steps.map(([, s]) => (s.measured ? s.roundTrip / s.measured : null)),
+      steps.map(([, s]) => s.edge / s.count),
+      steps.map(([, s]) => s.slowest),
+    ],
+    text: ([roundTrip, edge, slowest]) => {
+      const told = roundTrip.findLast((v) => v !== null);
+      return `In the last step the edge took ${shown(edge.at(-1))} ms on average, ${shown(slowest.at(-1))} ms at most; ${told === undefined ? "the UAVs do not tell their round trip" : `the last round trips told were ${shown(told)} ms on average`}. Milliseconds, logarithmic.`;
+    },
+  },
+  tokens: {
+    series: [["without attention", "--c2", [6, 4]], ["prompt", "--c1", []]],
+    rows: (steps) => [steps.map(([, s]) => s.uncompressed / s.count), steps.map(([, s]) => s.prompt / s.count)],
+    text: ([full, prompt]) => `Tokens a decision: ${shown(prompt.at(-1), 0)} in the last step's prompts, ${shown(full.at(-1), 0)} without attention and masks.`,
+  },
+};
+
+export class Charts {
+  constructor() {
+    this.plots = {};
+    this.drawn = 0;
+    onTheme(() => this.begin());
+    new ResizeObserver(() => this.#resize()).observe(at("loss"));
+  }
+
+  /** Begin anew: another mission, or other colours. */
+  begin() {
+    for (const plot of Object.values(this.plots)) plot.destroy();
+    this.plots = {};
+    this.drawn = 0;
+    if (this.mission) this.update(this.mission);
+  }
+
+  update(mission) {
+    this.mission = mission;
+    const steps = [...mission.steps].filter(([, s]) => s.count > 0).sort((a, b) => a[0] - b[0]);
+    if (!steps.length || performance.now() - this.drawn < REDRAWN_EVERY_MS) return;
+    this.drawn = performance.now();
+    for (const [name, chart] of Object.entries(CHARTS)) {
+      const rows = chart.rows(steps);
+      const data = [steps.map(([number]) => number), ...rows];
+      if (this.plots[name]) this.plots[name].setData(data);
+      else this.plots[name] = plotted(name, chart, data);
+      say(at(`${name}-text`), chart.text(rows, steps));
+    }
+  }
+
+  #resize() {
+    for (const [name, plot] of Object.entries(this.plots)) plot.setSize({ width: at(name).clientWidth, height: HEIGHT });
+  }
+}
+
+function plotted(name, chart, data) {
+  const axis = { stroke: named("--quiet"), grid: { stroke: named("--line"), width: 1 }, ticks: { stroke: named("--line"), width: 1 }, font: "12px system-ui, sans-serif" };
+  const series = chart.series.map(([label, colour, dash]) => ({
+    label, stroke: named(colour), width: 2, dash, spanGaps: true, points: { show: data[0].length < 3 }, value: (_, value) => shown(value, 2),
+  }));
+  const y = chart.log
+    ? { distr: 3, range: (_, low, high) => uPlot.rangeLog(Math.max(low, 0.1) * 0.8, high * 1.25, 10, false) }
+    : { range: (_, low, high) => [0, Math.max(1, high * 1.1)] };
+  const plot = new uPlot({
+    width: at(name).clientWidth, height: HEIGHT, series: [{ label: "step", value: (_, value) => shown(value, 0) }, ...series],
+    scales: { x: { time: false }, y },
+    axes: [{ ...axis, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }, { ...axis, size: 48 }],
+    cursor: { drag: { x: false, y: false } },
+  }, data, at(name));
+  // What it shows stands in words above it.
+  plot.root.setAttribute("aria-hidden", "true");
+  return plot;
+}

@@ -1,0 +1,82 @@
+// One decision in full: candidates with scores and probabilities, trust, times, tokens, and its prompt.
+
+import { at, make, say, shown } from "./dom.js";
+import { ask, Refused } from "./edge.js";
+import { measured } from "./model.js";
+import { ADVISERS, SOURCES, why } from "./words.js";
+
+let opened = null;
+
+at("decision-close").addEventListener("click", () => at("decision").close());
+
+/** Show a decision; its prompt is asked for. */
+export function open(decision) {
+  const { answer } = decision;
+  opened = answer.decision_id;
+  say(at("decision-title"), `Step ${answer.step}: UAV ${answer.uav_id} to sensor ${answer.sensor_id} at ${answer.velocity} m/s`);
+  const prompt = make("section", {}, make("h3", {}, "Prompt"), make("p", {}, "Asking the edge for it…"));
+  const said = why(answer);
+  at("decision-body").replaceChildren(
+    make("p", {}, make("span", { class: "who", "data-source": answer.source }, SOURCES[answer.source] ?? answer.source), said ? ` ${said}` : ""),
+    candidates(answer), ...trust(answer), times(decision), tokens(answer), prompt);
+  if (!at("decision").open) at("decision").showModal();
+  at("decision-title").focus();
+  showPrompt(answer, prompt);
+}
+
+function candidates(answer) {
+  const chosen = (row) => row.sensor_id === answer.sensor_id && (row.velocity ?? answer.velocity) === answer.velocity;
+  const guided = answer.guided?.candidates;
+  const columns = guided
+    ? [["Sensor", (c) => c.sensor_id], ["Velocity, m/s", (c) => c.velocity], ["LLM's probability", (c) => (c.llm === null ? "silent" : c.llm.toFixed(3))],
+       ["All advisers'", (c) => c.mixture.toFixed(3)], ["Expected loss, packets", (c) => c.regret.toFixed(2)], ["Score", (c) => c.score.toFixed(2)]]
+    : [["Sensor", (c) => c.sensor_id], ["Attention score", (c) => c.score.toFixed(3)]];
+  const rows = (guided ?? answer.top_k).map((row) =>
+    make("tr", chosen(row) ? { class: "chosen" } : {}, ...columns.map(([, cell]) => make("td", {}, String(cell(row)))), make("td", {}, chosen(row) ? "flown" : "")));
+  const head = make("tr", {}, ...columns.map(([name]) => make("th", { scope: "col" }, name)), make("td", {}));
+  const note = guided ? "Best first. The loss is above the best candidate's, as the critic expects it." : "The sensors that attention kept, best first.";
+  return make("section", {}, make("h3", {}, "Candidates"), make("p", { class: "hint" }, rows.length ? note : "None was offered."),
+    make("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Candidates" }, make("table", {}, make("thead", {}, head), make("tbody", {}, ...rows))));
+}
+
+function trust(answer) {
+  if (!answer.guided) return [];
+  const bars = Object.entries(answer.guided.trust).sort((a, b) => b[1] - a[1]).map(([name, weight]) =>
+    make("li", {}, make("span", {}, ADVISERS[name] ?? name), make("meter", { min: 0, max: 1, value: weight, "aria-label": `trust in ${ADVISERS[name] ?? name}` }), make("span", {}, `${shown(weight * 100)}%`)));
+  return [make("section", {}, make("h3", {}, "Trust before this decision"), make("ul", { class: "bars" }, ...bars))];
+}
+
+function times(decision) {
+  const { latency_ms: stages, deadline_ms: deadline } = decision.answer;
+  const roundTrip = measured(decision);
+  const rows = Object.entries(stages).filter(([name]) => name !== "total").map(([name, ms]) => [name, `${shown(ms, 2)} ms`]);
+  rows.push(["at the edge, total", `${shown(stages.total, 2)} ms of ${shown(deadline, 0)} ms`]);
+  rows.push(["round trip, by the UAV", roundTrip === null ? "not told" : `${shown(roundTrip, 2)} ms`]);
+  return make("section", {}, make("h3", {}, "Time"), pairs(rows));
+}
+
+function tokens(answer) {
+  const t = answer.tokens;
+  const rows = [["prompt", `${t.prompt}: ${t.static} static, ${t.experiences} experiences, ${t.state} state`],
+    ["without attention and masks", String(t.uncompressed)], ["saved", String(t.saved)], ["counted with", t.tokenizer]];
+  if (t.server_prompt !== null) rows.push(["by the LLM's own count", `${t.server_prompt}, of which ${t.cached ?? 0} cached; ${t.completion ?? 0} answered`]);
+  if (t.cost_usd !== null) rows.push(["price", `$${t.cost_usd.toPrecision(3)}`]);
+  return make("section", {}, make("h3", {}, "Tokens"), pairs(rows));
+}
+
+const pairs = (rows) => make("dl", { class: "pairs" }, ...rows.flatMap(([name, value]) => [make("dt", {}, name), make("dd", {}, value)]));
+
+async function showPrompt(answer, section) {
+  const path = `missions/${encodeURIComponent(answer.mission_id)}/decisions/${answer.decision_id}/prompt`;
+  let parts;
+  try {
+    const told = await ask(path);
+    const block = (name, text) => [make("h4", {}, name), make("pre", { tabindex: 0, role: "region", "aria-label": name }, text || "(empty)")];
+    parts = [make("p", { class: "hint" }, told.asked ? "As the LLM got it." : "No LLM was asked: it was made to count its tokens."),
+      ...block("Static block, the same for the whole mission", told.static), ...block("Experiences", told.experiences), ...block("Current task", told.state)];
+  } catch (error) {
+    const gone = error instanceof Refused && error.status === 404;
+    parts = [make("p", {}, gone ? "The edge keeps the prompts of its newest decisions only; this one is gone." : `The edge did not tell: ${error.message}`)];
+  }
+  if (opened === answer.decision_id) section.replaceChildren(make("h3", {}, "Prompt"), ...parts);
+}

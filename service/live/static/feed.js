@@ -1,0 +1,75 @@
+// The decisions as a list, the newest first. Whoever reads or has chosen one keeps it: nothing under the focus is removed.
+
+import { at, make, say, shown } from "./dom.js";
+import { measured } from "./model.js";
+import { SOURCES, why } from "./words.js";
+
+const MOST_SHOWN = 100;
+
+export class Feed {
+  constructor(onOpen) {
+    this.list = at("feed");
+    this.items = new Map();
+    this.onOpen = onOpen;
+    this.list.addEventListener("click", (event) => {
+      const button = event.target.closest("button");
+      if (button) this.onOpen(button.dataset.decision);
+    });
+    this.list.addEventListener("keydown", (event) => this.#move(event));
+  }
+
+  begin() {
+    this.items.clear();
+    this.list.replaceChildren();
+  }
+
+  update(mission) {
+    const newest = mission.newest(MOST_SHOWN);
+    const wanted = new Set(newest.map((decision) => decision.answer.decision_id));
+    for (const [id, item] of this.items) {
+      if (!wanted.has(id) && !item.element.contains(document.activeElement)) {
+        item.element.remove();
+        this.items.delete(id);
+      }
+    }
+    for (const decision of newest.reverse()) {
+      const id = decision.answer.decision_id;
+      const item = this.items.get(id);
+      if (!item) this.#add(id, decision);
+      else if (decision.outcome && !item.settled) this.#settle(item, decision);
+    }
+  }
+
+  #add(id, decision) {
+    const { answer } = decision;
+    const meta = make("span", { class: "meta" });
+    const button = make("button", { type: "button", "data-decision": id, "aria-haspopup": "dialog" },
+      make("span", { class: "what" }, make("b", {}, `UAV ${answer.uav_id}`), ` to sensor `, make("b", {}, String(answer.sensor_id)), ` at ${answer.velocity} m/s`),
+      make("span", { class: "step" }, `step ${answer.step}`),
+      make("span", { class: "by" }, make("span", { class: "who", "data-source": answer.source }, SOURCES[answer.source] ?? answer.source), ` ${why(answer)}`),
+      meta);
+    const item = { element: make("li", {}, button), meta, settled: false };
+    this.items.set(id, item);
+    this.list.prepend(item.element);
+    this.#settle(item, decision);
+  }
+
+  #settle(item, decision) {
+    const { answer, outcome } = decision;
+    const roundTrip = measured(decision);
+    const time = roundTrip === null ? `${shown(answer.latency_ms.total)} ms at the edge` : `${shown(roundTrip)} ms round trip`;
+    const parts = [time, `${shown(answer.tokens.saved, 0)} of ${shown(answer.tokens.uncompressed, 0)} tokens saved`];
+    if (outcome) parts.push(outcome.failed ? `failed, cost ${shown(outcome.cost, 2)}` : `cost ${shown(outcome.cost, 2)}`);
+    say(item.meta, parts.join(" · "));
+    item.meta.classList.toggle("failed", Boolean(outcome?.failed));
+    item.settled = Boolean(outcome);
+  }
+
+  #move(event) {
+    const item = event.target.closest("li");
+    const to = { ArrowDown: item?.nextElementSibling, ArrowUp: item?.previousElementSibling, Home: this.list.firstElementChild, End: this.list.lastElementChild }[event.key];
+    if (!to) return;
+    event.preventDefault();
+    to.querySelector("button").focus();
+  }
+}

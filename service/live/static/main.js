@@ -1,0 +1,212 @@
+// The page: which mission is shown, the connection to it, and when it is drawn.
+
+import { Charts } from "./charts.js";
+import { open } from "./decision.js";
+import { at, make, say, set } from "./dom.js";
+import { ask, events, Refused, useKey } from "./edge.js";
+import { Feed } from "./feed.js";
+import { MissionMap } from "./map.js";
+import { Mission } from "./model.js";
+import { clearNumbers, showNumbers } from "./numbers.js";
+import { GUIDANCE } from "./words.js";
+
+const LISTED_EVERY_MS = 3000;
+const RETRY_MS = [1000, 2000, 4000, 8000];
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+let wanted = new URLSearchParams(location.search).get("mission");
+let mission = null;
+let following = null;
+let stop = new AbortController();
+let drawing = false;
+let paused = false;
+
+const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id)));
+const map = new MissionMap((kind, id) => {
+  const last = mission.newest(1000).find(({ answer }) => (kind === "uav" ? answer.uav_id : answer.sensor_id) === id);
+  if (last) open(last);
+});
+const charts = new Charts();
+
+function connection(state, text) {
+  set(at("connection"), { "data-state": state });
+  say(at("connection").querySelector("b"), text);
+}
+
+function trouble(text) {
+  at("trouble").hidden = !text;
+  say(at("trouble"), text ?? "");
+}
+
+const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
+/** Which missions there are, again and again; follows the newest unless one was chosen. */
+async function list() {
+  for (;;) {
+    try {
+      const told = await ask("missions");
+      offer(told);
+      const next = wanted ?? told.newest ?? told.missions.find((one) => one.mode)?.mission_id ?? null;
+      if (next === null) nothing(told);
+      else if (next !== following) follow(next);
+    } catch (error) {
+      await refused(error);
+    }
+    await pause(LISTED_EVERY_MS);
+  }
+}
+
+function offer(told) {
+  const names = [["", told.newest ? `Newest: ${told.newest}` : "Newest"]];
+  for (const { mission_id: id, mode } of told.missions) names.push([id, mode ? `${id} (${mode})` : `${id} (in the store)`]);
+  if (wanted && !names.some(([id]) => id === wanted)) names.push([wanted, wanted]);
+  if (told.more) names.push([null, `${told.more} more are not listed: put ?mission=ID into the address`]);
+  const key = JSON.stringify(names);
+  if (offer.key === key) return;
+  offer.key = key;
+  at("picker").replaceChildren(...names.map(([id, text]) => make("option", id === null ? { disabled: "" } : { value: id }, text)));
+  at("picker").value = wanted ?? "";
+}
+
+function nothing(told) {
+  at("empty").hidden = false;
+  at("mission").hidden = true;
+  connection("waiting", "Waiting for a mission");
+  const asleep = told.missions.length;
+  say(at("empty-title"), asleep ? "No mission has flown since the edge started" : "No mission yet");
+  say(at("empty-text"), asleep ? "Choose one of the store above, or fly one, and it appears here:" : "Fly one, and it appears here:");
+  say(at("empty-command"), `aicvds simulate --edge ${location.origin} --out runs/mission`);
+}
+
+/** Show this mission, whatever happens on the way, until another is to be shown. */
+async function follow(id) {
+  stop.abort();
+  stop = new AbortController();
+  const { signal } = stop;
+  following = id;
+  let tries = 0;
+  while (!signal.aborted) {
+    try {
+      for await (const event of events(`missions/${encodeURIComponent(id)}/events`, signal)) {
+        if (signal.aborted) return;
+        tries = 0;
+        trouble(null);
+        connection(paused ? "paused" : "live", paused ? "Paused" : "Live");
+        if (event.name === "gone") return gone(id);
+        hear(event);
+      }
+    } catch (error) {
+      if (signal.aborted) return;
+      if (error instanceof Refused && error.status === 404) return gone(id);
+      if (error instanceof Refused) await refused(error);
+    }
+    if (signal.aborted) return;
+    const wait = RETRY_MS[Math.min(tries++, RETRY_MS.length - 1)];
+    if (tries > 1 || wait > RETRY_MS[0]) lost();
+    connection("lost", `Connection lost, trying again`);
+    await pause(wait * (0.75 + Math.random() / 2));
+  }
+}
+
+function lost() {
+  const seen = mission ? ` What you see is from step ${mission.now.step}.` : "";
+  if (at("trouble").hidden) trouble(`The edge does not answer. The page goes on as soon as it does.${seen}`);
+}
+
+function gone(id) {
+  if (following === id) following = null;
+  if (wanted === id) {
+    wanted = null;
+    trouble(`There is no mission ${id}, or no longer: the newest is shown instead.`);
+    history.replaceState(null, "", location.pathname);
+    offer.key = null;
+  }
+}
+
+async function refused(error) {
+  if (!(error instanceof Refused)) {
+    connection("lost", "Connection lost, trying again");
+    lost();
+  } else if (error.status === 401) {
+    connection("lost", "A key is needed");
+    await askForKey();
+  } else {
+    connection("lost", "Refused");
+    trouble(`The edge refused: ${error.message}`);
+    await pause(1000 * error.retryS);
+  }
+}
+
+let asking = null;
+
+function askForKey() {
+  asking ??= new Promise((resolve) => {
+    at("key").showModal();
+    at("key").addEventListener("close", () => {
+      if (at("key-input").value) useKey(at("key-input").value.trim());
+      at("key-input").value = "";
+      asking = null;
+      resolve();
+    }, { once: true });
+  });
+  return asking;
+}
+
+function hear({ name, data }) {
+  if (name === "snapshot") {
+    if (mission?.goesOn(data)) mission.begin(data);
+    else {
+      mission = new Mission(data);
+      feed.begin();
+      clearNumbers();
+      charts.mission = null;
+      charts.begin();
+    }
+    at("empty").hidden = true;
+    at("mission").hidden = false;
+    map.begin(mission);
+    draw();
+  } else if (name === "update" && mission) {
+    mission.apply(data);
+    soon();
+  }
+}
+
+function soon() {
+  if (drawing || paused) return;
+  drawing = true;
+  // Once a second is calm enough to read, and nothing glides.
+  if (calm.matches) setTimeout(draw, 1000);
+  else requestAnimationFrame(draw);
+}
+
+function draw() {
+  drawing = false;
+  if (paused || !mission) return;
+  map.update(mission);
+  feed.update(mission);
+  charts.update(mission);
+  showNumbers(mission);
+  const { note } = mission.about;
+  at("note").hidden = note === null;
+  say(at("note-text"), note ?? "");
+  say(at("note-state"), GUIDANCE[mission.now.guidance] ?? mission.now.guidance);
+  document.title = `${mission.id} · AIC-VDS`;
+  at("mission").dataset.made = mission.now.made;
+}
+
+at("picker").addEventListener("change", ({ target }) => {
+  wanted = target.value || null;
+  history.replaceState(null, "", wanted ? `?mission=${encodeURIComponent(wanted)}` : location.pathname);
+  trouble(null);
+  if (wanted) follow(wanted);
+});
+
+at("pause").addEventListener("click", () => {
+  paused = !paused;
+  set(at("pause"), { "aria-pressed": paused });
+  if (at("connection").dataset.state === (paused ? "live" : "paused")) connection(paused ? "paused" : "live", paused ? "Paused" : "Live");
+  if (!paused) draw();
+});
+
+list();
