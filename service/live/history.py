@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
@@ -46,6 +47,7 @@ class History:
         self._kept: OrderedDict[str, Kept] = OrderedDict()
         self._characters = 0
         self.order = 0
+        self.edge = uuid.uuid4().hex
 
     def drafted(self, mission_id: str, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
         """A decision was made; it is shown once it is answered."""

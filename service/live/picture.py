@@ -17,11 +17,16 @@ from shared.urgency import urgency
 _POINTS = 97
 
 
-def snapshot(mission: Mission, kept: list[Kept]) -> bytes:
-    """All that the page needs to begin, decisions included."""
+def snapshot(mission: Mission, kept: list[Kept], edge: str) -> bytes:
+    """All that the page needs to begin, decisions included.
+
+    Args:
+        edge: this process's own name: another's knows nothing of the decisions before.
+    """
     scenario = mission.scenario
     return _json(
         {
+            "edge": edge,
             "mission": {
                 "mission_id": mission.mission_id,
                 "mode": mission.mode,

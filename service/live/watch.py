@@ -123,7 +123,7 @@ class Watched:
         """What came after it, and before the next update, is in that."""
         if self._whole is None or self._whole[0] != self._made:
             kept = self._history.of(self.mission.mission_id)[-_SHOWN:]
-            self._whole = self._made, _event("snapshot", picture.snapshot(self.mission, kept))
+            self._whole = self._made, _event("snapshot", picture.snapshot(self.mission, kept, self._history.edge))
         return self._whole[1]
 
 

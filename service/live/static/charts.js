@@ -4,11 +4,12 @@ import uPlot from "./vendor/uPlot.esm.js";
 import { named, onTheme } from "./colours.js";
 import { at, say, shown } from "./dom.js";
 
-const HEIGHT = 200;
+const HEIGHT = 220;
 const REDRAWN_EVERY_MS = 500;
 
 const CHARTS = {
   loss: {
+    unit: "cost",
     series: [["cost so far", "--c1", []], ["failed so far", "--c2", [6, 4]]],
     rows: (steps) => {
       let cost = 0;
@@ -19,6 +20,7 @@ const CHARTS = {
     text: ([cost, failed], steps) => `Cost that the UAVs told since step ${steps[0][0]}: ${shown(cost.at(-1), 2)} (a failed transmission counts 1, a queue's worth of lost packets 1), ${failed.at(-1)} failed.`,
   },
   latency: {
+    unit: "ms",
     series: [["round trip, mean", "--c1", []], ["edge, mean", "--c2", [6, 4]], ["edge, slowest", "--c3", [2, 3]]],
     log: true,
     rows: (steps) => [
@@ -28,10 +30,11 @@ const CHARTS = {
     ],
     text: ([roundTrip, edge, slowest]) => {
       const told = roundTrip.findLast((v) => v !== null);
-      return `In the last step the edge took ${shown(edge.at(-1))} ms on average, ${shown(slowest.at(-1))} ms at most; ${told === undefined ? "the UAVs do not tell their round trip" : `the last round trips told were ${shown(told)} ms on average`}. Milliseconds, logarithmic.`;
+      return `In the last step the edge took ${shown(edge.at(-1))} ms on average, ${shown(slowest.at(-1))} ms at most; ${told === undefined ? "the UAVs do not tell their round trip" : `the last round trips told were ${shown(told)} ms on average`}.`;
     },
   },
   tokens: {
+    unit: "tokens",
     series: [["without attention", "--c2", [6, 4]], ["prompt", "--c1", []]],
     rows: (steps) => [steps.map(([, s]) => s.uncompressed / s.count), steps.map(([, s]) => s.prompt / s.count)],
     text: ([full, prompt]) => `Tokens a decision: ${shown(prompt.at(-1), 0)} in the last step's prompts, ${shown(full.at(-1), 0)} without attention and masks.`,
@@ -41,7 +44,7 @@ const CHARTS = {
 export class Charts {
   constructor() {
     this.plots = {};
-    this.drawn = 0;
+    this.later = null;
     onTheme(() => this.begin());
     new ResizeObserver(() => this.#resize()).observe(at("loss"));
   }
@@ -50,15 +53,24 @@ export class Charts {
   begin() {
     for (const plot of Object.values(this.plots)) plot.destroy();
     this.plots = {};
-    this.drawn = 0;
-    if (this.mission) this.update(this.mission);
+    if (this.mission) this.#draw();
   }
 
+  /** Draw a mission as it is now, and then no more for a moment. */
   update(mission) {
     this.mission = mission;
-    const steps = [...mission.steps].filter(([, s]) => s.count > 0).sort((a, b) => a[0] - b[0]);
-    if (!steps.length || performance.now() - this.drawn < REDRAWN_EVERY_MS) return;
-    this.drawn = performance.now();
+    this.stale = this.later !== null;
+    if (this.stale) return;
+    this.#draw();
+    this.later = setTimeout(() => {
+      this.later = null;
+      if (this.stale && this.mission) this.update(this.mission);
+    }, REDRAWN_EVERY_MS);
+  }
+
+  #draw() {
+    const steps = [...this.mission.steps].filter(([, s]) => s.count > 0).sort((a, b) => a[0] - b[0]);
+    if (!steps.length) return;
     for (const [name, chart] of Object.entries(CHARTS)) {
       const rows = chart.rows(steps);
       const data = [steps.map(([number]) => number), ...rows];
@@ -74,7 +86,7 @@ export class Charts {
 }
 
 function plotted(name, chart, data) {
-  const axis = { stroke: named("--quiet"), grid: { stroke: named("--line"), width: 1 }, ticks: { stroke: named("--line"), width: 1 }, font: "12px system-ui, sans-serif" };
+  const axis = { stroke: named("--quiet"), grid: { stroke: named("--line"), width: 1 }, ticks: { stroke: named("--line"), width: 1 }, font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif", labelSize: 20, labelGap: 2 };
   const series = chart.series.map(([label, colour, dash]) => ({
     label, stroke: named(colour), width: 2, dash, spanGaps: true, points: { show: data[0].length < 3 }, value: (_, value) => shown(value, 2),
   }));
@@ -84,7 +96,7 @@ function plotted(name, chart, data) {
   const plot = new uPlot({
     width: at(name).clientWidth, height: HEIGHT, series: [{ label: "step", value: (_, value) => shown(value, 0) }, ...series],
     scales: { x: { time: false }, y },
-    axes: [{ ...axis, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }, { ...axis, size: 48 }],
+    axes: [{ ...axis, label: "step", incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }, { ...axis, label: chart.unit, size: 48 }],
     cursor: { drag: { x: false, y: false } },
   }, data, at(name));
   // What it shows stands in words above it.

@@ -20,6 +20,7 @@ let following = null;
 let stop = new AbortController();
 let drawing = false;
 let paused = false;
+let remark = null;
 
 const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id)));
 const map = new MissionMap((kind, id) => {
@@ -33,9 +34,10 @@ function connection(state, text) {
   say(at("connection").querySelector("b"), text);
 }
 
+/** What is wrong now, or else what is to be remarked. */
 function trouble(text) {
-  at("trouble").hidden = !text;
-  say(at("trouble"), text ?? "");
+  at("trouble").hidden = !(text ?? remark);
+  say(at("trouble"), text ?? remark ?? "");
 }
 
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
@@ -110,14 +112,15 @@ async function follow(id) {
 
 function lost() {
   const seen = mission ? ` What you see is from step ${mission.now.step}.` : "";
-  if (at("trouble").hidden) trouble(`The edge does not answer. The page goes on as soon as it does.${seen}`);
+  if (!at("trouble").textContent.startsWith("The edge refused")) trouble(`The edge does not answer. The page goes on as soon as it does.${seen}`);
 }
 
 function gone(id) {
   if (following === id) following = null;
   if (wanted === id) {
     wanted = null;
-    trouble(`There is no mission ${id}, or no longer: the newest is shown instead.`);
+    remark = `There is no mission ${id}, or no longer: the newest is shown instead.`;
+    trouble(null);
     history.replaceState(null, "", location.pathname);
     offer.key = null;
   }
@@ -198,6 +201,7 @@ function draw() {
 at("picker").addEventListener("change", ({ target }) => {
   wanted = target.value || null;
   history.replaceState(null, "", wanted ? `?mission=${encodeURIComponent(wanted)}` : location.pathname);
+  remark = null;
   trouble(null);
   if (wanted) follow(wanted);
 });

@@ -12,14 +12,15 @@ export class Mission {
     this.begin(snapshot);
   }
 
-  /** Whether a snapshot goes on where this left off: the same mission, not one made anew under its name. */
+  /** Whether a snapshot goes on where this left off: the same mission, not one made anew, and the same edge. */
   goesOn(snapshot) {
-    return snapshot.mission.mission_id === this.id && snapshot.made >= this.now.made && snapshot.step >= this.now.step;
+    return snapshot.mission.mission_id === this.id && snapshot.edge === this.edge && snapshot.made >= this.now.made;
   }
 
   /** Take a snapshot; decisions that are known stay as they are. */
   begin(snapshot) {
     this.id = snapshot.mission.mission_id;
+    this.edge = snapshot.edge;
     this.about = snapshot.mission;
     this.scenario = snapshot.scenario;
     this.pipeline = snapshot.pipeline;

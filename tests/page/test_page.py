@@ -1,0 +1,281 @@
+"""The mission page in a real browser, of a real edge, while the simulator flies."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Page, expect
+
+from tests.e2e.processes import output_until, run, serving_edge, started
+from tests.page.conftest import Open, Start
+from tests.service.stub_llm import wait_for
+
+Report = Callable[..., dict[str, Any]]
+REFUSED = ("Failed to load resource",)
+GONE = (*REFUSED, "net::ERR_")
+HOSTILE = '<img src=x onerror="window.hacked = 1"><script>window.hacked = 1</script>'
+
+
+@pytest.fixture(scope="module")
+def edge() -> Iterator[str]:
+    """One for the tests that need none of their own; each has missions of its own name there."""
+    with serving_edge(AICVDS_MODE="value") as (url, _):
+        yield url
+
+
+@pytest.fixture(scope="module")
+def flown(edge: str, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The page of the paper's mission, flown by learned values."""
+    fly(edge, tmp_path_factory.mktemp("flown"))
+    return f"{edge}/?mission={httpx.get(f'{edge}/missions').json()['newest']}"
+
+
+def fly(url: str, out: Path, *options: str) -> None:
+    flown = run("simulate", "--edge", url, "--out", str(out / "run"), *options)
+    assert flown.returncode == 0, flown.stderr
+
+
+def violations(page: Page) -> list[str]:
+    found = Axe().run(page).response["violations"]
+    return [f"{one['id']}: {one['help']}: {[node['target'] for node in one['nodes']][:3]}" for one in found]
+
+
+def test_a_mission_appears_while_it_flies(visit: Open, start: Start, tmp_path: Path) -> None:
+    url, _ = start(AICVDS_MODE="value")
+    page = visit(url)
+    expect(page.get_by_role("heading", name="No mission yet")).to_be_visible()
+    expect(page.locator("#empty-command")).to_have_text(f"aicvds simulate --edge {url} --out runs/mission")
+    fly(url, tmp_path)
+    expect(page.locator("#mission")).to_have_attribute("data-made", "90")
+    expect(page.get_by_role("heading", name="No mission yet")).to_be_hidden()
+    expect(page.locator(".sensor[role=button]")).to_have_count(10)
+    expect(page.locator(".mark.uav")).to_have_count(3)
+    expect(page.locator("#feed li")).to_have_count(90)
+    expect(page.locator("#connection")).to_have_text("Live")
+    assert page.locator(".trails line").count() > 50
+    assert len(set(page.locator(".trails line").evaluate_all("all => all.map(l => l.getAttribute('stroke'))"))) > 3
+    for chart in ("loss", "latency", "tokens"):
+        expect(page.locator(f"#{chart} canvas")).to_have_count(1)
+        expect(page.locator(f"#{chart}-text")).not_to_be_empty()
+    expect(page.locator("#legend")).to_contain_text("round trip as the UAV measured it")
+    expect(page.locator("#summary")).to_contain_text("failed transmissions")
+
+
+def test_uavs_that_do_not_tell_their_round_trip_are_shown_with_the_edges_time(
+    visit: Open, start: Start, report: Report
+) -> None:
+    url, _ = start(AICVDS_MODE="value")
+    told = None
+    for step in range(3):
+        body = report(mission_id="silent", step=step, position=[500.0, 450.0 + 50 * step], outcome=told)
+        answer = httpx.post(f"{edge}/decide", json=body, timeout=60).json()
+        told = {"decision_id": answer["decision_id"], "cost": 0.5}
+    page = visit(f"{edge}/?mission=silent")
+    expect(page.locator("#legend")).to_contain_text("the edge's own time: these UAVs do not tell")
+    expect(page.locator("#feed li").first).to_contain_text("ms at the edge")
+    # Sensor 4 was never heard: it is drawn, and told apart.
+    expect(page.locator("#sensor-4")).to_have_attribute("aria-label", re.compile("never heard, no visit"))
+    expect(page.locator("#sensor-4")).to_have_class(re.compile("unheard"))
+
+
+def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: str) -> None:
+    page = visit(flown)
+    first = page.locator("#feed button").first
+    first.focus()
+    for _ in range(89):
+        page.keyboard.press("ArrowDown")
+    expect(page.locator("#feed button").last).to_be_focused()
+    page.keyboard.press("Home")
+    expect(first).to_be_focused()
+    page.keyboard.press("Enter")
+    dialog = page.get_by_role("dialog", name=re.compile("^Step 29: UAV"))
+    expect(dialog.get_by_role("region", name=re.compile("^Static block"))).to_contain_text("You direct a fleet of UAVs")
+    expect(dialog.get_by_role("region", name="Current task")).to_have_text(re.compile(r"^(\d+(,-?\d+){6}\s*){5}$"))
+    expect(dialog.locator("tr.chosen")).to_have_count(1)
+    expect(dialog.locator("tbody tr")).to_have_count(5)
+    expect(dialog).to_contain_text("No LLM was asked")
+    page.keyboard.press("Escape")
+    expect(dialog).to_be_hidden()
+    expect(first).to_be_focused()
+    page.locator("#sensor-0").focus()
+    for sensor in range(1, 10):
+        page.keyboard.press("ArrowRight")
+        expect(page.locator(f"#sensor-{sensor}")).to_be_focused()
+        expect(page.locator("#readout")).to_contain_text(f"Sensor {sensor}: queue")
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#readout")).to_contain_text("UAV 0 at step 29")
+
+
+def test_mode_guided_shows_candidates_with_probabilities_and_trust(visit: Open, start: Start, report: Report) -> None:
+    url, _ = start(AICVDS_MODE="guided")
+    with httpx.Client(base_url=url, timeout=60) as client:
+        wait_for(client, "ready")
+        answer = client.post("/decide", json=report(deadline_ms=30_000)).json()
+        assert answer["source"] == "guided", answer["reason"]
+        page = visit(url)
+        page.locator("#feed button").first.click()
+        dialog = page.locator("#decision")
+        expect(dialog.locator("tbody tr")).to_have_count(len(answer["guided"]["candidates"]))
+        best = answer["guided"]["candidates"][0]
+        expect(dialog.locator("tbody tr").first).to_contain_text(f"{best['llm']:.3f}{best['mixture']:.3f}")
+        expect(dialog.locator("meter")).to_have_count(len(answer["guided"]["trust"]))
+        expect(dialog).to_contain_text("As the LLM got it.")
+        assert violations(page) == []
+
+
+def test_what_comes_from_outside_is_text(visit: Open, edge: str, report: Report) -> None:
+    assert httpx.put(f"{edge}/missions/noted", json={"note": HOSTILE}, timeout=60).status_code == 200
+    httpx.post(f"{edge}/decide", json=report(mission_id="noted"), timeout=60)
+    page = visit(f"{edge}/?mission=noted", expected=REFUSED)
+    expect(page.locator("#note-text")).to_have_text(HOSTILE)
+    page.locator("#feed button").first.click()
+    expect(page.get_by_role("region", name=re.compile("^Static block"))).to_contain_text(HOSTILE)
+    assert page.locator("img").count() == 0
+    page.goto(f"{edge}/?mission={HOSTILE}")
+    expect(page.locator("#trouble")).to_contain_text(f"There is no mission {HOSTILE}")
+    expect(page.locator("#connection")).to_have_text("Live")
+    expect(page.locator("#trouble")).to_be_visible()
+    assert page.locator("img").count() == 0
+    assert page.evaluate("window.hacked") is None
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_it_is_accessible_and_fits(visit: Open, flown: str, scheme: str, width: int) -> None:
+    page = visit(flown, color_scheme=scheme, viewport={"width": width, "height": 844}, reduced_motion="reduce")
+    expect(page.locator("#tokens canvas")).to_have_count(1)
+    assert violations(page) == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.locator("#feed button").first.click()
+    expect(page.get_by_role("region", name="Current task")).to_be_visible()
+    assert violations(page) == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_one_of_several_missions_is_chosen(visit: Open, edge: str, flown: str, tmp_path: Path) -> None:
+    first = flown.split("=")[1]
+    fly(edge, tmp_path, "--scenario", "pipeline")
+    page = visit(edge)
+    expect(page).to_have_title(re.compile("^pipeline-0-"))
+    expect(page.locator(".pipeline")).to_have_count(1)
+    page.get_by_role("combobox", name="Mission").select_option(first)
+    expect(page).to_have_title(f"{first} · AIC-VDS")
+    expect(page.locator(".pipeline")).to_have_count(0)
+    page.reload()
+    expect(page).to_have_title(f"{first} · AIC-VDS")
+    assert page.url.endswith(f"?mission={first}")
+
+
+def test_paused_the_page_stands_still_and_goes_on_from_there(visit: Open, edge: str, report: Report) -> None:
+    httpx.post(f"{edge}/decide", json=report(mission_id="paused"), timeout=60)
+    page = visit(f"{edge}/?mission=paused")
+    expect(page.locator("#feed li")).to_have_count(1)
+    page.get_by_role("button", name="Pause").click()
+    httpx.post(f"{edge}/decide", json=report(mission_id="paused", step=1), timeout=60)
+    page.wait_for_timeout(600)
+    expect(page.locator("#feed li")).to_have_count(1)
+    page.get_by_role("button", name="Pause").click()
+    expect(page.locator("#feed li")).to_have_count(2)
+
+
+def test_a_mission_that_is_deleted_and_made_again_begins_anew(visit: Open, edge: str, report: Report) -> None:
+    for step in range(2):
+        httpx.post(f"{edge}/decide", json=report(mission_id="again", step=step), timeout=60)
+    page = visit(f"{edge}/?mission=again", expected=REFUSED)
+    expect(page.locator("#feed li")).to_have_count(2)
+    httpx.delete(f"{edge}/missions/again", timeout=60)
+    expect(page.locator("#trouble")).to_contain_text("There is no mission again, or no longer")
+    httpx.post(f"{edge}/decide", json=report(mission_id="again", step=5), timeout=60)
+    expect(page.locator("#feed li")).to_have_count(1)
+    expect(page.locator("#feed li")).to_contain_text("step 5")
+
+
+def test_a_lost_connection_is_told_and_taken_up_again(visit: Open, start: Start, report: Report) -> None:
+    url, process = start(AICVDS_MODE="value")
+    httpx.post(f"{url}/decide", json=report(), timeout=60)
+    page = visit(url, expected=GONE)
+    expect(page.locator("#connection")).to_have_text("Live")
+    process.send_signal(signal.SIGTERM)
+    process.wait(timeout=30)
+    expect(page.locator("#connection")).to_have_text("Connection lost, trying again")
+    expect(page.locator("#trouble")).to_contain_text("The edge does not answer", timeout=15_000)
+    port = url.rsplit(":", 1)[1]
+    with started("serve", "--port", port, AICVDS_MODE="value") as again:
+        output_until(again, "startup complete")
+        httpx.post(f"{url}/decide", json=report(step=7), timeout=60)
+        expect(page.locator("#connection")).to_have_text("Live", timeout=20_000)
+        expect(page.locator("#trouble")).to_be_hidden()
+        expect(page.locator("#feed li")).to_have_count(1)
+        expect(page.locator("#feed li")).to_contain_text("step 7")
+
+
+def test_the_page_asks_for_a_key_where_the_edge_does(visit: Open, start: Start, report: Report, tmp_path: Path) -> None:
+    keys = str(tmp_path / "keys.json")
+    key = run("keys", "add", "fleet", "--file", keys, "--scopes", "decide", "admin").stdout.strip()
+    reader = run("keys", "add", "reader", "--file", keys, "--scopes", "decide").stdout.strip()
+    url, _ = start(AICVDS_MODE="value", AICVDS_KEYS=keys)
+    httpx.post(f"{url}/decide", json=report(), timeout=60, headers={"Authorization": f"Bearer {key}"})
+    page = visit(url, expected=REFUSED)
+    asked = page.get_by_role("dialog", name="This edge asks for a key")
+    expect(asked).to_be_visible()
+    assert violations(page) == []
+    asked.get_by_label("Key", exact=True).fill("wrong")
+    page.keyboard.press("Enter")
+    expect(asked).to_be_hidden()
+    expect(asked).to_be_visible(timeout=15_000)
+    asked.get_by_label("Key", exact=True).fill(reader)
+    page.keyboard.press("Enter")
+    expect(page.locator("#feed li")).to_have_count(1, timeout=15_000)
+    assert page.evaluate("[localStorage.length, document.cookie]") == [0, ""]
+    assert reader not in page.url
+    # It counts no more: the stream ends, and the page asks again.
+    run("keys", "remove", "reader", "--file", keys)
+    expect(asked).to_be_visible(timeout=20_000)
+
+
+def test_a_hundred_sensors_and_ten_uavs_ten_times_a_second(visit: Open, edge: str) -> None:
+    with httpx.Client(base_url=edge, timeout=60) as client:
+        client.put("/missions/many", json={"scenario": "dense"})
+        page = visit(f"{edge}/?mission=many")
+        expect(page.locator("#mission")).to_have_attribute("data-made", "0")
+        page.evaluate(
+            """() => {
+                window.updates = 0;
+                new MutationObserver(() => { window.updates += 1; })
+                    .observe(document.getElementById("mission"), {attributes: true, attributeFilter: ["data-made"]});
+            }"""
+        )
+        began, steps = time.monotonic(), 50
+        for step in range(steps):
+            assert client.post("/decide/batch", json=batch(step)).status_code == 200
+            time.sleep(max(0.0, began + 0.1 * (step + 1) - time.monotonic()))
+        expect(page.locator("#mission")).to_have_attribute("data-made", str(10 * steps), timeout=15_000)
+        expect(page.locator(".sensor[role=button]")).to_have_count(100)
+        expect(page.locator(".mark.uav")).to_have_count(10)
+        expect(page.locator(".trails line")).to_have_count(10 * (steps - 1))
+        expect(page.locator("#feed li")).to_have_count(100)
+        expect(page.locator("#feed li").first).to_contain_text(f"step {steps - 1}")
+        assert page.evaluate("window.updates") >= steps // 5
+
+
+def batch(step: int) -> dict[str, Any]:
+    """Ten UAVs that fly east over a hundred sensors, of which each hears all."""
+    sensors = {
+        "id": list(range(100)),
+        "x": [50.0 + 100 * (i % 10) for i in range(100)],
+        "y": [50.0 + 100 * (i // 10) for i in range(100)],
+        "queue": [float((7 * i + 3 * step) % 60) for i in range(100)],
+        "battery": [50.0] * 100,
+        "channel_gain": [-90.0] * 100,
+        "last_seen": [step] * 100,
+    }
+    uavs = [{"uav_id": u, "position": [10.0 + 15 * step, 50.0 + 100 * u], "sensors": sensors} for u in range(10)]
+    return {"mission_id": "many", "step": step, "uavs": uavs}
