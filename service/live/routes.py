@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import aclosing
 from pathlib import Path
 from typing import Annotated
@@ -92,7 +92,7 @@ def _engine(request: Request) -> Engine:
 TheEngine = Annotated[Engine, Depends(_engine)]
 
 
-def _placed(engine: TheEngine) -> Iterator[None]:
+async def _placed(engine: TheEngine) -> AsyncIterator[None]:
     """A place among those who watch, until the answer has ended."""
     with engine.live.place():
         yield

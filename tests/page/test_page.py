@@ -69,10 +69,7 @@ def test_a_mission_appears_while_it_flies(visit: Open, start: Start, tmp_path: P
     expect(page.locator("#summary")).to_contain_text("failed transmissions")
 
 
-def test_uavs_that_do_not_tell_their_round_trip_are_shown_with_the_edges_time(
-    visit: Open, start: Start, report: Report
-) -> None:
-    url, _ = start(AICVDS_MODE="value")
+def test_where_no_round_trip_is_told_the_edges_time_is_shown(visit: Open, edge: str, report: Report) -> None:
     told = None
     for step in range(3):
         body = report(mission_id="silent", step=step, position=[500.0, 450.0 + 50 * step], outcome=told)
