@@ -71,7 +71,8 @@ def test_a_listener_gets_a_snapshot_and_then_what_changes(edge: Edge, report: Re
         assert len(whole["trajectories"]) == 3
         outcome = {"decision_id": first, "cost": 0.25, "failed": True, "round_trip_ms": 41.5}
         second = decided(client, report(step=1, outcome=outcome))
-        told, heard = [], []
+        told: list[str] = []
+        heard: list[Any] = []
         while not (told and heard):
             name, update = next(events)
             assert name == "update"

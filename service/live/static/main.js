@@ -178,7 +178,7 @@ function hear({ name, data }) {
 function soon() {
   if (drawing || paused) return;
   drawing = true;
-  // Once a second is calm enough to read, and nothing glides.
+  // Once a second is calm enough to read.
   if (calm.matches) setTimeout(draw, 1000);
   else requestAnimationFrame(draw);
 }
