@@ -20,7 +20,7 @@ from typing import Any
 import httpx
 import numpy as np
 import tyro
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import CDPSession, Page, sync_playwright
 from rich.console import Console
 
 from simulator.demo import HOST, usable_port
@@ -91,20 +91,20 @@ def fly(url: str, options: Smoothness, stop: threading.Event) -> None:
             step += 1
 
 
-def main_thread_s(page: Page) -> float:
+def main_thread_s(session: CDPSession) -> float:
     """Seconds that the page's main thread has computed, painting in software included; other jobs do not count."""
-    session = page.context.new_cdp_session(page)
-    session.send("Performance.enable", {"timeDomain": "threadTicks"})
     found = {one["name"]: float(one["value"]) for one in session.send("Performance.getMetrics")["metrics"]}
-    session.detach()
     return found["TaskDuration"]
 
 
 def told(name: str, page: Page, seconds: float) -> str:
     """Measure, and say it in a line."""
-    before = main_thread_s(page)
+    session = page.context.new_cdp_session(page)
+    session.send("Performance.enable", {"timeDomain": "threadTicks"})
+    before = main_thread_s(session)
     measured = page.evaluate(FRAMES, seconds)
-    busy = (main_thread_s(page) - before) / seconds
+    busy = (main_thread_s(session) - before) / seconds
+    session.detach()
     gaps = np.diff(measured["frames"])
     drawn = len(measured["drawn"]) / seconds
     p50, p95, p99 = np.percentile(gaps, (50, 95, 99))

@@ -96,7 +96,7 @@ function plotted(name, chart, data) {
   const plot = new uPlot({
     width: at(name).clientWidth, height: HEIGHT, series: [{ label: "step", value: (_, value) => shown(value, 0) }, ...series],
     scales: { x: { time: false }, y },
-    axes: [{ ...axis, label: "step", incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }, { ...axis, label: chart.unit, size: 48 }],
+    axes: [{ ...axis, label: "step", size: 34, incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000] }, { ...axis, label: chart.unit, size: 48 }],
     cursor: { drag: { x: false, y: false } },
   }, data, at(name));
   // What it shows stands in words above it.
