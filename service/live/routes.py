@@ -7,7 +7,6 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import aclosing
 from pathlib import Path
-from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse, StreamingResponse
@@ -15,10 +14,10 @@ from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
 from starlette.types import Message, Scope, Send
 
-from service.engine import Engine
 from service.guard import STILL_KNOWN
 from service.live.watch import Live
 from service.problems import NotFound, documented
+from service.routes import TheEngine
 from shared.wire import DecisionId, DecisionPrompt, MissionId, MissionLine, MissionList, Reason
 
 log = logging.getLogger(__name__)
@@ -82,14 +81,6 @@ class EventStream(StreamingResponse):
                         return
                     asked = time.monotonic()
                 yield event
-
-
-def _engine(request: Request) -> Engine:
-    engine: Engine = request.state.engine
-    return engine
-
-
-TheEngine = Annotated[Engine, Depends(_engine)]
 
 
 async def _placed(engine: TheEngine) -> AsyncIterator[None]:
