@@ -228,6 +228,7 @@ def test_the_page_asks_for_a_key_where_the_edge_does(visit: Open, start: Start, 
     page.keyboard.press("Enter")
     expect(asked).to_be_hidden()
     expect(asked).to_be_visible(timeout=15_000)
+    expect(asked).to_contain_text("The key that was given is not known here")
     asked.get_by_label("Key", exact=True).fill(reader)
     page.keyboard.press("Enter")
     expect(page.locator("#feed li")).to_have_count(1, timeout=15_000)

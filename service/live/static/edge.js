@@ -16,6 +16,9 @@ export class Refused extends Error {
 /** Keep a key for this tab. */
 export const useKey = (key) => sessionStorage.setItem(KEY, key);
 
+/** Whether a key is kept. */
+export const hasKey = () => sessionStorage.getItem(KEY) !== null;
+
 /** A JSON answer; throws `Refused`, or a TypeError where the edge is out of reach. */
 export async function ask(path, signal) {
   return (await get(path, signal)).json();

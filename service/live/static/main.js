@@ -3,7 +3,7 @@
 import { Charts } from "./charts.js";
 import { open } from "./decision.js";
 import { at, make, say, set } from "./dom.js";
-import { ask, events, Refused, useKey } from "./edge.js";
+import { ask, events, hasKey, Refused, useKey } from "./edge.js";
 import { Feed } from "./feed.js";
 import { MissionMap } from "./map.js";
 import { Mission } from "./model.js";
@@ -144,6 +144,7 @@ let asking = null;
 
 function askForKey() {
   asking ??= new Promise((resolve) => {
+    say(at("key-text"), `${hasKey() ? "The key that was given is not known here, or no longer. " : ""}Any key of the edge may read. It is kept in this tab until you close it.`);
     at("key").showModal();
     at("key").addEventListener("close", () => {
       if (at("key-input").value) useKey(at("key-input").value.trim());
