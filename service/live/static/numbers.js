@@ -18,7 +18,7 @@ export function showNumbers(mission) {
   const typical = times.length ? times[Math.floor(times.length / 2)] : null;
   const roundTrip = lately.length > 0 && lately.every((d) => measured(d) !== null || d.outcome === null) && lately.some((d) => measured(d) !== null);
   const by = [...sources].sort((a, b) => b[1] - a[1]).map(([source, n]) => `${n} ${SOURCES[source] ?? source}`).join(", ");
-  cell("Step", String(now.step), `of ${scenario.steps} from 0, ${scenario.step_s} s each`);
+  cell("Step", String(now.step), `mission of ${scenario.steps}, from 0, ${scenario.step_s} s each`);
   cell("Decisions", shown(now.made, 0), by || `mode ${mission.about.mode}`);
   cell(roundTrip ? "Round trip" : "Edge's time", typical === null ? "–" : `${shown(typical)} ms`,
     typical === null ? "no decision yet" : `median of the newest ${times.length}; slowest ${shown(times.at(-1))} ms`, "time");
