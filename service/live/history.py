@@ -15,6 +15,15 @@ _MOST = 600
 _MOST_CHARACTERS = 4_000_000
 
 
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """A prompt's text, without what it would be uncompressed: that is a state of up to 10,000 sensors."""
+
+    static: str
+    experiences: str
+    state: str
+
+
 @dataclass(slots=True)
 class Kept:
     """One decision: where its UAV was, m, what was asked, what was answered, and what came of it.
@@ -24,7 +33,7 @@ class Kept:
 
     mission_id: str
     position: tuple[float, float]
-    prompt: Prompt | None
+    prompt: Blocks | None
     answer: DecideResponse
     order: int = 0
     outcome: Outcome | None = None
@@ -51,9 +60,8 @@ class History:
 
     def drafted(self, mission_id: str, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
         """A decision was made; it is shown once it is answered."""
-        # The block as it would be uncompressed has a row for every sensor of 10,000.
-        prompt = Prompt(prompt.static, prompt.experiences, prompt.state, "")
-        kept = Kept(mission_id, position, prompt, answer)
+        blocks = Blocks(prompt.static, prompt.experiences, prompt.state)
+        kept = Kept(mission_id, position, blocks, answer)
         self._kept[answer.decision_id] = kept
         self._characters += kept.characters
         while len(self._kept) > _MOST:

@@ -23,8 +23,11 @@ from service.live.routes import STATIC
 from service.live.watch import MOST_LISTENERS
 from service.packing import pack
 from service.prompt import Prompt
+from service.rows import FORMATS
+from service.uncompressed import Uncompressed
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
+from tests.service.making import attended, mission, uav
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -278,18 +281,22 @@ def answer_of(decision_id: str, mission_id: str = "test") -> DecideResponse:
     )
 
 
+def prompt_of(state: str) -> Prompt:
+    return Prompt("static", "", state, Uncompressed(attended(mission(), uav()).state, FORMATS["csv"].row))
+
+
 def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
     history = History()
+    prompt = prompt_of("x" * 20_000)
     for number in range(2000):
         answer = answer_of(f"{number:032x}", f"m{number % 2}")
-        history.drafted(answer.mission_id, (0.0, 0.0), Prompt("static", "", "x" * 20_000, "y" * 20_000), answer)
+        history.drafted(answer.mission_id, (0.0, 0.0), prompt, answer)
         history.answered(answer)
     kept = history.of("m0") + history.of("m1")
     assert len(kept) == 600
     assert kept[-1].answer.decision_id == f"{1999:032x}"
     prompts = [one.prompt for one in kept if one.prompt is not None]
     assert 100 <= len(prompts) <= 200
-    assert not any(prompt.state_uncompressed for prompt in prompts)
     assert kept[-1].prompt is not None
     history.forget("m0")
     history.forget("m1")
@@ -299,7 +306,7 @@ def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
 def test_a_decision_is_shown_once_it_is_answered() -> None:
     history = History()
     answer = answer_of("a" * 32)
-    history.drafted("test", (1.0, 2.0), Prompt("", "", "", ""), answer)
+    history.drafted("test", (1.0, 2.0), prompt_of(""), answer)
     assert history.of("test") == []
     history.answered(answer)
     history.settled(Outcome(decision_id="a" * 32, cost=1.0))
