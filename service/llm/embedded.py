@@ -22,18 +22,22 @@ class EmbeddedServer:
 
     The server wants a key made at start, so that other users of the machine cannot spend its time.
 
+    Args:
+        context: tokens, which the slots share evenly.
+        slots: requests taken at once, each with a prefix cache of its own. With one, the static prefix and the
+            experiences are one prefix for the whole fleet.
+
     Raises:
         LoadFailed: llama.cpp could not load the file.
     """
 
-    def __init__(self, gguf: Path, *, threads: int, context: int) -> None:
+    def __init__(self, gguf: Path, *, threads: int, context: int, slots: int = 1) -> None:
         params = xllamacpp.CommonParams()
         params.model.path = str(gguf)
         params.cpuparams.n_threads = threads
         params.cpuparams_batch.n_threads = threads
         params.n_ctx = context
-        # One slot: the static prefix and the experiences are one prefix for the whole fleet.
-        params.n_parallel = 1
+        params.n_parallel = slots
         # llama.cpp notices a cancelled call between batches: large ones keep the next decision waiting for seconds.
         params.n_batch = params.n_ubatch = _BATCH
         params.cache_ram_mib = _PROMPT_CACHE_MIB

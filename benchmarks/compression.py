@@ -1,0 +1,82 @@
+"""What making a prompt shorter takes: a compressor of LLMLingua-2's size, and this project's attention.
+
+LLMLingua-2 (Pan et al. 2024, arXiv 2403.12968) keeps the tokens that an encoder classifies as worth keeping: that of
+XLM-RoBERTa large, or of multilingual BERT in its small version, over windows of 512 tokens. Its weights are not fetched
+here, and how long it takes does not depend on their values: these are encoders of the same sizes with random weights,
+without the table of embeddings, which takes no time to speak of. Half of the tokens are kept.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from service.attention import top_k
+from service.checkpoint import initial_modules
+from service.features import FEATURES
+from shared.scenario import Scenario
+
+WINDOW = 512
+KEPT = 0.5
+_LEVELS = 15
+_K = 5
+
+
+@dataclass(frozen=True)
+class Size:
+    """An encoder's."""
+
+    label: str
+    layers: int
+    width: int
+    heads: int
+    inner: int
+
+
+SMALL = Size("LLMLingua-2 small (multilingual BERT base)", 12, 768, 12, 3072)
+LARGE = Size("LLMLingua-2 (XLM-RoBERTa large)", 24, 1024, 16, 4096)
+# For tests: it shows nothing but that the benchmark runs.
+TINY = Size("tiny", 1, 64, 2, 128)
+
+
+class Compressor(nn.Module):
+    """Says of each token's embedding whether to keep it."""
+
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        layer = nn.TransformerEncoderLayer(size.width, size.heads, size.inner, activation="gelu", batch_first=True)
+        self._encoder = nn.TransformerEncoder(layer, size.layers, enable_nested_tensor=False)
+        self._keep = nn.Linear(size.width, 2)
+        self._width = size.width
+        self.eval()
+
+    @torch.inference_mode()
+    def window_s(self, tokens: int) -> float:
+        """Seconds to classify one window of so many tokens, and to choose half of them."""
+        embedded = torch.randn(1, tokens, self._width)
+        began = time.perf_counter()
+        keep = self._keep(self._encoder(embedded)).softmax(dim=-1)[0, :, 1]
+        torch.topk(keep, max(1, int(KEPT * tokens)))
+        return time.perf_counter() - began
+
+
+def windows(tokens: int) -> int:
+    """How many windows a prompt takes."""
+    return math.ceil(tokens / WINDOW)
+
+
+def attention_s(scenario: Scenario, repeats: int) -> list[float]:
+    """Seconds of scoring all J sensors by the edge's attention module and taking the best k, measured so often."""
+    modules = initial_modules("pretrained", "paper", _LEVELS, 0)
+    features = np.random.default_rng(0).random((scenario.sensors, FEATURES["paper"]), dtype=np.float32)
+    took = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        top_k(modules.score(features)[0], _K)
+        took.append(time.perf_counter() - began)
+    return took

@@ -1,0 +1,175 @@
+"""What an LLM would be asked in a mission, decision by decision, in several ways side by side.
+
+A policy on board flies. Beside it go the edge's own missions, one for each way of asking: they hear what the UAVs
+report, what is decided and what it costs, and make their prompts. So all prompts of one decision are about the same
+situation, and no LLM is needed to make them.
+"""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass
+from typing import Any
+
+from paper_template import EXPERIENCES, Newest, PaperTemplate
+
+from service.candidates import GuidedTemplate, Offer
+from service.critic import Situation
+from service.guided import offered
+from service.llm.client import chat_body, label_body
+from service.mission import Mission
+from service.prompt import Prompt
+from service.settings import Settings
+from service.view import View
+from shared.scenario import Scenario
+from shared.wire import MissionSpec, Outcome, PromptStyle
+from simulator.mission import Choice, LocalPilot, decide_request, fly
+from simulator.site import Site
+from simulator.world import Observation
+
+GUIDED, LLM, LLM_ALL, LLM_30, PAPER = "guided", "llm", "llm_no_attention", "llm_30", "paper"
+WAYS = {
+    GUIDED: "mode guided (default)",
+    LLM: "mode llm (default)",
+    LLM_ALL: "mode llm, attention off",
+    LLM_30: "mode llm, 30 experiences",
+    PAPER: "the paper's template",
+}
+_POLICY = "mpc"
+# The longest prompt of them, the paper's, with room to spare.
+CONTEXT = 8192
+
+
+@dataclass(frozen=True)
+class Put:
+    """One decision as it is put to an LLM in one way; ``offer`` in mode ``guided``, whose answer is a letter."""
+
+    prompt: Prompt
+    sensors: list[int]
+    offer: Offer | None = None
+
+    def body(self, velocities: int) -> dict[str, Any]:
+        """The request to the embedded LLM, as the edge would send it."""
+        static, user = self.prompt.static, self.prompt.user
+        if self.offer is not None:
+            return label_body(None, static, user, "grammar", [list(self.offer.labels)])
+        return chat_body(None, static, user, "grammar", self.sensors, velocities)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One decision: the ways of putting it, by name, and the situation for a critic to judge answers by."""
+
+    seed: int
+    step: int
+    uav: int
+    ways: dict[str, Put]
+    situation: Situation
+
+
+@dataclass(frozen=True)
+class Together:
+    """One step of the fleet as mode ``guided`` puts it in one call."""
+
+    step: int
+    prompt: Prompt
+    lists: list[list[str]]
+
+    def body(self) -> dict[str, Any]:
+        """The request to the embedded LLM, as the edge would send it."""
+        return label_body(None, self.prompt.static, self.prompt.user, "grammar", self.lists)
+
+
+class Scribe(LocalPilot):
+    """Flies by a planner on board and writes down how each decision would be put to an LLM.
+
+    ``asked`` has the decisions that every way would have asked about, ``together`` the fleet's whole steps.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, policy: str = _POLICY) -> None:
+        super().__init__(policy, scenario, seed)
+        self._seed = seed
+        self._missions = missions(scenario, seed)
+        self._owed: dict[int, Outcome] = {}
+        self._decided: dict[int, str] = {}
+        self._step: dict[int, tuple[Offer, View]] = {}
+        self.asked: list[Asked] = []
+        self.together: list[Together] = []
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The policy's choice."""
+        choice = super().decide(uav, observation, taken)
+        step = int(observation["step"][0])
+        self._decided[uav] = name = uuid.uuid4().hex
+        request = decide_request(uav, observation, "flown", outcome=self._owed.pop(uav, None))
+        ways: dict[str, Put] = {}
+        situation: Situation | None = None
+        for way, mission in self._missions.items():
+            if request.outcome is not None:
+                mission.apply(request.outcome)
+            attempt = mission.observe(request, step)
+            view = View.of(mission, request, step)
+            view.attend(mission)
+            if view.rows:
+                ways[way] = self._put(mission, view)
+            if way == GUIDED:
+                reserved = mission.reserved(step, uav)
+                situation = Situation.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
+            mission.commit(view.pending(mission, name, choice.sensor, choice.velocity), attempt)
+        if situation is not None and len(ways) == len(self._missions):
+            self.asked.append(Asked(self._seed, step, uav, ways, situation))
+        return choice
+
+    def _put(self, mission: Mission, view: View) -> Put:
+        shown, nearest = view.shown(mission), view.nearest(mission)
+        if not isinstance(mission.template, GuidedTemplate):
+            return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.offered)
+        offer = offered(mission, view)
+        self._note(mission, mission.template, view, offer)
+        return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.offered, offer)
+
+    def _note(self, mission: Mission, template: GuidedTemplate, view: View, offer: Offer) -> None:
+        self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
+        self._step[view.uav_id] = offer, view
+        if len(self._step) == mission.scenario.uavs:
+            shares = template.together({u: (o, v.state) for u, (o, v) in self._step.items()}, mission.experiences)
+            first = next(iter(shares.values()))
+            state = "".join(share.state for share in shares.values())
+            whole = Prompt(template.static_together, first.experiences, state, state)
+            self.together.append(Together(view.step, whole, [list(o.labels) for o, _ in self._step.values()]))
+
+    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+        """Keep the outcome for this UAV's next request."""
+        self._owed[uav] = Outcome(decision_id=self._decided[uav], cost=cost, failed=failed)
+
+
+def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
+    """The edge's mission for each of ``WAYS``, with the settings that it has by default."""
+    settings = Settings(llm_context=CONTEXT)
+    many = PromptStyle(experiences=EXPERIENCES)
+
+    def made(name: str, **spec: Any) -> Mission:
+        return Mission(name, MissionSpec(scenario=scenario, seed=seed, planner="off", **spec), settings)
+
+    found = {
+        GUIDED: made(GUIDED, mode="guided"),
+        LLM: made(LLM, mode="llm"),
+        LLM_ALL: made(LLM_ALL, mode="llm", attention="off"),
+        LLM_30: made(LLM_30, mode="llm", prompt=many),
+        PAPER: made(PAPER, mode="llm", attention="off", prompt=many),
+    }
+    as_the_paper(found[PAPER])
+    return found
+
+
+def as_the_paper(mission: Mission) -> None:
+    """Have a mission put its decisions as the paper does."""
+    mission.template = PaperTemplate(mission.scenario)
+    mission.memory = Newest(EXPERIENCES, uavs=mission.scenario.uavs)
+
+
+def flown(scenario: Scenario, seed: int, policy: str = _POLICY) -> Scribe:
+    """One mission, flown and written down."""
+    scribe = Scribe(scenario, seed, policy)
+    fly(Site(scenario), scribe, seed)
+    return scribe

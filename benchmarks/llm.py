@@ -1,0 +1,273 @@
+"""The embedded LLM's time to a decision: with and without its prefix cache, threads, neighbours, and UAVs at once.
+
+    python benchmarks/llm.py
+    python benchmarks/llm.py --rounds 15    # narrower intervals
+
+The prompts are a mission's own, in their order, as modes `guided` (scoring: one forward pass, whose answer is the
+probabilities of single-token labels) and `llm` (generating: a sensor and a velocity under a grammar) would send them.
+In every round each server is asked once in each condition: nothing or a busy process on every other core, llama.cpp
+with one thread and with two. `cold` reads the whole prompt, `cached` what is new since the decision before, `first` is
+the first question to a server just started. Then the fleet's decisions of one step are asked for in four ways. Times
+are from request to answer; ratios are of medians, with 95% bootstrap intervals over rounds. The processor's seconds
+are this process's, which what else the machine does changes least.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from flown_prompts import GUIDED, LLM, Asked, Scribe, Together, flown
+from local_llm import Answered, LocalLLM
+from ratios import ratio_of_medians, shown
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from service.settings import Settings, usable_cores
+from shared.scenario import Scenario, scenario_named
+
+THREADS = (1, 2)
+# Of a mission's decisions, those from here on: the block of experiences is full.
+_FIRST = 24
+_NEIGHBOUR = "while True: pass"
+QUIET, BUSY = "quiet", "busy"
+ROW, CALL, QUEUE, SLOTS = "one after the other", "one call about all", "at once, one slot", "at once, a slot each"
+
+
+@dataclass(frozen=True)
+class Llm:
+    """Ask the embedded LLM and take the time."""
+
+    rounds: int = 5
+    """Decisions in each condition, and steps of the fleet."""
+    seed: int = 0
+    """Of the mission whose prompts are asked."""
+    policy: Literal["mpc", "eof"] = "mpc"
+    """Who flies it: the planner, or the rule that is faster to compute."""
+    limit_s: float = 20.0
+    """Seconds after which an answer is waited for no longer; it then counts as this long."""
+    out: Path = Path("runs/llm.json")
+    """Where to write the figures."""
+
+
+@dataclass
+class Line:
+    """One server and the mission's decisions that it is asked, each once, in their order."""
+
+    way: str
+    llm: LocalLLM
+    decisions: Iterator[Asked]
+    levels: int
+    limit_s: float
+    cold: list[Answered] = field(default_factory=list)
+
+    def ask(self) -> Answered:
+        """The next decision, as the edge would ask."""
+        self._body = next(self.decisions).ways[self.way].body(self.levels)
+        return self.llm.ask(self._body, self.limit_s)
+
+    def ask_cold(self) -> Answered:
+        """The last decision again, the whole prompt read anew."""
+        return self.llm.ask(self._body, self.limit_s, cache_prompt=False)
+
+
+def main(args: Llm) -> int:
+    """Fly, ask, print, write."""
+    torch.set_num_threads(1)
+    console, scenario = Console(), scenario_named("paper")
+    scribe = flown(scenario, args.seed, args.policy)
+    alone = decisions(scribe, scenario, args, console)
+    fleet = fleets(scribe, scenario, args, console)
+    found = {
+        "command": sys.argv,
+        "cores": usable_cores(),
+        "rounds": args.rounds,
+        "limit_s": args.limit_s,
+        **alone,
+        "fleet": fleet,
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    tell(found, console)
+    console.print(f"Wrote {args.out}")
+    return 0
+
+
+Times = dict[str, list[Answered]]
+
+
+def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
+    """One UAV's decisions in every condition: ``<way> <cold|cached> <threads> <quiet|busy>``."""
+    asked = scribe.asked[_FIRST:]
+    if len(asked) < 2 * args.rounds:
+        raise SystemExit(f"--rounds: the mission has decisions for {len(asked) // 2} at most")
+    times: Times = {}
+    with ExitStack() as stack:
+        lines = {
+            (way, threads): Line(
+                way,
+                stack.enter_context(LocalLLM(threads, Settings().llm_context)),
+                iter(asked),
+                scenario.max_velocity + 1,
+                args.limit_s,
+            )
+            for threads in THREADS
+            for way in (GUIDED, LLM)
+        }
+        loads = [line.llm.load_s for line in lines.values()]
+        for line in lines.values():
+            # What a server without anything in its cache does first.
+            times.setdefault(f"{line.way} first", []).append(line.ask())
+        for _ in track(range(args.rounds), "Asking", console=console):
+            for load in (QUIET, BUSY):
+                with neighbours(load):
+                    for (way, threads), line in lines.items():
+                        times.setdefault(f"{way} cached {threads} {load}", []).append(line.ask())
+                        if load == QUIET:
+                            times.setdefault(f"{way} cold {threads} {load}", []).append(line.ask_cold())
+    return {"load_s_median": statistics.median(loads), "times": summed(times), "ratios": ratios(times)}
+
+
+@contextmanager
+def neighbours(load: str) -> Iterator[None]:
+    """While it lasts a process spins on every core but one; none where it is to be quiet."""
+    command = [sys.executable, "-c", _NEIGHBOUR]
+    spinning = [subprocess.Popen(command) for _ in range(max(1, usable_cores() - 1) if load == BUSY else 0)]
+    try:
+        if spinning:
+            time.sleep(0.2)
+        yield
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+
+
+def summed(times: Times) -> dict[str, dict[str, float]]:
+    """Medians, and the tokens read anew."""
+    return {
+        name: {
+            "seconds_median": statistics.median(one.seconds for one in told),
+            "first_token_s_median": statistics.median(one.first_s for one in told),
+            "cpu_s_median": statistics.median(one.cpu_s for one in told),
+            "new_mean": statistics.fmean(one.new for one in told),
+            "written_mean": statistics.fmean(one.written for one in told),
+            "late": sum(one.late for one in told),
+        }
+        for name, told in times.items()
+    }
+
+
+def ratios(times: Times) -> dict[str, list[float]]:
+    """What was asked side by side, as ratios."""
+
+    def of(ours: str, theirs: str) -> list[float]:
+        return ratio_of_medians([one.seconds for one in times[ours]], [one.seconds for one in times[theirs]])
+
+    found = {}
+    for n in THREADS:
+        for way in (GUIDED, LLM):
+            found[f"{way}, {n} threads: cached / cold"] = of(f"{way} cached {n} quiet", f"{way} cold {n} quiet")
+            found[f"{way}, {n} threads: busy / quiet"] = of(f"{way} cached {n} busy", f"{way} cached {n} quiet")
+        found[f"{n} threads: scoring / generating"] = of(f"{GUIDED} cached {n} quiet", f"{LLM} cached {n} quiet")
+        generated = times[f"{LLM} cached {n} quiet"]
+        found[f"{n} threads: first token / all, generating"] = ratio_of_medians(
+            [one.first_s for one in generated], [one.seconds for one in generated]
+        )
+    for load in (QUIET, BUSY):
+        found[f"scoring, {load}: 2 threads / 1"] = of(f"{GUIDED} cached 2 {load}", f"{GUIDED} cached 1 {load}")
+    found["scoring, cold: 2 threads / 1"] = of(f"{GUIDED} cold 2 quiet", f"{GUIDED} cold 1 quiet")
+    return found
+
+
+def fleets(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
+    """The decisions of all UAVs of a step, in mode ``guided``, by the default number of threads: seconds to the last.
+
+    Each way has a server of its own, so that each finds the step before in its cache.
+    """
+    steps = whole_steps(scribe, scenario)[-args.rounds - 1 :]
+    threads, uavs = Settings().embedded_threads, scenario.uavs
+    seconds: dict[str, list[float]] = {}
+    cpu: dict[str, list[float]] = {}
+    new: dict[str, list[int]] = {}
+    with ExitStack() as stack, ThreadPoolExecutor(uavs) as pool:
+        context = Settings().llm_context
+        models = {
+            name: stack.enter_context(LocalLLM(threads, context, slots=uavs if name == SLOTS else 1))
+            for name in (ROW, CALL, QUEUE, SLOTS)
+        }
+
+        def asked(name: str, bodies: list[dict[str, Any]], together: Together) -> list[Answered]:
+            llm = models[name]
+            if name == CALL:
+                return [llm.ask(together.body(), args.limit_s)]
+            if name == ROW:
+                return [llm.ask(body, args.limit_s) for body in bodies]
+            slots = range(uavs) if name == SLOTS else [0] * uavs
+            one: Callable[..., Answered] = llm.ask
+            return list(pool.map(lambda body, slot: one(body, args.limit_s, id_slot=slot), bodies, slots))
+
+        for number, (bodies, together) in enumerate(track(steps, "Asking for the fleet", console=console)):
+            for name in models:
+                began, cpu_began = time.perf_counter(), time.process_time()
+                answers = asked(name, bodies, together)
+                took, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
+                # The first step finds nothing in the cache.
+                if number:
+                    seconds.setdefault(name, []).append(took)
+                    cpu.setdefault(name, []).append(cpu_s)
+                    new.setdefault(name, []).append(sum(one.new for one in answers))
+    return {
+        name: {
+            "seconds_median": statistics.median(took),
+            "cpu_s_median": statistics.median(cpu[name]),
+            "new_mean": statistics.fmean(new[name]),
+            "to_one_after_the_other": ratio_of_medians(took, seconds[ROW]),
+        }
+        for name, took in seconds.items()
+    }
+
+
+def whole_steps(scribe: Scribe, scenario: Scenario) -> list[tuple[list[dict[str, Any]], Together]]:
+    """The steps in which every UAV asks: each one's request, and the one about all."""
+    levels = scenario.max_velocity + 1
+    found = []
+    for together in scribe.together:
+        bodies = [asked.ways[GUIDED].body(levels) for asked in scribe.asked if asked.step == together.step]
+        if len(bodies) == scenario.uavs:
+            found.append((bodies, together))
+    return found
+
+
+def tell(found: dict[str, Any], console: Console) -> None:
+    """The figures, for people."""
+    table = Table("", "s", "first token", "processor", "anew", "written", "late", title="Time to a decision, medians")
+    for name, row in found["times"].items():
+        seconds = [f"{row[column]:.3f}" for column in ("seconds_median", "first_token_s_median", "cpu_s_median")]
+        table.add_row(name, *seconds, f"{row['new_mean']:.0f}", f"{row['written_mean']:.1f}", f"{row['late']:.0f}")
+    console.print(table)
+    for name, ratio in found["ratios"].items():
+        console.print(f"{name}: {shown(ratio)}", highlight=False)
+    fleet = Table("", "s", "processor", "anew", "to one after the other", title="A fleet's step, mode guided")
+    for name, row in found["fleet"].items():
+        ratio = shown(row["to_one_after_the_other"])
+        fleet.add_row(
+            name, f"{row['seconds_median']:.3f}", f"{row['cpu_s_median']:.3f}", f"{row['new_mean']:.0f}", ratio
+        )
+    console.print(fleet)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Llm, description=__doc__)))

@@ -1,0 +1,326 @@
+"""Tokens a decision against the paper's own template, what they cost in time and quality, and what a compressor would.
+
+    python benchmarks/tokens.py
+    python benchmarks/tokens.py --asked 12 --seeds 10    # more decisions put to the LLM: narrower intervals
+
+Flies missions by a planner and puts every decision to an LLM in several ways: as the edge does in its modes, and as the
+paper does, with all sensors in words and 30 experiences (`paper_template.py` says how far that is known). Counts whole
+prompts in tiktoken's o200k_base and in the embedded model's own tokens, and those read anew where a server keeps the
+prompt before. Some decisions from the middle of each mission are put to the embedded model: time, what its server says
+of its cache, and the answers, which the edge's critic judges. Last, whether a compressor of LLMLingua-2's size pays.
+Intervals are 95% bootstrap intervals over missions (tokens), decisions (quality) or pairs (times).
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from compression import KEPT, LARGE, SMALL, TINY, WINDOW, Compressor, Size, attention_s, windows
+from flown_prompts import CONTEXT, GUIDED, LLM, LLM_ALL, PAPER, WAYS, Asked, flown
+from local_llm import Answered, LocalLLM
+from paper_template import STATED_STATE_TOKENS
+from ratios import ratio_of_medians, shown
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from service.critic import Action, judge
+from service.llm.answer import NoDecision, check_answer
+from service.settings import Settings
+from service.tokens import TokenCounter
+from shared.scenario import Scenario, scenario_named
+from simulator.experiments.intervals import interval, paired
+
+GOAL_PROMPT, GOAL_NEW = 0.5, 0.15
+# Ways whose answers are judged: each answers with a sensor and a velocity, or with a letter for both.
+JUDGED = (GUIDED, LLM, PAPER)
+_DRAWN = "drawn"
+# Prefill speeds for which it is reckoned whether compression pays, tokens a second.
+SPEEDS = (50, 200, 1_000, 10_000)
+_COUNTS = ("o200k", "own", "new")
+# By o200k_base: the whole prompt and its blocks, as the edge's token accounting calls them.
+_BLOCKS = {"o200k": "prompt", "o200k_static": "static", "o200k_experiences": "experiences", "o200k_state": "state"}
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """Count tokens, time them, and compare with the paper's template."""
+
+    seeds: int = 5
+    """Missions: seeds 0 to N - 1."""
+    asked: int = 2
+    """Decisions of each mission's middle that are put to the embedded LLM, after one more that fills its cache."""
+    policy: Literal["mpc", "eof"] = "mpc"
+    """Who flies: the planner, or the rule that is faster to compute."""
+    scenario: str = "paper"
+    """Their scenario."""
+    steps: int | None = None
+    """Of each mission; unset: the scenario's."""
+    threads: int = 1
+    """Of the embedded LLM and of the compressor alike."""
+    encoders: Literal["real", "tiny"] = "real"
+    """Sizes of the compressors; `tiny` only shows that the benchmark runs."""
+    repeats: int = 3
+    """Times that a compressor reads a window."""
+    out: Path = Path("runs/tokens.json")
+    """Where to write the figures."""
+
+
+def main(args: Tokens) -> int:
+    """Fly, count, ask, compress; print and write."""
+    torch.set_num_threads(args.threads)
+    console, scenario = Console(), scenario_named(args.scenario)
+    if args.steps is not None:
+        scenario = scenario.model_copy(update={"steps": args.steps})
+    flights = [flown(scenario, seed, args.policy).asked for seed in track(range(args.seeds), "Flying", console=console)]
+    with LocalLLM(args.threads, CONTEXT) as llm:
+        counts = counted(flights, llm, console)
+        name = llm.name
+    answers = put(flights, scenario, args, console)
+    found: dict[str, Any] = {
+        "command": sys.argv,
+        "options": {**asdict(args), "out": str(args.out)},
+        "model": name,
+        "decisions": [len(flight) for flight in flights],
+        "tokens": token_figures(counts),
+        "state_tokens_stated_by_the_paper": STATED_STATE_TOKENS,
+        "asked": asked_figures(answers, scenario),
+        "goal": {"prompt": GOAL_PROMPT, "new": GOAL_NEW},
+    }
+    found["compression"] = compression_figures(found, flights[-1][-1], scenario, args, console)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    tell(found, console)
+    console.print(f"Wrote {args.out}")
+    return 0
+
+
+def counted(flights: Sequence[Sequence[Asked]], llm: LocalLLM, console: Console) -> dict[str, dict[str, list[float]]]:
+    """By way and count one mean a mission: tokens by o200k_base, by the model, and those not in the prompt before."""
+    counter = TokenCounter(Settings().cache_dir)
+    means: dict[str, dict[str, list[float]]] = {way: {count: [] for count in (*_COUNTS, *_BLOCKS)} for way in WAYS}
+    for flight in track(flights, "Counting", console=console):
+        for way in WAYS:
+            prompts = [asked.ways[way].prompt for asked in flight]
+            own = [llm.tokens(prompt) for prompt in prompts]
+            new = [anew(now, before) for now, before in zip(own, [[], *own], strict=False)]
+            accounts = [counter.account(prompt) for prompt in prompts]
+            for count, name in _BLOCKS.items():
+                means[way][count].append(statistics.fmean(getattr(account, name) for account in accounts))
+            means[way]["own"].append(statistics.fmean(map(len, own)))
+            means[way]["new"].append(statistics.fmean(new))
+    return means
+
+
+def anew(now: Sequence[int], before: Sequence[int]) -> int:
+    """Tokens that a server reads which kept the prompt before; the last one always."""
+    same = next((i for i, (a, b) in enumerate(zip(now, before, strict=False)) if a != b), min(len(now), len(before)))
+    return len(now) - min(same, len(now) - 1)
+
+
+def token_figures(counts: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
+    """Means and ratios to the paper's, by way; ``new_to_whole`` is to the paper's without any prefix cache."""
+    theirs = counts[PAPER]
+    found: dict[str, Any] = {}
+    for way, ours in counts.items():
+        found[way] = {count: interval(values).model_dump(exclude={"values"}) for count, values in ours.items()}
+        found[way]["ratio"] = {
+            **{count: _ratio(ours[count], theirs[count]) for count in _COUNTS},
+            "new_to_whole": _ratio(ours["new"], theirs["own"]),
+        }
+    return found
+
+
+def _ratio(ours: Sequence[float], theirs: Sequence[float]) -> list[float]:
+    of_means = next(pair for pair in paired("ours", "theirs", "tokens", ours, theirs) if pair.kind == "ratio")
+    return [of_means.mean, of_means.low, of_means.high]
+
+
+@dataclass(frozen=True)
+class Told:
+    """One answer to one way of putting a decision; ``reckoned``: the tokens that were to be read anew.
+
+    That is None for the first of each mission, which finds another mission's prompt in the cache.
+    """
+
+    asked: Asked
+    answered: Answered
+    reckoned: int | None
+
+
+def put(
+    flights: Sequence[Sequence[Asked]], scenario: Scenario, args: Tokens, console: Console
+) -> dict[str, list[Told]]:
+    """Decisions put to the embedded LLM in each of ``JUDGED``, side by side, each with a server of its own."""
+    middles = [(i > 0, asked) for flight in flights for i, asked in enumerate(middle(flight, args.asked + 1))]
+    answers: dict[str, list[Told]] = {way: [] for way in JUDGED}
+    before: dict[str, list[int]] = {}
+    with ExitStack() as stack:
+        models = {way: stack.enter_context(LocalLLM(args.threads, CONTEXT)) for way in JUDGED}
+        for warm, asked in track(middles, "Asking", console=console):
+            for way, llm in models.items():
+                now = llm.tokens(asked.ways[way].prompt)
+                answered = llm.ask(asked.ways[way].body(scenario.max_velocity + 1))
+                answers[way].append(Told(asked, answered, anew(now, before[way]) if warm else None))
+                before[way] = now
+    return answers
+
+
+def middle(flight: Sequence[Asked], count: int) -> Sequence[Asked]:
+    """So many decisions in a row, from the middle on, when there are 30 experiences; fewer where there are fewer."""
+    return flight[len(flight) // 2 :][:count]
+
+
+def asked_figures(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, Any]:
+    """What was measured of the decisions that were put to the LLM: time, tokens read anew, expected losses."""
+    lost = judged(answers, scenario)
+    warm = {way: [one for one in told if one.reckoned is not None] for way, told in answers.items()}
+    paper_s = [one.answered.seconds for one in warm[PAPER]]
+    found: dict[str, Any] = {"decisions": len(answers[PAPER]), "lost_packets_above_best": {}, "compared": []}
+    for way, told in warm.items():
+        found[way] = {
+            "seconds_median": statistics.median(one.answered.seconds for one in told),
+            "to_paper_seconds": ratio_of_medians([one.answered.seconds for one in told], paper_s),
+            "new_mean": statistics.fmean(one.answered.new for one in told),
+            "new_as_reckoned": sum(one.answered.new == one.reckoned for one in told) / len(told),
+            "late": sum(one.answered.late for one in told),
+        }
+    for way, values in lost.items():
+        found["lost_packets_above_best"][way] = interval(values).model_dump(exclude={"values"})
+        if way != PAPER:
+            found["compared"] += [pair.model_dump() for pair in paired(way, PAPER, "lost", values, lost[PAPER])]
+    return found
+
+
+def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list[float]]:
+    """Packets that the fleet is expected to lose after each answer above the best one, and after uniform draws.
+
+    Judged are all sensors that may be named at all velocities. An answer that is none loses what a draw would.
+    """
+    lost: dict[str, list[float]] = {way: [] for way in (*answers, _DRAWN)}
+    for rows in zip(*answers.values(), strict=True):
+        asked = rows[0].asked
+        levels = scenario.max_velocity + 1
+        actions = [(sensor, v) for sensor in asked.ways[PAPER].sensors for v in range(levels)]
+        said = {way: action(way, asked, one.answered, levels) for way, one in zip(answers, rows, strict=True)}
+        judgement = judge(asked.situation, [*actions, *(one for one in said.values() if one is not None)])
+        best, drawn = judgement.lost.min(), judgement.lost[: len(actions)].mean()
+        told = iter(judgement.lost[len(actions) :].tolist())
+        for way, one in said.items():
+            lost[way].append(float((drawn if one is None else next(told)) - best))
+        lost[_DRAWN].append(float(drawn - best))
+    return lost
+
+
+def action(way: str, asked: Asked, answered: Answered, levels: int) -> Action | None:
+    """The sensor and velocity that an answer means."""
+    put = asked.ways[way]
+    if put.offer is not None:
+        return put.offer.actions[put.offer.labels[answered.text]] if answered.text in put.offer.labels else None
+    try:
+        return check_answer(answered.text, put.sensors, levels)
+    except NoDecision:
+        return None
+
+
+def compression_figures(
+    found: dict[str, Any], last: Asked, scenario: Scenario, args: Tokens, console: Console
+) -> dict[str, Any]:
+    """Seconds to compress beside seconds of reading, and the prefill speed at which compression would pay.
+
+    An encoder's time is measured on one window; that of a prompt is reckoned from it, evenly.
+    """
+    prompt = found["tokens"][PAPER]["own"]["mean"]
+    sizes: Sequence[Size] = (SMALL, LARGE) if args.encoders == "real" else (TINY,)
+    encoders = {size.label: Compressor(size) for size in sizes}
+    window: dict[str, list[float]] = {label: [] for label in encoders}
+    read_s: list[float] = []
+    body = last.ways[PAPER].body(scenario.max_velocity + 1)
+    body["messages"] = [body["messages"][0], {"role": "user", "content": "Current state: none"}]
+    with LocalLLM(args.threads, CONTEXT) as llm:
+        for _ in track(range(args.repeats), "Compressing", console=console):
+            for label, encoder in encoders.items():
+                window[label].append(encoder.window_s(WINDOW))
+            answered = llm.ask(body, cache_prompt=False, max_tokens=1)
+            read_s.append(answered.seconds / max(1, answered.new))
+    speed = 1 / statistics.median(read_s)
+    attention = attention_s(scenario, 200)
+    saved = found["tokens"][LLM_ALL]["new"]["mean"] - found["tokens"][LLM]["new"]["mean"]
+    attention_speed = saved / statistics.median(attention)
+    return {
+        "kept": KEPT,
+        "prompt_tokens": prompt,
+        "windows": windows(round(prompt)),
+        "embedded_prefill_tokens_per_s": speed,
+        "compressors": {
+            label: {
+                "window_s_median": statistics.median(took),
+                "prompt_s_reckoned": statistics.median(took) * prompt / WINDOW,
+                "saved_s_embedded_reckoned": prompt * (1 - KEPT) / speed,
+                "spent_to_saved_embedded": ratio_of_medians(took, [s * WINDOW * (1 - KEPT) for s in read_s]),
+                "spent_to_saved_at_speed_reckoned": {
+                    str(at): statistics.median(took) / WINDOW * at / (1 - KEPT) for at in SPEEDS
+                },
+                "pays_below_tokens_per_s": WINDOW * (1 - KEPT) / statistics.median(took),
+            }
+            for label, took in window.items()
+        },
+        "attention": {
+            "ms_median": statistics.median(attention) * 1e3,
+            "ms_p99": float(np.quantile(attention, 0.99)) * 1e3,
+            "tokens_saved": saved,
+            "pays_below_tokens_per_s": attention_speed,
+        },
+    }
+
+
+def tell(found: dict[str, Any], console: Console) -> None:
+    """The figures, for people."""
+    table = Table(
+        "", "o200k", "own", "read anew", "to paper's: whole", "read anew", "to its whole", title="Tokens a decision"
+    )
+    for way, label in WAYS.items():
+        row = found["tokens"][way]
+        means = [f"{row[count]['mean']:.0f}" for count in _COUNTS]
+        ratios = [shown(row["ratio"][name]) for name in ("own", "new", "new_to_whole")]
+        table.add_row(label, *means, *ratios)
+    console.print(table)
+    told = found["asked"]
+    for way in JUDGED:
+        one, lost = told[way], told["lost_packets_above_best"][way]
+        console.print(
+            f"{WAYS[way]}: {one['seconds_median']:.2f} s, {shown(one['to_paper_seconds'])} times the paper's; "
+            f"expected to lose {lost['mean']:.2f} [{lost['low']:.2f}, {lost['high']:.2f}] packets above the best",
+            highlight=False,
+        )
+    drawn = told["lost_packets_above_best"][_DRAWN]
+    console.print(f"drawn uniformly: {drawn['mean']:.2f} [{drawn['low']:.2f}, {drawn['high']:.2f}]", highlight=False)
+    for pair in told["compared"]:
+        console.print(f"{pair['scheme']} - paper, {pair['kind']}: {shown([pair['mean'], pair['low'], pair['high']])}")
+    for label, one in found["compression"]["compressors"].items():
+        console.print(
+            f"{label}: {shown(one['spent_to_saved_embedded'])} times what halving saves the embedded LLM; "
+            f"pays below {one['pays_below_tokens_per_s']:.0f} tokens/s",
+            highlight=False,
+        )
+    attention = found["compression"]["attention"]
+    console.print(
+        f"attention: {attention['ms_median']:.3f} ms for {attention['tokens_saved']:.1f} tokens; pays below "
+        f"{attention['pays_below_tokens_per_s']:.0f} tokens/s (embedded: "
+        f"{found['compression']['embedded_prefill_tokens_per_s']:.0f})",
+        highlight=False,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Tokens, description=__doc__)))
