@@ -19,7 +19,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -38,9 +38,6 @@ from rich.table import Table
 from service.settings import Settings, usable_cores
 from shared.scenario import Scenario, scenario_named
 
-THREADS = (1, 2)
-# Of a mission's decisions, those from here on: the block of experiences is full.
-_FIRST = 24
 _NEIGHBOUR = "while True: pass"
 QUIET, BUSY = "quiet", "busy"
 ROW, CALL, QUEUE, SLOTS = "one after the other", "one call about all", "at once, one slot", "at once, a slot each"
@@ -52,8 +49,12 @@ class Llm:
 
     rounds: int = 5
     """Decisions in each condition, and steps of the fleet."""
+    threads: tuple[int, ...] = (1, 2)
+    """Of llama.cpp."""
     seed: int = 0
     """Of the mission whose prompts are asked."""
+    steps: int | None = None
+    """Of that mission; unset: the scenario's."""
     policy: Literal["mpc", "eof"] = "mpc"
     """Who flies it: the planner, or the rule that is faster to compute."""
     limit_s: float = 20.0
@@ -87,6 +88,8 @@ def main(args: Llm) -> int:
     """Fly, ask, print, write."""
     torch.set_num_threads(1)
     console, scenario = Console(), scenario_named("paper")
+    if args.steps is not None:
+        scenario = scenario.model_copy(update={"steps": args.steps})
     scribe = flown(scenario, args.seed, args.policy)
     alone = decisions(scribe, scenario, args, console)
     fleet = fleets(scribe, scenario, args, console)
@@ -110,9 +113,10 @@ Times = dict[str, list[Answered]]
 
 def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
     """One UAV's decisions in every condition: ``<way> <cold|cached> <threads> <quiet|busy>``."""
-    asked = scribe.asked[_FIRST:]
-    if len(asked) < 2 * args.rounds:
-        raise SystemExit(f"--rounds: the mission has decisions for {len(asked) // 2} at most")
+    # From here on the block of experiences is full.
+    asked = scribe.asked[len(scribe.asked) // 3 :]
+    if len(asked) < 2 * args.rounds + 1:
+        raise SystemExit(f"--rounds: the mission has decisions for {(len(asked) - 1) // 2} at most")
     times: Times = {}
     with ExitStack() as stack:
         lines = {
@@ -123,7 +127,7 @@ def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -
                 scenario.max_velocity + 1,
                 args.limit_s,
             )
-            for threads in THREADS
+            for threads in args.threads
             for way in (GUIDED, LLM)
         }
         loads = [line.llm.load_s for line in lines.values()]
@@ -137,7 +141,7 @@ def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -
                         times.setdefault(f"{way} cached {threads} {load}", []).append(line.ask())
                         if load == QUIET:
                             times.setdefault(f"{way} cold {threads} {load}", []).append(line.ask_cold())
-    return {"load_s_median": statistics.median(loads), "times": summed(times), "ratios": ratios(times)}
+    return {"load_s_median": statistics.median(loads), "times": summed(times), "ratios": ratios(times, args.threads)}
 
 
 @contextmanager
@@ -170,14 +174,14 @@ def summed(times: Times) -> dict[str, dict[str, float]]:
     }
 
 
-def ratios(times: Times) -> dict[str, list[float]]:
+def ratios(times: Times, threads: Sequence[int]) -> dict[str, list[float]]:
     """What was asked side by side, as ratios."""
 
     def of(ours: str, theirs: str) -> list[float]:
         return ratio_of_medians([one.seconds for one in times[ours]], [one.seconds for one in times[theirs]])
 
     found = {}
-    for n in THREADS:
+    for n in threads:
         for way in (GUIDED, LLM):
             found[f"{way}, {n} threads: cached / cold"] = of(f"{way} cached {n} quiet", f"{way} cold {n} quiet")
             found[f"{way}, {n} threads: busy / quiet"] = of(f"{way} cached {n} busy", f"{way} cached {n} quiet")
@@ -186,9 +190,12 @@ def ratios(times: Times) -> dict[str, list[float]]:
         found[f"{n} threads: first token / all, generating"] = ratio_of_medians(
             [one.first_s for one in generated], [one.seconds for one in generated]
         )
-    for load in (QUIET, BUSY):
-        found[f"scoring, {load}: 2 threads / 1"] = of(f"{GUIDED} cached 2 {load}", f"{GUIDED} cached 1 {load}")
-    found["scoring, cold: 2 threads / 1"] = of(f"{GUIDED} cold 2 quiet", f"{GUIDED} cold 1 quiet")
+    fewest, *more = threads
+    for n in more:
+        for kind in (f"cached {QUIET}", f"cached {BUSY}", f"cold {QUIET}"):
+            read, load = kind.split()
+            named = f"scoring, {kind}: {n} threads / {fewest}"
+            found[named] = of(f"{GUIDED} {read} {n} {load}", f"{GUIDED} {read} {fewest} {load}")
     return found
 
 

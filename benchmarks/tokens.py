@@ -1,7 +1,7 @@
 """Tokens a decision against the paper's own template, what they cost in time and quality, and what a compressor would.
 
     python benchmarks/tokens.py
-    python benchmarks/tokens.py --asked 12 --seeds 10    # more decisions put to the LLM: narrower intervals
+    python benchmarks/tokens.py --seeds 30 --asked 3    # more decisions put to the LLM: narrower intervals
 
 Flies missions by a planner and puts every decision to an LLM in several ways: as the edge does in its modes, and as the
 paper does, with all sensors in words and 30 experiences (`paper_template.py` says how far that is known). Counts whole
@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
-from compression import KEPT, LARGE, SMALL, TINY, WINDOW, Compressor, Size, attention_s, windows
+from compressors import KEPT, LARGE, SMALL, TINY, WINDOW, Compressor, Size, attention_s, windows
 from flown_prompts import CONTEXT, GUIDED, LLM, LLM_ALL, PAPER, WAYS, Asked, flown
 from local_llm import Answered, LocalLLM
 from paper_template import STATED_STATE_TOKENS
@@ -56,9 +56,9 @@ _BLOCKS = {"o200k": "prompt", "o200k_static": "static", "o200k_experiences": "ex
 class Tokens:
     """Count tokens, time them, and compare with the paper's template."""
 
-    seeds: int = 5
+    seeds: int = 6
     """Missions: seeds 0 to N - 1."""
-    asked: int = 2
+    asked: int = 1
     """Decisions of each mission's middle that are put to the embedded LLM, after one more that fills its cache."""
     policy: Literal["mpc", "eof"] = "mpc"
     """Who flies: the planner, or the rule that is faster to compute."""

@@ -1,0 +1,17 @@
+"""Runs a benchmark as its docstring says, as a process of its own."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+
+
+def figures(name: str, *options: str, out: Path) -> Any:
+    """What it wrote."""
+    command = [sys.executable, f"benchmarks/{name}.py", *options, "--out", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads(out.read_text())
