@@ -44,7 +44,8 @@ from simulator.experiments.intervals import interval, paired
 GOAL_PROMPT, GOAL_NEW = 0.5, 0.15
 # Ways whose answers are judged: each answers with a sensor and a velocity, or with a letter for both.
 JUDGED = (GUIDED, LLM, PAPER)
-_DRAWN = "drawn"
+# What answers are compared with: uniform draws among all sensors that may be named, and among those attention keeps.
+_DRAWN, _DRAWN_KEPT = "drawn", "drawn_among_kept"
 # Prefill speeds for which it is reckoned whether compression pays, tokens a second.
 SPEEDS = (50, 200, 1_000, 10_000)
 _COUNTS = ("o200k", "own", "new")
@@ -57,7 +58,9 @@ class Tokens:
     """Count tokens, time them, and compare with the paper's template."""
 
     seeds: int = 6
-    """Missions: seeds 0 to N - 1."""
+    """Missions: seeds --first to --first + N - 1."""
+    first: int = 0
+    """The first seed."""
     asked: int = 1
     """Decisions of each mission's middle that are put to the embedded LLM, after one more that fills its cache."""
     policy: Literal["mpc", "eof"] = "mpc"
@@ -82,7 +85,8 @@ def main(args: Tokens) -> int:
     console, scenario = Console(), scenario_named(args.scenario)
     if args.steps is not None:
         scenario = scenario.model_copy(update={"steps": args.steps})
-    flights = [flown(scenario, seed, args.policy).asked for seed in track(range(args.seeds), "Flying", console=console)]
+    seeds = range(args.first, args.first + args.seeds)
+    flights = [flown(scenario, seed, args.policy).asked for seed in track(seeds, "Flying", console=console)]
     with LocalLLM(args.threads, CONTEXT) as llm:
         counts = counted(flights, llm, console)
         name = llm.name
@@ -196,7 +200,7 @@ def asked_figures(answers: dict[str, list[Told]], scenario: Scenario) -> dict[st
             "late": sum(one.answered.late for one in told),
         }
     for way, values in lost.items():
-        found["lost_packets_above_best"][way] = interval(values).model_dump(exclude={"values"})
+        found["lost_packets_above_best"][way] = interval(values).model_dump()
         if way != PAPER:
             found["compared"] += [pair.model_dump() for pair in paired(way, PAPER, "lost", values, lost[PAPER])]
     return found
@@ -207,7 +211,7 @@ def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list
 
     Judged are all sensors that may be named at all velocities. An answer that is none loses what a draw would.
     """
-    lost: dict[str, list[float]] = {way: [] for way in (*answers, _DRAWN)}
+    lost: dict[str, list[float]] = {way: [] for way in (*answers, _DRAWN, _DRAWN_KEPT)}
     for rows in zip(*answers.values(), strict=True):
         asked = rows[0].asked
         levels = scenario.max_velocity + 1
@@ -219,6 +223,8 @@ def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list
         for way, one in said.items():
             lost[way].append(float((drawn if one is None else next(told)) - best))
         lost[_DRAWN].append(float(drawn - best))
+        kept = np.isin([sensor for sensor, _ in actions], asked.ways[LLM].sensors)
+        lost[_DRAWN_KEPT].append(float(judgement.lost[: len(actions)][kept].mean() - best))
     return lost
 
 
@@ -303,8 +309,9 @@ def tell(found: dict[str, Any], console: Console) -> None:
             f"expected to lose {lost['mean']:.2f} [{lost['low']:.2f}, {lost['high']:.2f}] packets above the best",
             highlight=False,
         )
-    drawn = told["lost_packets_above_best"][_DRAWN]
-    console.print(f"drawn uniformly: {drawn['mean']:.2f} [{drawn['low']:.2f}, {drawn['high']:.2f}]", highlight=False)
+    for name in (_DRAWN, _DRAWN_KEPT):
+        drawn = told["lost_packets_above_best"][name]
+        console.print(f"{name}: {drawn['mean']:.2f} [{drawn['low']:.2f}, {drawn['high']:.2f}]", highlight=False)
     for pair in told["compared"]:
         console.print(f"{pair['scheme']} - paper, {pair['kind']}: {shown([pair['mean'], pair['low'], pair['high']])}")
     for label, one in found["compression"]["compressors"].items():
