@@ -8,7 +8,6 @@ without the table of embeddings, which takes no time to speak of. Half of the to
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 
@@ -63,11 +62,6 @@ class Compressor(nn.Module):
         keep = self._keep(self._encoder(embedded)).softmax(dim=-1)[0, :, 1]
         torch.topk(keep, max(1, int(KEPT * tokens)))
         return time.perf_counter() - began
-
-
-def windows(tokens: int) -> int:
-    """How many windows a prompt takes."""
-    return math.ceil(tokens / WINDOW)
 
 
 def attention_s(scenario: Scenario, repeats: int) -> list[float]:

@@ -19,7 +19,7 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -72,16 +72,16 @@ class Line:
     decisions: Iterator[Asked]
     levels: int
     limit_s: float
-    cold: list[Answered] = field(default_factory=list)
+    body: dict[str, Any] = field(default_factory=dict)
 
     def ask(self) -> Answered:
         """The next decision, as the edge would ask."""
-        self._body = next(self.decisions).ways[self.way].body(self.levels)
-        return self.llm.ask(self._body, self.limit_s)
+        self.body = next(self.decisions).ways[self.way].body(self.levels)
+        return self.llm.ask(self.body, self.limit_s)
 
     def ask_cold(self) -> Answered:
         """The last decision again, the whole prompt read anew."""
-        return self.llm.ask(self._body, self.limit_s, cache_prompt=False)
+        return self.llm.ask(self.body, self.limit_s, cache_prompt=False)
 
 
 def main(args: Llm) -> int:
@@ -215,21 +215,10 @@ def fleets(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> d
             name: stack.enter_context(LocalLLM(threads, context, slots=uavs if name == SLOTS else 1))
             for name in (ROW, CALL, QUEUE, SLOTS)
         }
-
-        def asked(name: str, bodies: list[dict[str, Any]], together: Together) -> list[Answered]:
-            llm = models[name]
-            if name == CALL:
-                return [llm.ask(together.body(), args.limit_s)]
-            if name == ROW:
-                return [llm.ask(body, args.limit_s) for body in bodies]
-            slots = range(uavs) if name == SLOTS else [0] * uavs
-            one: Callable[..., Answered] = llm.ask
-            return list(pool.map(lambda body, slot: one(body, args.limit_s, id_slot=slot), bodies, slots))
-
         for number, (bodies, together) in enumerate(track(steps, "Asking for the fleet", console=console)):
             for name in models:
                 began, cpu_began = time.perf_counter(), time.process_time()
-                answers = asked(name, bodies, together)
+                answers = ask_fleet(name, models[name], bodies, together, args.limit_s, pool)
                 took, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
                 # The first step finds nothing in the cache.
                 if number:
@@ -245,6 +234,24 @@ def fleets(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> d
         }
         for name, took in seconds.items()
     }
+
+
+def ask_fleet(
+    name: str,
+    llm: LocalLLM,
+    bodies: Sequence[dict[str, Any]],
+    together: Together,
+    limit_s: float,
+    pool: ThreadPoolExecutor,
+) -> list[Answered]:
+    """One step's decisions, asked for in one of the four ways."""
+    if name == CALL:
+        return [llm.ask(together.body(), limit_s)]
+    if name == ROW:
+        return [llm.ask(body, limit_s) for body in bodies]
+    slots = range(len(bodies)) if name == SLOTS else [0] * len(bodies)
+    waiting = [pool.submit(llm.ask, body, limit_s, id_slot=slot) for body, slot in zip(bodies, slots, strict=True)]
+    return [one.result() for one in waiting]
 
 
 def whole_steps(scribe: Scribe, scenario: Scenario) -> list[tuple[list[dict[str, Any]], Together]]:

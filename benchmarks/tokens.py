@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
-from compressors import KEPT, LARGE, SMALL, TINY, WINDOW, Compressor, Size, attention_s, windows
+from compressors import KEPT, LARGE, SMALL, TINY, WINDOW, Compressor, Size, attention_s
 from flown_prompts import CONTEXT, GUIDED, LLM, LLM_ALL, PAPER, WAYS, Asked, flown
 from local_llm import Answered, LocalLLM
 from paper_template import STATED_STATE_TOKENS
@@ -101,7 +101,8 @@ def main(args: Tokens) -> int:
         "asked": asked_figures(answers, scenario),
         "goal": {"prompt": GOAL_PROMPT, "new": GOAL_NEW},
     }
-    found["compression"] = compression_figures(found, flights[-1][-1], scenario, args, console)
+    window, read_s = compressing(flights[-1][-1], scenario, args, console)
+    found["compression"] = compression_figures(found["tokens"], window, read_s, attention_s(scenario, 200))
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(found, indent=1) + "\n")
     tell(found, console)
@@ -239,19 +240,16 @@ def action(way: str, asked: Asked, answered: Answered, levels: int) -> Action | 
         return None
 
 
-def compression_figures(
-    found: dict[str, Any], last: Asked, scenario: Scenario, args: Tokens, console: Console
-) -> dict[str, Any]:
-    """Seconds to compress beside seconds of reading, and the prefill speed at which compression would pay.
-
-    An encoder's time is measured on one window; that of a prompt is reckoned from it, evenly.
-    """
-    prompt = found["tokens"][PAPER]["own"]["mean"]
+def compressing(
+    last: Asked, scenario: Scenario, args: Tokens, console: Console
+) -> tuple[dict[str, list[float]], list[float]]:
+    """Seconds for a window by compressor, and seconds a token of reading by the embedded LLM, taken side by side."""
     sizes: Sequence[Size] = (SMALL, LARGE) if args.encoders == "real" else (TINY,)
     encoders = {size.label: Compressor(size) for size in sizes}
     window: dict[str, list[float]] = {label: [] for label in encoders}
     read_s: list[float] = []
     body = last.ways[PAPER].body(scenario.max_velocity + 1)
+    # About a window long: the static block, and hardly more.
     body["messages"] = [body["messages"][0], {"role": "user", "content": "Current state: none"}]
     with LocalLLM(args.threads, CONTEXT) as llm:
         for _ in track(range(args.repeats), "Compressing", console=console):
@@ -259,33 +257,40 @@ def compression_figures(
                 window[label].append(encoder.window_s(WINDOW))
             answered = llm.ask(body, cache_prompt=False, max_tokens=1)
             read_s.append(answered.seconds / max(1, answered.new))
-    speed = 1 / statistics.median(read_s)
-    attention = attention_s(scenario, 200)
-    saved = found["tokens"][LLM_ALL]["new"]["mean"] - found["tokens"][LLM]["new"]["mean"]
-    attention_speed = saved / statistics.median(attention)
+    return window, read_s
+
+
+def compression_figures(
+    tokens: dict[str, Any], window: dict[str, list[float]], read_s: Sequence[float], attention: Sequence[float]
+) -> dict[str, Any]:
+    """Seconds spent to seconds saved, and the prefill speed below which compression pays.
+
+    An encoder's time is measured on one window; that of a prompt is reckoned from it, evenly.
+    """
+    prompt, speed = tokens[PAPER]["own"]["mean"], 1 / statistics.median(read_s)
+    reckoned_s = {f"{way}, cached": tokens[way]["new"]["mean"] / speed for way in (GUIDED, LLM, PAPER)}
+    reckoned_s |= {f"{PAPER}, whole": prompt / speed}
+    compressors = {}
+    for label, took in window.items():
+        median = statistics.median(took)
+        reckoned_s[f"{PAPER}, halved by {label}"] = median * prompt / WINDOW + KEPT * prompt / speed
+        compressors[label] = {
+            "window_s_median": median,
+            "spent_to_saved_embedded": ratio_of_medians(took, [s * WINDOW * (1 - KEPT) for s in read_s]),
+            "spent_to_saved_at_speed_reckoned": {str(at): median / WINDOW * at / (1 - KEPT) for at in SPEEDS},
+            "pays_below_tokens_per_s": WINDOW * (1 - KEPT) / median,
+        }
+    saved = tokens[LLM_ALL]["new"]["mean"] - tokens[LLM]["new"]["mean"]
     return {
         "kept": KEPT,
-        "prompt_tokens": prompt,
-        "windows": windows(round(prompt)),
         "embedded_prefill_tokens_per_s": speed,
-        "compressors": {
-            label: {
-                "window_s_median": statistics.median(took),
-                "prompt_s_reckoned": statistics.median(took) * prompt / WINDOW,
-                "saved_s_embedded_reckoned": prompt * (1 - KEPT) / speed,
-                "spent_to_saved_embedded": ratio_of_medians(took, [s * WINDOW * (1 - KEPT) for s in read_s]),
-                "spent_to_saved_at_speed_reckoned": {
-                    str(at): statistics.median(took) / WINDOW * at / (1 - KEPT) for at in SPEEDS
-                },
-                "pays_below_tokens_per_s": WINDOW * (1 - KEPT) / statistics.median(took),
-            }
-            for label, took in window.items()
-        },
+        "seconds_to_read_reckoned": reckoned_s,
+        "compressors": compressors,
         "attention": {
             "ms_median": statistics.median(attention) * 1e3,
             "ms_p99": float(np.quantile(attention, 0.99)) * 1e3,
             "tokens_saved": saved,
-            "pays_below_tokens_per_s": attention_speed,
+            "pays_below_tokens_per_s": saved / statistics.median(attention),
         },
     }
 
@@ -320,6 +325,8 @@ def tell(found: dict[str, Any], console: Console) -> None:
             f"pays below {one['pays_below_tokens_per_s']:.0f} tokens/s",
             highlight=False,
         )
+    for label, seconds in found["compression"]["seconds_to_read_reckoned"].items():
+        console.print(f"reading {label}: {seconds:.2f} s, reckoned", highlight=False)
     attention = found["compression"]["attention"]
     console.print(
         f"attention: {attention['ms_median']:.3f} ms for {attention['tokens_saved']:.1f} tokens; pays below "
