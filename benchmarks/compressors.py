@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from service.attention import top_k
-from service.checkpoint import initial_modules
+from service.checkpoint import initial_weights
 from service.features import FEATURES
 from shared.scenario import Scenario
 
@@ -66,11 +66,11 @@ class Compressor(nn.Module):
 
 def attention_s(scenario: Scenario, repeats: int) -> list[float]:
     """Seconds of scoring all J sensors by the edge's attention module and taking the best k, measured so often."""
-    modules = initial_modules("pretrained", "paper", _LEVELS, 0)
+    weights = initial_weights("pretrained", "paper", _LEVELS, 0)
     features = np.random.default_rng(0).random((scenario.sensors, FEATURES["paper"]), dtype=np.float32)
     took = []
     for _ in range(repeats):
         began = time.perf_counter()
-        top_k(modules.score(features)[0], _K)
+        top_k(weights.score(features)[0], _K)
         took.append(time.perf_counter() - began)
     return took

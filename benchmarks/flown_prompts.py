@@ -135,7 +135,7 @@ class Scribe(LocalPilot):
             shares = template.together({u: (o, v.state) for u, (o, v) in self._step.items()}, mission.experiences)
             first = next(iter(shares.values()))
             state = "".join(share.state for share in shares.values())
-            whole = Prompt(template.static_together, first.experiences, state, state)
+            whole = Prompt(template.static_together, first.experiences, state, first.uncompressed)
             self.together.append(Together(view.step, whole, [list(o.labels) for o, _ in self._step.values()]))
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:

@@ -14,7 +14,8 @@ from collections.abc import Sequence
 from service.experiences import Experiences
 from service.features import State
 from service.prompt import Prompt, Template
-from service.rows import UNKNOWN, Cells, full_cells
+from service.rows import UNKNOWN, Cells
+from service.uncompressed import Uncompressed
 from shared.scenario import Scenario
 
 EXPERIENCES = 30
@@ -68,9 +69,9 @@ class PaperTemplate(Template):
         self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()
     ) -> Prompt:
         """The prompt for one decision; ``kept_rows`` and ``nearest`` are not heeded."""
-        rows = "".join(_sentence(full_cells(state, row)) + "\n" for row in range(len(state.ids)))
+        whole = Uncompressed(state, lambda cells: _sentence(cells) + "\n", "Current state:\n")
         past = "Past decisions:\n" + "".join(experiences) if experiences else ""
-        return Prompt(self.static, past, f"Current state:\n{rows}", f"Current state:\n{rows}")
+        return Prompt(self.static, past, whole.text, whole)
 
 
 class Newest(Experiences):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,6 +20,11 @@ from tests.running import serving
 
 # Edges that are started as processes keep nothing, unless a test says so: they would share the user's store.
 os.environ["AICVDS_STORE"] = "none"
+
+# Where the tests must be complete, as in CI, one whose program is missing fails.
+_COMPLETE = "AICVDS_TESTS_COMPLETE"
+# Of Debian's packages of the same name; tests that need one are marked so.
+_PROGRAMS = ("chromium", "prometheus")
 
 Edge = Callable[..., httpx.Client]
 
@@ -61,3 +67,22 @@ def report() -> Callable[..., dict[str, Any]]:
         return {**body, **changes}
 
     return make
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what needs a program that is not installed, unless the tests must be complete."""
+    missing = set(_missing())
+    left_out = [i for i in items if missing & {name for mark in i.iter_markers("needs") for name in mark.args}]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """What was left out, and how to have it."""
+    for name in _missing():
+        terminalreporter.write_line(f"left out: the tests that need {name}. To run them: apt-get install {name}")
+
+
+def _missing() -> list[str]:
+    return [] if os.environ.get(_COMPLETE) else [name for name in _PROGRAMS if shutil.which(name) is None]

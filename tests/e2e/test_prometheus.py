@@ -27,6 +27,8 @@ from grafana_foundation_sdk.models.dashboard import Dashboard
 from tests.e2e.processes import serving_edge, started
 from tests.simulator.edge_stub import free_port
 
+pytestmark = pytest.mark.needs("prometheus")
+
 DOCKER = Path(__file__).parents[2] / "docker"
 ALERTS = DOCKER / "alerts.yml"
 BOARD: dict[str, Any] = json.loads((DOCKER / "grafana" / "dashboards" / "aicvds.json").read_text())

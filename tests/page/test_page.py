@@ -18,6 +18,8 @@ from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.page.conftest import Open, Start
 from tests.service.stub_llm import wait_for
 
+pytestmark = pytest.mark.needs("chromium")
+
 Report = Callable[..., dict[str, Any]]
 REFUSED = ("Failed to load resource",)
 GONE = (*REFUSED, "net::ERR_")

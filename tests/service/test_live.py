@@ -110,8 +110,8 @@ def test_the_missions_are_listed_the_one_that_decided_last_first(edge: Edge, rep
     client = edge()
     assert client.get("/missions").json() == {"missions": [], "more": 0, "newest": None}
     client.put("/missions/waits", json={"mode": "policy"})
-    for mission in ("a", "b", "a"):
-        decided(client, report(mission_id=mission))
+    for named in ("a", "b", "a"):
+        decided(client, report(mission_id=named))
     told = client.get("/missions").json()
     assert told["newest"] == "a"
     assert [(one["mission_id"], one["mode"], one["decisions"]) for one in told["missions"]] == [
@@ -129,8 +129,8 @@ def test_a_decisions_prompt_is_told_while_it_is_kept(edge: Edge, report: Report)
     assert told["state"].count("\n") == 5
     assert told["asked"] is False
     decided(client, report(mission_id="other"))
-    for mission, decision in (("other", name), ("test", "0" * 32)):
-        assert client.get(f"/missions/{mission}/decisions/{decision}/prompt").status_code == 404
+    for named, decision in (("other", name), ("test", "0" * 32)):
+        assert client.get(f"/missions/{named}/decisions/{decision}/prompt").status_code == 404
     client.delete("/missions/test")
     assert client.get(f"/missions/test/decisions/{name}/prompt").status_code == 404
 
