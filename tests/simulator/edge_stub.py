@@ -20,6 +20,8 @@ from starlette.routing import Route
 
 from shared.scenario import Scenario, scenario_named
 from shared.wire import (
+    BatchRequest,
+    BatchResponse,
     Candidate,
     DecideRequest,
     DecideResponse,
@@ -52,6 +54,8 @@ class EdgeStub:
     slow_s: float = 0.3
     asked: int = 0
     polled: int = 0
+    at_once: int = 0
+    most_at_once: int = 0
     headers: list[dict[str, str]] = field(default_factory=list)
     decides: list[DecideRequest] = field(default_factory=list)
     feedbacks: list[FeedbackRequest] = field(default_factory=list)
@@ -65,7 +69,10 @@ class EdgeStub:
         asked = DecideRequest.model_validate_json(await request.body())
         self.decides.append(asked)
         if behaviour == "slow":
+            self.at_once += 1
+            self.most_at_once = max(self.most_at_once, self.at_once)
             await asyncio.sleep(self.slow_s)
+            self.at_once -= 1
         refusal = _misbehave(behaviour, asked)
         return refusal or Response(self._answer(asked, behaviour).model_dump_json())
 
@@ -100,6 +107,14 @@ class EdgeStub:
             latency_ms={"llm": 1.0, "total": 2.0},
         )
 
+    async def decide_batch(self, request: Request) -> Response:
+        """POST /decide/batch."""
+        asked = BatchRequest.model_validate_json(await request.body())
+        behaviour = self.script.pop(0) if self.script else self.otherwise
+        requests = [DecideRequest(step=asked.step, **uav.model_dump()) for uav in asked.uavs]
+        answers = [self._answer(one, behaviour) for one in requests]
+        return Response(BatchResponse(decisions=answers).model_dump_json())
+
     async def feedback(self, request: Request) -> Response:
         """POST /feedback."""
         outcome = FeedbackRequest.model_validate_json(await request.body())
@@ -109,11 +124,24 @@ class EdgeStub:
     async def put_mission(self, request: Request) -> Response:
         """PUT /missions/{mission_id}."""
         mission_id = request.path_params["mission_id"]
-        spec = MissionSpec.model_validate_json(await request.body())
-        self.missions[mission_id] = spec
+        self.missions[mission_id] = MissionSpec.model_validate_json(await request.body())
+        return Response(self._status(mission_id).model_dump_json())
+
+    async def mission(self, request: Request) -> Response:
+        """GET and DELETE /missions/{mission_id}."""
+        mission_id = request.path_params["mission_id"]
+        if mission_id not in self.missions:
+            return _problem(404, "mission_id: unknown")
+        if request.method == "DELETE":
+            del self.missions[mission_id]
+            return Response(status_code=204)
+        return Response(self._status(mission_id).model_dump_json())
+
+    def _status(self, mission_id: str) -> MissionStatus:
+        spec = self.missions[mission_id]
         world = spec.scenario if isinstance(spec.scenario, Scenario) else scenario_named(spec.scenario)
         counts: dict[str, Any] = dict.fromkeys(("decisions", "feedback", "experiences", "learner_updates"), 0)
-        status = MissionStatus(
+        return MissionStatus(
             mission_id=mission_id,
             scenario=world,
             mode="llm",
@@ -124,7 +152,6 @@ class EdgeStub:
             visits={},
             **counts,
         )
-        return Response(status.model_dump_json())
 
     async def readyz(self, request: Request) -> Response:
         """GET /readyz."""
@@ -138,8 +165,10 @@ class EdgeStub:
         return Starlette(
             routes=[
                 Route("/decide", self.decide, methods=["POST"]),
+                Route("/decide/batch", self.decide_batch, methods=["POST"]),
                 Route("/feedback", self.feedback, methods=["POST"]),
                 Route("/missions/{mission_id}", self.put_mission, methods=["PUT"]),
+                Route("/missions/{mission_id}", self.mission, methods=["GET", "DELETE"]),
                 Route("/readyz", self.readyz, methods=["GET"]),
             ]
         )
