@@ -6,11 +6,10 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from importlib.metadata import version
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import torch
 from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
 
 from service import problems
 from service.engine import Engine
@@ -21,12 +20,12 @@ from service.limits import BodyLimit, Crowd
 from service.live import routes as live_routes
 from service.llm.servers import Servers
 from service.metrics import Metrics
+from service.openapi import schema_of
 from service.routes import router
 from service.settings import Settings
 from service.store import Store
 from service.tokens import TokenCounter
 from service.tracing import Traced, Traces, provider_from_environment
-from shared.wire import Problem
 
 
 class State(TypedDict):
@@ -88,17 +87,5 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     if traces.provider is not None:
         app.add_middleware(Traced)
     problems.install(app)
-    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    app.openapi = lambda: schema_of(app)  # type: ignore[method-assign]
     return app
-
-
-def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The schema, with problem documents in place of FastAPI's own validation errors."""
-    if app.openapi_schema is None:
-        schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
-        schemas = schema["components"]["schemas"]
-        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
-        for unused in ("HTTPValidationError", "ValidationError"):
-            schemas.pop(unused, None)
-        app.openapi_schema = schema
-    return app.openapi_schema

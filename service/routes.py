@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Depends, Header, Request, Response
+from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
 from service.engine import Engine
@@ -28,21 +28,6 @@ from shared.wire import (
 )
 
 router = APIRouter()
-
-EXAMPLE = {
-    "step": 0,
-    "uav_id": 0,
-    "position": [500.0, 450.0],
-    "sensors": {
-        "id": [0, 1, 2, 3],
-        "x": [420.0, 650.0, 300.0, 900.0],
-        "y": [380.0, 520.0, 700.0, 100.0],
-        "queue": [52.0, 17.0, 33.0, None],
-        "battery": [49.0, 50.0, 47.5, None],
-        "channel_gain": [-83.1, -96.0, -109.2, None],
-        "last_seen": [0, 0, 0, None],
-    },
-}
 
 
 async def _engine(request: Request) -> Engine:
@@ -69,12 +54,7 @@ RequestKey = Annotated[
     responses=documented(400, 404, 409, 413, 415, 422, 503),
     tags=["decisions"],
 )
-async def decide(
-    body: Annotated[DecideRequest, Body(openapi_examples={"paper": {"value": EXAMPLE}})],
-    engine: TheEngine,
-    may_make: MayMake,
-    key: RequestKey = None,
-) -> Response:
+async def decide(body: DecideRequest, engine: TheEngine, may_make: MayMake, key: RequestKey = None) -> Response:
     """Which sensor to collect from, and how fast to fly the next step."""
     answer = await engine.decide(body, may_make=may_make, key=key)
     took = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}

@@ -1,0 +1,212 @@
+"""The OpenAPI document: FastAPI's, with problem documents for errors and an example of every request and answer."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.problems import CONTENT_TYPE
+from shared.scenario import SCENARIOS
+from shared.wire import Problem
+
+JSON = "application/json"
+Example = dict[str, Any]
+
+DECISION_ID = "0123456789abcdef0123456789abcdef"
+SENSORS = {
+    "id": [0, 1, 2, 3],
+    "x": [420.0, 650.0, 300.0, 900.0],
+    "y": [380.0, 520.0, 700.0, 100.0],
+    "queue": [52.0, 17.0, 33.0, None],
+    "battery": [49.0, 50.0, 47.5, None],
+    "channel_gain": [-83.1, -96.0, -109.2, None],
+    "last_seen": [0, 0, 0, None],
+}
+STATE = {"uav_id": 0, "position": [500.0, 450.0], "sensors": SENSORS}
+OUTCOME = {"decision_id": DECISION_ID, "cost": 0.2, "failed": False}
+NOTE = "Suspected leak at sensor 4: visit it every third step."
+ORDERS = {
+    "sensors": [{"sensor_id": 4, "weight": 1.0, "visit_every": 3}],
+    "min_velocity": None,
+    "max_velocity": 10,
+    "forbidden_velocities": [],
+}
+
+DECISION = {
+    "decision_id": DECISION_ID,
+    "mission_id": "default",
+    "uav_id": 0,
+    "step": 0,
+    "sensor_id": 0,
+    "velocity": 5,
+    "source": "guided",
+    "reason": None,
+    "model": "SmolLM2-135M-Instruct.Q4_1",
+    "top_k": [{"sensor_id": 0, "score": -0.156479}, {"sensor_id": 2, "score": -0.304903}],
+    "guided": {
+        "trust": {"llm": 0.2, "planner": 0.6, "value": 0.1, "policy": 0.1},
+        "calibrated": True,
+        "candidates": [
+            {"sensor_id": 0, "velocity": 5, "llm": 0.61, "mixture": 0.7431, "regret": 0.0, "score": -0.297},
+            {"sensor_id": 2, "velocity": 6, "llm": 0.39, "mixture": 0.0064, "regret": 1.25, "score": -5.8059},
+        ],
+    },
+    "tokens": {
+        "tokenizer": "o200k_base",
+        "static": 214,
+        "experiences": 0,
+        "state": 28,
+        "state_uncompressed": 64,
+        "prompt": 242,
+        "uncompressed": 278,
+        "saved": 36,
+        "completion": 1,
+        "cached": 0,
+        "server_prompt": 290,
+        "cost_usd": 0.0,
+    },
+    "deadline_ms": 3000,
+    "latency_ms": {"plan": 160.7, "augment": 0.8, "attend": 0.5, "prompt": 0.4, "llm": 410.5, "total": 574.2},
+    "stored": True,
+}
+GUIDANCE = {
+    "mission_id": "patrol",
+    "status": "confirmed",
+    "note": NOTE,
+    "guidance": ORDERS,
+    "in_words": "Visit sensor 4 at least once in every 3 steps. Never fly faster than 10 m/s.",
+    "origin": "operator",
+    "model": None,
+    "failure": None,
+}
+MISSION = {
+    "mission_id": "patrol",
+    "scenario": SCENARIOS["paper"].model_dump(mode="json"),
+    "mode": "guided",
+    "top_k": 5,
+    "attention": "on",
+    "features": "reach",
+    "belief": "fleet",
+    "verify": "on",
+    "planner": "on",
+    "prompt": {"format": "csv", "order": "score", "experiences": 8, "selection": "recent", "demonstrations": 0},
+    "init": "pretrained",
+    "seed": 0,
+    "decisions": 3,
+    "feedback": 2,
+    "experiences": 2,
+    "learner_updates": 2,
+    "learner_loss": 0.041,
+    "visits": {"0": 0, "2": 1},
+}
+_FIRST = {"mission_id": "default", "step": 0, **STATE}
+_BATCH = {"step": 0, "uavs": [STATE, {**STATE, "uav_id": 1, "position": [620.0, 480.0]}]}
+
+# By method and path; what the paper's UAV would send comes first.
+REQUESTS: dict[tuple[str, str], dict[str, Example]] = {
+    ("post", "/decide"): {
+        "first": {"summary": "A UAV's first request: it says nothing of an outcome", "value": _FIRST},
+        "outcome": {
+            "summary": "A later request: what came of the decision before, and 1.5 s to answer",
+            "value": {**_FIRST, "step": 1, "outcome": OUTCOME, "deadline_ms": 1500},
+        },
+    },
+    ("post", "/decide/batch"): {"fleet": {"summary": "Two UAVs at one step", "value": _BATCH}},
+    ("post", "/feedback"): {
+        "served": {"summary": "Packets came, few were lost", "value": {"mission_id": "default", **OUTCOME}},
+    },
+    ("put", "/missions/{mission_id}"): {
+        "preset": {"summary": "A preset's world, and the operator's note", "value": {"mode": "guided", "note": NOTE}},
+        "paper": {
+            "summary": "The paper's method: mode llm, its random start, no rules",
+            "value": {"scenario": "paper", "mode": "llm", "init": "random", "verify": "off", "planner": "off"},
+        },
+    },
+    ("post", "/missions/{mission_id}/guidance"): {
+        "own": {"summary": "The operator's own structure: obeyed at once", "value": {"guidance": ORDERS}},
+        "confirm": {"summary": "What was understood is right", "value": {"answer": "confirm"}},
+        "reject": {"summary": "It is not", "value": {"answer": "reject"}},
+    },
+}
+
+# Of the answers that are no problem; 200 all of them.
+ANSWERS: dict[tuple[str, str], Any] = {
+    ("post", "/decide"): DECISION,
+    ("post", "/decide/batch"): {
+        "decisions": [
+            DECISION,
+            {**DECISION, "decision_id": DECISION_ID[::-1], "uav_id": 1, "sensor_id": 2, "velocity": 6},
+        ]
+    },
+    ("post", "/feedback"): {"decision_id": DECISION_ID, "result": "applied"},
+    ("put", "/missions/{mission_id}"): {
+        **MISSION, "decisions": 0, "feedback": 0, "experiences": 0, "learner_updates": 0, "learner_loss": None,
+        "visits": {},
+    },
+    ("get", "/missions/{mission_id}"): MISSION,
+    ("get", "/missions/{mission_id}/guidance"): GUIDANCE,
+    ("post", "/missions/{mission_id}/guidance"): GUIDANCE,
+    ("get", "/healthz"): {"status": "ok"},
+    ("get", "/readyz"): {
+        "ready": True,
+        "decides": "guided",
+        "llm": "ready",
+        "model": "SmolLM2-135M-Instruct.Q4_1",
+        "standing_by": 0,
+        "constraint": "grammar",
+        "detail": None,
+    },
+    ("get", "/"): {"service": "AIC-VDS edge", "version": "0.1.0", "docs": "/docs", "metrics": "/metrics"},
+}  # fmt: skip
+
+# Status to the field at fault and what is wrong with it.
+PROBLEMS: dict[int, tuple[str, str]] = {
+    400: ("body", "There was an error parsing the body"),
+    404: ("mission_id", "there is no mission patrol"),
+    409: ("mission_id", "mission patrol has another spec: DELETE it or choose another ID"),
+    413: ("body", "larger than 2000000 bytes"),
+    415: ("body", "Content-Encoding 'br': use gzip, zstd or none"),
+    422: ("mission_id", "String should match pattern '^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$'"),
+    503: ("mission_id", "the store fails: nothing was recorded, send it again"),
+}
+
+
+def schema_of(app: FastAPI) -> dict[str, Any]:
+    """The app's OpenAPI document; made once."""
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = schema["components"]["schemas"]
+        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        for path, methods in schema["paths"].items():
+            for method, operation in methods.items():
+                _exemplify(operation, (method, path))
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _exemplify(operation: dict[str, Any], route: tuple[str, str]) -> None:
+    if route in REQUESTS:
+        operation["requestBody"]["content"][JSON]["examples"] = REQUESTS[route]
+    for status, response in operation["responses"].items():
+        content = response.get("content", {})
+        if JSON in content and route in ANSWERS:
+            content[JSON]["example"] = ANSWERS[route]
+        if CONTENT_TYPE in content:
+            content[CONTENT_TYPE]["example"] = problem(int(status))
+
+
+def problem(status: int) -> Example:
+    """A problem document of that status."""
+    field, fault = PROBLEMS[status]
+    whole = Problem(
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=f"{field}: {fault}",
+        errors=[{"field": field, "problem": fault}],
+    )
+    return whole.model_dump(mode="json")
