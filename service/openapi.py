@@ -108,7 +108,7 @@ _BATCH = {"step": 0, "uavs": [STATE, {**STATE, "uav_id": 1, "position": [620.0, 
 # By method and path; what the paper's UAV would send comes first.
 REQUESTS: dict[tuple[str, str], dict[str, Example]] = {
     ("post", "/decide"): {
-        "first": {"summary": "A UAV's first request: it says nothing of an outcome", "value": _FIRST},
+        "paper": {"summary": "A UAV's first request: it says nothing of an outcome", "value": _FIRST},
         "outcome": {
             "summary": "A later request: what came of the decision before, and 1.5 s to answer",
             "value": {**_FIRST, "step": 1, "outcome": OUTCOME, "deadline_ms": 1500},

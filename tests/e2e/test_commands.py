@@ -1,0 +1,209 @@
+"""Every command that the README, the docs and the examples show is run as shown, or listed here with the reason."""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import tyro
+
+from shared import cli
+from simulator.client import EdgeClient
+from simulator.experiments.catalogue import EXPERIMENTS
+from tests.e2e.processes import serving_edge
+from tests.simulator.edge_stub import free_port
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md")), *sorted(ROOT.glob("examples/*/README.md"))]
+EDGE = "http://localhost:8000"
+BIN = ".venv/bin/"
+
+# Run as they stand, in this order, beside an edge: what is added makes them short.
+FLOWN = {
+    f"{BIN}aicvds simulate --edge {EDGE} --scenario paper --seed 0 --out runs/mission": "--steps 2",
+    f"{BIN}aicvds replay runs/mission --edge {EDGE} --format json --top-k 3 --out runs/again": "",
+    f"{BIN}python -m examples.uav_loop --edge {EDGE}": "--steps 3",
+    f"{BIN}aicvds simulate --world examples/pipeline_world --edge {EDGE}": "--steps 2",
+    f"{BIN}aicvds simulate --world examples/pipeline_world --policy eof --out runs/pipeline_world": "--steps 2",
+}
+# The edge that the others are flown against is this one; the commands of "Who may ask" have an edge of their own.
+SERVED = [f"{BIN}aicvds serve"]
+KEYED = [
+    f"KEY=$({BIN}aicvds keys add fleet-1 --file keys.json --scopes decide admin)",
+    f"AICVDS_KEYS=keys.json {BIN}aicvds serve --host 0.0.0.0",
+    f"AICVDS_API_KEY=$KEY {BIN}aicvds simulate --edge {EDGE} --out runs/mission",
+]
+# Their command lines are parsed and no more; by how they begin.
+PARSED = {
+    "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
+    "aicvds explore": "minutes; tests/e2e/test_pretrain.py runs it small",
+    "aicvds pretrain": "minutes; tests/e2e/test_pretrain.py runs it small",
+    "aicvds demonstrate": "minutes; tests/e2e/test_pretrain.py runs it small",
+    "python benchmarks/": "minutes to hours, and they measure",
+}
+# `make --dry-run` finds their targets.
+MADE = {
+    "make install": "what runs this was installed by it",
+    "make demo": "`aicvds demo` is `serve` and `simulate`, which are run here",
+    "make test": "this is part of it",
+    "make faults": "ten minutes",
+    "make fuzz": "some minutes; tests/service/test_fuzz.py is a short one",
+    "make soak": "ten minutes",
+}
+# Run by tests/e2e/test_readme.py, as they stand.
+CURLED = "curl "
+
+
+def commands(page: Path) -> list[str]:
+    """The commands of a page's `sh` blocks, without comments, a command that goes over lines as one."""
+    found: list[str] = []
+    for block in re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+        whole = ""
+        for line in block.splitlines():
+            whole += line + "\n"
+            if complete(whole):
+                found.append(whole.strip())
+                whole = ""
+        assert not whole, f"{page}: a command has no end: {whole}"
+    return [re.sub(r"\s+#\s.*$", "", command) for command in found if not command.startswith("#")]
+
+
+def complete(text: str) -> bool:
+    """Whether no quote is open and no line goes on."""
+    try:
+        shlex.split(text, comments=True)
+    except ValueError:
+        return False
+    return not text.endswith("\\\n")
+
+
+def told() -> list[tuple[str, str]]:
+    """Every command, with its page."""
+    return [(page.relative_to(ROOT).as_posix(), command) for page in PAGES for command in commands(page)]
+
+
+def begins(command: str, how: dict[str, str]) -> bool:
+    return any(command.removeprefix(BIN).startswith(start) for start in how)
+
+
+TOLD = told()
+
+
+@pytest.mark.parametrize(("page", "command"), TOLD)
+def test_every_command_is_in_a_list(page: str, command: str) -> None:
+    listed = [
+        command in FLOWN,
+        command in SERVED,
+        command in KEYED,
+        begins(command, PARSED),
+        begins(command, MADE),
+        command.startswith(CURLED) and page == "README.md",
+    ]
+    assert sum(listed) == 1, f"{page} shows {command!r}: run it in this test, or list it with the reason"
+
+
+def test_every_list_is_of_commands_that_are_shown() -> None:
+    shown = {command for _, command in TOLD}
+    assert {*FLOWN, *SERVED, *KEYED} <= shown
+    assert all(any(begins(command, {start: ""}) for command in shown) for start in {**PARSED, **MADE})
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Path:
+    """A directory that looks to the commands like the repository, and keeps what they write."""
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    for name in ("examples", "benchmarks"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    return tmp_path
+
+
+def shell(command: str, workspace: Path) -> str:
+    """Run it as a shell does; returns what it prints."""
+    ended = subprocess.run(
+        ["bash", "-c", command], cwd=workspace, capture_output=True, text=True, timeout=170, check=False
+    )
+    assert ended.returncode == 0, f"{command} ended with {ended.returncode}:\n{ended.stdout}\n{ended.stderr}"
+    return ended.stdout
+
+
+def test_missions_are_flown_as_shown(workspace: Path) -> None:
+    with serving_edge() as (url, _):
+        for command, more in FLOWN.items():
+            shell(f"{command} {more}".replace(EDGE, url), workspace)
+        decided = httpx.get(f"{url}/metrics").text
+    assert "aicvds_decisions_total{" in decided
+    for written in ("mission/summary.json", "mission/report.html", "again/replay.json", "pipeline_world/report.html"):
+        assert (workspace / "runs" / written).stat().st_size > 0
+
+
+@contextmanager
+def in_the_background(command: str, workspace: Path) -> Iterator[None]:
+    process = subprocess.Popen(["bash", "-c", f"exec {command}"], cwd=workspace, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait(timeout=30)
+
+
+def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
+    make, serve, fly = KEYED
+    key = shell(f"{make}; echo $KEY", workspace).strip()
+    port = free_port()
+    url = f"http://localhost:{port}"
+    # `exec` takes no assignments before it.
+    settings, _, rest = serve.partition(" ")
+    with in_the_background(f"env {settings} AICVDS_MODE=policy {rest} --port {port}", workspace):
+        with EdgeClient(url) as waiting:
+            waiting.wait_ready(60)
+        assert httpx.get(f"{url}/missions/none").status_code == 401
+        shell(f"KEY={key}; {fly.replace(EDGE, url)} --steps 2", workspace)
+    assert (workspace / "runs" / "mission" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("command", [command for _, command in TOLD if begins(command, PARSED)])
+def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    program, *args = shlex.split(command.removeprefix(BIN))
+    if args[0] == "experiment":
+        assert args[1] in (*EXPERIMENTS, "all")
+    with monkeypatch.context() as patched:
+        patched.setattr(tyro, "cli", only_parsed(tyro.cli))
+        if program == "aicvds":
+            patched.setattr(sys, "argv", [program, *args])
+            with pytest.raises(Understood):
+                cli.main()
+        else:
+            patched.setattr(sys, "argv", args)
+            with pytest.raises(Understood):
+                runpy.run_path(str(ROOT / args[0]), run_name="__main__")
+
+
+class Understood(Exception):
+    """The command line was parsed."""
+
+
+def only_parsed(parse: Callable[..., object]) -> Callable[..., object]:
+    def parsed(*args: Any, **kwargs: Any) -> object:
+        parse(*args, **kwargs)
+        raise Understood
+
+    return parsed
+
+
+@pytest.mark.parametrize("command", sorted({command for _, command in TOLD if begins(command, MADE)}))
+def test_what_is_made_has_a_target(command: str) -> None:
+    target = shlex.split(command.replace("<that address>", "address"))[1]
+    planned = subprocess.run(
+        ["make", "--dry-run", target], cwd=ROOT, capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
+    assert planned.returncode == 0, planned.stderr
