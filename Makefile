@@ -1,4 +1,4 @@
-# make install | demo | test | check | docs | bench | faults | fuzz | soak | compose | release | clean
+# make install | demo | test | check | docs | bench | faults | fuzz | soak | compose | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
@@ -17,6 +17,7 @@ help:
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
 	@echo "make test      install, run the tests"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
+	@echo "make docs      build the documentation into site/, to be read without a network"
 	@echo "make bench     how fast the edge and its LLM are, side by side with others: runs/*.json, 15 minutes"
 	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
@@ -44,6 +45,9 @@ check: install
 	PYTHONHASHSEED=0 $(BIN)/mypy
 	PYTHONHASHSEED=0 $(BIN)/mypy benchmarks
 	$(BIN)/lint-imports
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: install
 	$(BIN)/python benchmarks/startup.py

@@ -28,7 +28,7 @@ class Serve:
 
     Decides at once by its LLM-free policy, and by the LLM as soon as that is loaded (watch /readyz). With no
     AICVDS_LLM_URL it embeds SmolLM2-135M; `aicvds model fetch` brings the file. Everything else is set by
-    environment variables AICVDS_*: see the README's table of settings.
+    environment variables AICVDS_*: see the table in docs/operations.md.
 
     Try it:  curl localhost:8000/readyz
     """

@@ -37,7 +37,10 @@ FLOWN = {
     f"{BIN}aicvds simulate --world examples/pipeline_world --policy eof --out runs/pipeline_world": "--steps 2",
 }
 # The edge that the others are flown against is this one; the commands of "Who may ask" have an edge of their own.
-SERVED = [f"{BIN}aicvds serve"]
+SERVED = [
+    f"{BIN}aicvds serve",
+    f"AICVDS_LLM_URL=http://localhost:11434/v1 AICVDS_LLM_MODEL=qwen3:8b {BIN}aicvds serve",
+]
 KEYED = [
     f"KEY=$({BIN}aicvds keys add fleet-1 --file keys.json --scopes decide admin)",
     f"AICVDS_KEYS=keys.json {BIN}aicvds serve --host 0.0.0.0",
@@ -59,9 +62,10 @@ MADE = {
     "make faults": "ten minutes",
     "make fuzz": "some minutes; tests/service/test_fuzz.py is a short one",
     "make soak": "ten minutes",
+    "make docs": "tests/test_docs.py builds the pages",
 }
 # Run by tests/e2e/test_readme.py, as they stand.
-CURLED = "curl "
+CURLED, CURLED_ON = "curl ", ("README.md", "docs/guidance.md")
 
 
 def commands(page: Path) -> list[str]:
@@ -107,7 +111,7 @@ def test_every_command_is_in_a_list(page: str, command: str) -> None:
         command in KEYED,
         begins(command, PARSED),
         begins(command, MADE),
-        command.startswith(CURLED) and page == "README.md",
+        command.startswith(CURLED) and page in CURLED_ON,
     ]
     assert sum(listed) == 1, f"{page} shows {command!r}: run it in this test, or list it with the reason"
 
@@ -137,7 +141,8 @@ def shell(command: str, workspace: Path) -> str:
 
 
 def test_missions_are_flown_as_shown(workspace: Path) -> None:
-    with serving_edge() as (url, _):
+    # Who decides is not asked here, and the policy is the quickest.
+    with serving_edge(AICVDS_MODE="policy") as (url, _):
         for command, more in FLOWN.items():
             shell(f"{command} {more}".replace(EDGE, url), workspace)
         decided = httpx.get(f"{url}/metrics").text

@@ -1,4 +1,4 @@
-"""The README is true: its curl works as pasted, its tables are the code's."""
+"""The README and the docs are true: their curl works as pasted, their tables are the code's."""
 
 import json
 import re
@@ -15,10 +15,18 @@ from shared.wire import DecideResponse, Reason
 from tests.e2e.processes import serving_edge
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text()
+README, DECIDING, GUIDANCE, OPERATIONS = (
+    (ROOT / page).read_text() for page in ("README.md", "docs/deciding.md", "docs/guidance.md", "docs/operations.md")
+)
 
 
-DECIDE, GUIDE = (block.strip() for block in re.findall(r"```sh\n(curl .*?)```", README, re.DOTALL))
+def curls(page: str) -> str:
+    """A page's one block of them."""
+    [block] = re.findall(r"```sh\n(curl .*?)```", page, re.DOTALL)
+    return str(block).strip()
+
+
+DECIDE, GUIDE = curls(README), curls(GUIDANCE)
 
 
 def pasted(command: str, url: str) -> str:
@@ -51,7 +59,7 @@ def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
 
 
 def test_every_setting_and_its_default_is_in_the_table() -> None:
-    listed = dict(re.findall(r"^\| `(AICVDS_\w+)` \| ([^|]*?) ?\|", README, re.MULTILINE))
+    listed = dict(re.findall(r"^\| `(AICVDS_\w+)` \| ([^|]*?) ?\|", OPERATIONS, re.MULTILINE))
     assert listed.keys() == {f"AICVDS_{name.upper()}" for name in Settings.model_fields}
     defaults = Settings().model_dump(mode="json") | {
         "cache_dir": "~/.cache/aicvds",
@@ -74,7 +82,7 @@ def test_the_example_environment_has_the_real_defaults() -> None:
 
 @pytest.mark.parametrize("reason", Reason.__args__)  # type: ignore[attr-defined]
 def test_every_reason_is_explained(reason: str) -> None:
-    assert f"`{reason}`" in README
+    assert f"`{reason}`" in DECIDING
 
 
 def test_what_it_links_to_is_there() -> None:

@@ -1,0 +1,74 @@
+"""The documentation builds without a warning, needs nothing from elsewhere, and its Python runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.e2e.processes import serving_edge
+
+ROOT = Path(__file__).parents[1]
+# Where a reader is led, not what a page loads.
+LINKS = re.compile(r"<a [^>]*>")
+LOADED = re.compile(r'(?:src|href)="((?:https?:)?//[^"]+)"')
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `make docs` builds."""
+    out = tmp_path_factory.mktemp("site")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0 and not built.stderr, built.stderr
+    return out
+
+
+def test_every_page_is_built(site: Path) -> None:
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
+    assert pages and all((site / f"{page}.html").exists() for page in pages)
+    assert (site / "search" / "search_index.json").stat().st_size > 10_000
+
+
+def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
+    for page in site.glob("**/*.html"):
+        assert not LOADED.findall(LINKS.sub("", page.read_text(encoding="utf-8"))), page.name
+
+
+def test_equations_are_drawn(site: Path) -> None:
+    method = (site / "method.html").read_text(encoding="utf-8")
+    asked = (ROOT / "docs" / "method.md").read_text(encoding="utf-8").count("$$") // 2
+    assert asked > 5
+    assert method.count('<p class="equation"><svg') == asked
+    assert "arithmatex" not in method and "merror" not in method
+
+
+def blocks(page: str) -> str:
+    """A page's Python, as one program."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+
+
+def test_the_policy_shown_flies(capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    exec(blocks("your-policy.md").replace("range(5)", "range(1)"), names)
+    assert re.match(r"mine \[\d+\]\neof \[\d+\]\n$", capsys.readouterr().out)
+
+
+def test_the_client_shown_asks(capsys: pytest.CaptureFixture[str]) -> None:
+    with serving_edge(AICVDS_MODE="policy") as (url, _):
+        shown = blocks("quick-start.md")
+        assert '"http://localhost:8000"' in shown
+        exec(shown.replace('"http://localhost:8000"', f'"{url}", timeout_s=60'), {})
+    assert re.match(r"collect from [012] at \d+ m/s: policy\n$", capsys.readouterr().out)
