@@ -1,30 +1,24 @@
-"""The report's figures, each one a string of SVG fit to stand inline beside the others.
+"""The report's figures.
 
 Colours are Okabe and Ito's, which stay apart for colour-blind readers; lines differ in dashes and markers too.
 """
 
 from __future__ import annotations
 
-import io
-import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
-import matplotlib
-import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
+from simulator.drawing import Drawing, drawn
 from simulator.record import Decision, Tally, visits_per_sensor
 
 INK = "#222222"
@@ -68,51 +62,9 @@ MARKERS = {"llm": "o", "guided": "P", "value": "^", "policy": "D", "onboard": "o
 MAPS = 9
 # Of the area's side, from a sensor to its number.
 LABEL_OFFSET = 0.06
-WIDTH_IN = 9.0
 
-RC: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial", "sans-serif"],
-    "font.size": 11,
-    "axes.labelsize": 11,
-    "axes.titlesize": 12,
-    "axes.linewidth": 0.8,
-    "xtick.labelsize": 10,
-    "ytick.labelsize": 10,
-    "legend.fontsize": 10,
-    "legend.frameon": False,
-    "lines.linewidth": 1.8,
-    "text.parse_math": False,
-    "axes.formatter.use_mathtext": False,
-    "axes.unicode_minus": True,
-    "savefig.bbox": "tight",
-}
 
 _HALO = [withStroke(linewidth=2.5, foreground="white")]
-
-
-@contextmanager
-def _drawn(name: str, height_in: float, panels: tuple[int, int], out: list[str]) -> Iterator[list[Axes]]:
-    # A constant salt makes the ids, and so the whole text, the same on every run.
-    with matplotlib.style.context(["default", {**RC, "svg.hashsalt": name}]):
-        figure = Figure(figsize=(WIDTH_IN, height_in), layout="compressed")
-        yield list(figure.subplots(*panels, squeeze=False).flat)
-        out.append(_inline_svg(figure, name))
-
-
-def _inline_svg(figure: Figure, name: str) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    svg = buffer.getvalue()
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    # Every figure numbers its parts from 1; inline, the ids of all share one page.
-    svg = re.sub(r'\bid="', f'id="{name}-', svg)
-    svg = re.sub(r'href="#', f'href="#{name}-', svg)
-    svg = re.sub(r"url\(#", f"url(#{name}-", svg)
-    svg = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', "", svg, count=1)
-    return svg.replace("<svg", f'<svg role="img" aria-labelledby="{name}-caption"', 1)
 
 
 def _integers(axes: Axes, x: bool = True, y: bool = True) -> None:
@@ -120,6 +72,11 @@ def _integers(axes: Axes, x: bool = True, y: bool = True) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
     if y:
         axes.yaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
+
+
+def _legend_above(axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    axes.figure.legend(handles, labels, loc="outside upper center", ncols=3)
 
 
 def plain(axes: Axes) -> None:
@@ -131,7 +88,7 @@ def plain(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> str:
+def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> Drawing:
     """One map a UAV (the first nine): its trajectory, its waypoints coloured by round trip, all sensors.
 
     ``sensor_xy`` is (J, 2) in metres. The marker says who decided; what was decided on board is hollow.
@@ -141,8 +98,8 @@ def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[D
     rows = -(-shown // columns)
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
     scale = Normalize(min(trips), max(trips)) if trips else Normalize(0.0, 1.0)
-    out: list[str] = []
-    with _drawn("latency-map", 3.0 * rows + 0.5, (rows, columns), out) as panels:
+    out: list[Drawing] = []
+    with drawn("latency-map", 2.1 * rows + 0.4, (rows, columns), out) as panels:
         for extra in panels[shown:]:
             extra.set_visible(False)
         for uav in range(shown):
@@ -199,9 +156,9 @@ def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Dec
     tail = flown[0] + 0.06 * scenario.area_m * left
     tip = tail + 0.15 * scenario.area_m * ahead
     label = flown[0] + 0.15 * scenario.area_m * left
-    axes.annotate("", tuple(tip), tuple(tail), arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.4}, zorder=6)
+    axes.annotate("", tuple(tip), tuple(tail), arrowprops={"arrowstyle": "-|>", "color": RED, "lw": 1.1}, zorder=6)
     axes.text(
-        label[0], label[1], "start", color=RED, fontsize=9, ha="center", va="center", zorder=7, path_effects=_HALO
+        label[0], label[1], "start", color=RED, fontsize=7, ha="center", va="center", zorder=7, path_effects=_HALO
     )
     return [tail, tip, label]
 
@@ -209,7 +166,7 @@ def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Dec
 def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: list[np.ndarray]) -> None:
     few = len(sensor_xy) <= 20
     axes.scatter(
-        sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=42 if few else 10, color=INK, edgecolors="white", zorder=5
+        sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=27 if few else 6, color=INK, edgecolors="white", zorder=5
     )
     crowd = [*drawn, *sensor_xy]
     reach = LABEL_OFFSET * scenario.area_m
@@ -219,7 +176,7 @@ def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: l
         spot = max(spots, key=lambda s: min((float(np.hypot(*(s - other))) for other in crowd), default=0.0))
         crowd.append(spot)
         axes.text(
-            spot[0], spot[1], str(j), fontsize=9, color=INK, ha="center", va="center", zorder=7, path_effects=_HALO
+            spot[0], spot[1], str(j), fontsize=7, color=INK, ha="center", va="center", zorder=7, path_effects=_HALO
         )  # fmt: skip
 
 
@@ -229,34 +186,34 @@ def _map_waypoints(axes: Axes, mine: Sequence[Decision], scale: Normalize) -> No
         x, y, trips = np.array(asked, dtype=float).reshape(-1, 3).T
         axes.scatter(
             x, y, c=trips, cmap="viridis", norm=scale, marker=marker,
-            s=46, edgecolors="white", linewidths=0.5, zorder=3,
+            s=30, edgecolors="white", linewidths=0.5, zorder=3,
         )  # fmt: skip
     onboard = np.array([d.position for d in mine if d.rtt_ms is None]).reshape(-1, 2)
     axes.scatter(
-        onboard[:, 0], onboard[:, 1], s=40, marker=MARKERS["onboard"], facecolors="none", edgecolors=RED,
+        onboard[:, 0], onboard[:, 1], s=26, marker=MARKERS["onboard"], facecolors="none", edgecolors=RED,
         linewidths=1.4, zorder=4,
     )  # fmt: skip
 
 
-def latency_per_step(decisions: Sequence[Decision]) -> str:
+def latency_per_step(decisions: Sequence[Decision]) -> Drawing:
     """Round trip over the steps, apart for each source: the median of the fleet, the range from fastest to slowest."""
     trips: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for d in decisions:
         if d.rtt_ms is not None:
             trips[d.source][d.step].append(d.rtt_ms)
-    out: list[str] = []
-    with _drawn("latency-steps", 3.0, (1, 1), out) as (axes,):
+    out: list[Drawing] = []
+    with drawn("latency-steps", 2.2, (1, 1), out) as (axes,):
         for source in (name for name in SOURCES if name in trips):
             by_step, colour = trips[source], SOURCES[source]
             steps = sorted(by_step)
             medians = [float(np.median(by_step[s])) for s in steps]
             low, high = [min(by_step[s]) for s in steps], [max(by_step[s]) for s in steps]
-            axes.vlines(steps, low, high, color=colour, alpha=0.3, linewidth=5)
+            axes.vlines(steps, low, high, color=colour, alpha=0.3, linewidth=3.5)
             axes.plot(
-                steps, medians, color=colour, marker=MARKERS[source], ms=5, linestyle="", label=source, clip_on=False
+                steps, medians, color=colour, marker=MARKERS[source], ms=4, linestyle="", label=source, clip_on=False
             )
         if trips:
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.17), ncols=len(trips))
+            _legend_above(axes)
             axes.set_ylim(bottom=0)
         axes.set_xlabel("step")
         axes.set_ylabel("round trip (ms)")
@@ -265,14 +222,14 @@ def latency_per_step(decisions: Sequence[Decision]) -> str:
     return out[0]
 
 
-def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> str:
+def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Drawing:
     """Lost packets and loss events of every policy, per step and cumulative; ``names`` labels the policies."""
     measures: tuple[tuple[str, Callable[[Tally], int]], ...] = (
         ("lost packets", lambda t: t.lost_packets),
         ("loss events", lambda t: t.failures + t.overflows),
     )
-    out: list[str] = []
-    with _drawn("losses", 6.0, (2, 2), out) as panels:
+    out: list[Drawing] = []
+    with drawn("losses", 4.8, (2, 2), out) as panels:
         for row, (title, measure) in enumerate(measures):
             for name, tally in tallies.items():
                 colour, dash, marker = POLICIES.get(name, OTHER_POLICY)
@@ -280,7 +237,7 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> str
                 for axes, series in ((panels[2 * row], values), (panels[2 * row + 1], values.cumsum())):
                     axes.plot(
                         np.arange(len(series)), series, color=colour, linestyle=dash, marker=marker,
-                        markersize=3.5, label=names.get(name, name),
+                        markersize=2.8, label=names.get(name, name),
                     )  # fmt: skip
             panels[2 * row].set_ylabel(f"{title} a step")
             panels[2 * row + 1].set_ylabel(f"{title}, cumulative")
@@ -296,15 +253,15 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> str
     return out[0]
 
 
-def tokens_per_step(decisions: Sequence[Decision]) -> str:
+def tokens_per_step(decisions: Sequence[Decision]) -> Drawing:
     """Tokens a decision, averaged over the fleet at each step: the prompt and its state block, as sent and in full."""
     by_step = defaultdict(list)
     for d in decisions:
         if d.tokens is not None:
             by_step[d.step].append(d.tokens)
     steps = sorted(by_step)
-    out: list[str] = []
-    with _drawn("tokens", 3.4, (1, 2), out) as panels:
+    out: list[Drawing] = []
+    with drawn("tokens", 2.7, (1, 2), out) as panels:
         for axes, sent, full, title in (
             (panels[0], "prompt", "uncompressed", "whole prompt"),
             (panels[1], "state", "state_uncompressed", "state block"),
@@ -314,7 +271,7 @@ def tokens_per_step(decisions: Sequence[Decision]) -> str:
                 (sent, "as sent", AS_SENT),
             ):
                 means = [float(np.mean([getattr(t, key) for t in by_step[s]])) for s in steps]
-                axes.plot(steps, means, color=colour, linestyle=dash, marker=marker, markersize=3.5, label=label)
+                axes.plot(steps, means, color=colour, linestyle=dash, marker=marker, markersize=2.8, label=label)
             axes.set_title(title)
             axes.set_xlabel("step")
             axes.set_ylim(bottom=0)
@@ -326,12 +283,12 @@ def tokens_per_step(decisions: Sequence[Decision]) -> str:
     return out[0]
 
 
-def visits(decisions: Sequence[Decision], sensors: int) -> str:
+def visits(decisions: Sequence[Decision], sensors: int) -> Drawing:
     """Visits of each sensor: served ones, and failed ones on top."""
     served = np.array(visits_per_sensor(decisions, sensors))
     tried = np.bincount([d.sensor_id for d in decisions], minlength=sensors)[:sensors]
-    out: list[str] = []
-    with _drawn("visits", 3.0, (1, 1), out) as (axes,):
+    out: list[Drawing] = []
+    with drawn("visits", 2.2, (1, 1), out) as (axes,):
         at = np.arange(sensors)
         axes.bar(at, served, color=BLUE, label="served")
         missed = np.flatnonzero(tried > served)
@@ -351,15 +308,15 @@ def visits(decisions: Sequence[Decision], sensors: int) -> str:
         axes.set_ylabel("visits")
         plain(axes)
         _integers(axes, x=False)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.2), ncols=3)
+        _legend_above(axes)
     return out[0]
 
 
-def deciders(decisions: Sequence[Decision]) -> str:
+def deciders(decisions: Sequence[Decision]) -> Drawing:
     """Who took the decisions of each step, as stacked bars."""
     steps = sorted({d.step for d in decisions})
-    out: list[str] = []
-    with _drawn("deciders", 2.6, (1, 1), out) as (axes,):
+    out: list[Drawing] = []
+    with drawn("deciders", 2.0, (1, 1), out) as (axes,):
         below = np.zeros(len(steps))
         for source, colour in SOURCES.items():
             counts = np.array([sum(d.step == s and d.source == source for d in decisions) for s in steps], dtype=float)
@@ -371,5 +328,5 @@ def deciders(decisions: Sequence[Decision]) -> str:
         plain(axes)
         _integers(axes)
         if steps:
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=len(SOURCES))
+            _legend_above(axes)
     return out[0]

@@ -13,10 +13,12 @@ from rich.table import Table
 
 from shared.scenario import Scenario
 from simulator import figures
+from simulator.drawing import Drawing
 from simulator.policies.reach import cruise_velocity
 from simulator.record import Decision, Summary, Tally, told_sources
 
 COSTLIEST_DECISIONS = 15
+FIGURES = "figures"
 # Of the decisions, that the LLM must have taken for the mission to count as the LLM's.
 LLM_SHARE = 0.9
 NAMES = {
@@ -90,14 +92,14 @@ def costliest(decisions: Sequence[Decision]) -> list[Decision]:
     return sorted(decisions, key=lambda d: (-d.cost, d.step, d.uav_id))[:COSTLIEST_DECISIONS]
 
 
-def render_report(
+def drawings(
     summary: Summary,
     scenario: Scenario,
     decisions: Sequence[Decision],
     tallies: Mapping[str, Sequence[Tally]],
     sensor_xy: np.ndarray,
-) -> str:
-    """The page as HTML.
+) -> dict[str, Drawing]:
+    """The figures that this mission has, by their place in the page.
 
     Args:
         summary: what ``summary.json`` holds.
@@ -106,12 +108,8 @@ def render_report(
         tallies: per policy, one entry a step flown.
         sensor_xy: (J, 2), metres.
     """
-    pages = Environment(loader=PackageLoader("simulator", "."), autoescape=True, undefined=StrictUndefined)
-    pages.trim_blocks = pages.lstrip_blocks = True
-    pages.filters["number"] = number
-    labels = policy_labels(summary)
     drawn = {
-        "losses": figures.losses(tallies, labels),
+        "losses": figures.losses(tallies, policy_labels(summary)),
         "visits": figures.visits(decisions, scenario.sensors),
     }
     if summary.policy == "edge":
@@ -120,6 +118,17 @@ def render_report(
         drawn["deciders"] = figures.deciders(decisions)
     if summary.llm_asked:
         drawn["tokens"] = figures.tokens_per_step(decisions)
+    return drawn
+
+
+def render_report(
+    summary: Summary, scenario: Scenario, decisions: Sequence[Decision], drawn: Mapping[str, Drawing]
+) -> str:
+    """The page as HTML; arguments as for ``drawings``, and what it returned."""
+    pages = Environment(loader=PackageLoader("simulator", "."), autoescape=True, undefined=StrictUndefined)
+    pages.trim_blocks = pages.lstrip_blocks = True
+    pages.filters["number"] = number
+    labels = policy_labels(summary)
     return pages.get_template("report.html.j2").render(
         s=summary,
         ours=next(iter(summary.lost_packets)),
@@ -129,7 +138,7 @@ def render_report(
         sources=summary.by_source.present(),
         scenario=scenario,
         cruise=cruise_velocity(scenario),
-        figures={name: Markup(svg) for name, svg in drawn.items()},
+        figures={name: Markup(one.inline) for name, one in drawn.items()},
         costliest=costliest(decisions),
         maps=min(scenario.uavs, figures.MAPS),
     )
@@ -143,12 +152,17 @@ def write_report(
     tallies: Mapping[str, Sequence[Tally]],
     sensor_xy: np.ndarray,
 ) -> None:
-    """Write the page; arguments as for ``render_report``.
+    """Write the page, and beside it its figures for print into ``figures/``; arguments as for ``drawings``.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: a file cannot be written.
     """
-    path.write_text(render_report(summary, scenario, decisions, tallies, sensor_xy), encoding="utf-8")
+    drawn = drawings(summary, scenario, decisions, tallies, sensor_xy)
+    path.write_text(render_report(summary, scenario, decisions, drawn), encoding="utf-8")
+    folder = path.parent / FIGURES
+    folder.mkdir(exist_ok=True)
+    for one in drawn.values():
+        one.write(folder)
 
 
 def show(summary: Summary, console: Console) -> None:

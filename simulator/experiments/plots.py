@@ -22,13 +22,13 @@ from matplotlib.axis import XAxis, YAxis
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator, SymmetricalLogLocator
 
+from simulator.drawing import DOUBLE_IN, RC, SINGLE_IN
 from simulator.experiments.result import Figure, Interval, Result
-from simulator.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RC, RED, SKY, plain
+from simulator.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
 from simulator.report import NAMES
 
 Format = Literal["png", "svg", "pdf"]
 FORMATS: tuple[Format, ...] = ("png", "svg", "pdf")
-SINGLE_IN, DOUBLE_IN = 3.5, 7.16
 # Past this ratio of the largest to the smallest mean, the smaller schemes would be slivers on a linear axis.
 LOG_PAST = 30.0
 # Where the least is more than this of the most, bars from zero would all look alike.

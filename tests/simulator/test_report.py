@@ -11,7 +11,16 @@ from shared.scenario import SCENARIOS, Scenario
 from simulator import figures
 from simulator.mission import Flight, LocalPilot, baselines, fly
 from simulator.record import Decision, DecisionLog, Summary, jain_index, read_decisions, summarise, visits_per_sensor
-from simulator.report import costliest, llm_notice, number, policy_labels, render_report, verdict, write_report
+from simulator.report import (
+    costliest,
+    drawings,
+    llm_notice,
+    number,
+    policy_labels,
+    render_report,
+    verdict,
+    write_report,
+)
 from simulator.site import Site
 
 SHORT = Scenario(steps=5)
@@ -27,7 +36,10 @@ def decision(**changes: object) -> Decision:
 def page(flight: Flight, model: str | None = "stub-1", decisions: list[Decision] | None = None) -> str:
     seen = flight.decisions if decisions is None else decisions
     tallies = {"aic_vds": flight.tally, **baselines(Site(flight.scenario), 0, flight.steps_flown)}
-    return render_report(summary_of(flight, model), flight.scenario, seen, tallies, flight.sensor_xy)
+    summary = summary_of(flight, model)
+    return render_report(
+        summary, flight.scenario, seen, drawings(summary, flight.scenario, seen, tallies, flight.sensor_xy)
+    )
 
 
 def summary_of(flight: Flight, model: str | None) -> Summary:
@@ -106,9 +118,9 @@ def test_a_local_policys_page_has_nothing_of_an_edge() -> None:
         policy="eof", edge=None, mission_id="m", mode=None, model=None, deadline_ms=None, command="c"
     )  # fmt: skip
     tallies = {"eof": flown.tally}
-    html = render_report(
-        summarise(facts, flown.decisions, tallies), SHORT, flown.decisions, tallies, flown.sensor_xy
-    )  # fmt: skip
+    summary = summarise(facts, flown.decisions, tallies)
+    drawn = drawings(summary, SHORT, flown.decisions, tallies, flown.sensor_xy)
+    html = render_report(summary, SHORT, flown.decisions, drawn)
     for absent in ("latency", "tokens", "deciders"):
         assert f'<section id="{absent}">' not in html
     assert "round trip" not in html and "<dt>edge</dt>" not in html and "135 million" not in html
@@ -116,7 +128,7 @@ def test_a_local_policys_page_has_nothing_of_an_edge() -> None:
 
 
 def test_a_policy_has_one_colour_on_every_page(flight: Flight) -> None:
-    alone = figures.losses({"eof": flight.tally}, {})
+    alone = figures.losses({"eof": flight.tally}, {}).inline
     assert figures.POLICIES["eof"][0].lower() in alone and figures.POLICIES["aic_vds"][0].lower() not in alone
 
 
@@ -179,6 +191,25 @@ def test_a_large_fleet_fits(tmp_path: Path) -> None:
         tmp_path / "r.html", summary_of(flown, None), world, flown.decisions, {"a": flown.tally}, np.zeros((100, 2))
     )
     assert "The first 9 of 10 UAVs are shown" in (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_figures_are_written_for_print(tmp_path: Path) -> None:
+    flown = fly(Site(SHORT), LocalPilot("random", SHORT, 0), seed=0)
+    summary = summary_of(flown, None)
+    for out in (tmp_path / "a", tmp_path / "b"):
+        out.mkdir()
+        write_report(out / "r.html", summary, SHORT, flown.decisions, {"aic_vds": flown.tally}, flown.sensor_xy)
+    html = (tmp_path / "a" / "r.html").read_text(encoding="utf-8")
+    assert "seed 0" in html and "<code>aicvds simulate</code>" in html
+    widths = {"losses": 7.16, "latency-map": 7.16, "visits": 3.5, "deciders": 3.5, "latency-steps": 3.5}
+    for name, width in widths.items():
+        assert f"figures/{name}.pdf" in html
+        pdf, svg = ((tmp_path / "a" / "figures" / f"{name}.{kind}").read_bytes() for kind in ("pdf", "svg"))
+        [box] = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) [\d.]+ \]", pdf)
+        assert float(box) == pytest.approx(72 * width)
+        assert b"/FontFile2" in pdf and b"<text" in svg
+        assert pdf == (tmp_path / "b" / "figures" / f"{name}.pdf").read_bytes()
+        assert svg == (tmp_path / "b" / "figures" / f"{name}.svg").read_bytes()
 
 
 def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:

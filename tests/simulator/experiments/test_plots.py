@@ -7,7 +7,8 @@ from xml.etree import ElementTree
 import pytest
 from PIL import Image
 
-from simulator.experiments.plots import BOUND_LABEL, DOUBLE_IN, SINGLE_IN, draw, label_of, styles
+from simulator.drawing import DOUBLE_IN, SINGLE_IN
+from simulator.experiments.plots import BOUND_LABEL, draw, label_of, styles
 from simulator.experiments.result import Result, Sweep
 from tests.simulator.experiments.made_results import CURVES, figure, interval, result, zero_from
 
