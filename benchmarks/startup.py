@@ -35,7 +35,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from service.routes import EXAMPLE
+from service.openapi import STATE
 
 GOAL_RATIO, GOAL_HELP_S = 1.5, 0.3
 AICVDS = str(Path(sys.executable).with_name("aicvds"))
@@ -105,7 +105,7 @@ def _timed(env: dict[str, str]) -> dict[str, Callable[[], float]]:
 
 def _request() -> dict[str, object]:
     """The first of a new mission, so that none has to be read back; patient, so that a busy machine refuses none."""
-    return {**EXAMPLE, "mission_id": uuid.uuid4().hex, "deadline_ms": 60_000}
+    return {**STATE, "step": 0, "mission_id": uuid.uuid4().hex, "deadline_ms": 60_000}
 
 
 def _ended(command: list[str], env: dict[str, str]) -> float:
