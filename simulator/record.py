@@ -16,6 +16,13 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from shared.wire import Candidate, Tokens
 
 SUMMARY, DECISIONS, REPORT, REQUESTS = "summary.json", "decisions.jsonl", "report.html", "requests.jsonl"
+FIGURES = "figures"
+# The figures that a mission may have, for print.
+DRAWN = tuple(
+    f"{FIGURES}/{name}.{kind}"
+    for name in ("latency-map", "latency-steps", "losses", "tokens", "visits", "deciders")
+    for kind in ("svg", "pdf")
+)
 LATE_SLACK_MS = 50.0
 # Reasons with which the LLM was asked, and its answer or its silence not used.
 _ASKED_IN_VAIN = frozenset(
@@ -180,7 +187,7 @@ def refuse_old_result(out: Path, overwrite: bool, result: str = SUMMARY) -> None
         raise BadUse(f"--out {out} holds {what} already; choose another folder or add --overwrite")
 
 
-def fresh_folder(out: Path, stale: Iterable[str] = (SUMMARY, REPORT, REQUESTS)) -> None:
+def fresh_folder(out: Path, stale: Iterable[str] = (SUMMARY, REPORT, REQUESTS, *DRAWN)) -> None:
     """Make the folder, without the earlier mission's files that would stand beside another's decisions.
 
     Raises:

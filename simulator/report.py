@@ -15,10 +15,9 @@ from shared.scenario import Scenario
 from simulator import figures
 from simulator.drawing import Drawing
 from simulator.policies.reach import cruise_velocity
-from simulator.record import Decision, Summary, Tally, told_sources
+from simulator.record import FIGURES, Decision, Summary, Tally, told_sources
 
 COSTLIEST_DECISIONS = 15
-FIGURES = "figures"
 # Of the decisions, that the LLM must have taken for the mission to count as the LLM's.
 LLM_SHARE = 0.9
 NAMES = {

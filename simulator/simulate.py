@@ -31,6 +31,7 @@ from simulator.commandline import (
 )
 from simulator.record import (
     DECISIONS,
+    FIGURES,
     REPORT,
     REQUESTS,
     SUMMARY,
@@ -385,6 +386,6 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
 
         write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, flight.sensor_xy)
     show(summary, console)
-    for name in (SUMMARY, DECISIONS, REPORT, *((REQUESTS,) if job.edge else ())):
+    for name in (SUMMARY, DECISIONS, REPORT, FIGURES, *((REQUESTS,) if job.edge else ())):
         console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)
     return INTERRUPTED if flight.interrupted else 0

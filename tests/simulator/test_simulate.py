@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from simulator import demo, simulate
-from simulator.record import Summary, read_decisions
+from simulator.record import DRAWN, Summary, read_decisions
 from tests.simulator.edge_stub import EdgeStub, stub_edge
 
 
@@ -31,7 +31,9 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
     out = tmp_path / "run"
     code = simulate.main(["--edge", stub.url, "--steps", "3", "--seed", "4", "--deadline-ms", "900", "--out", str(out)])
     assert code == 0
-    assert sorted(p.name for p in out.iterdir()) == ["decisions.jsonl", "report.html", "requests.jsonl", "summary.json"]
+    left = ["decisions.jsonl", "figures", "report.html", "requests.jsonl", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == left
+    assert {str(p.relative_to(out)) for p in (out / "figures").iterdir()} == set(DRAWN)
     summary = summary_in(out)
     assert (summary.seed, summary.steps, summary.decisions, summary.deadline_ms) == (4, 3, 9, 900)
     assert len(read_decisions(out / "decisions.jsonl")) == 9
@@ -63,7 +65,9 @@ def test_an_old_result_is_kept_unless_told(tmp_path: Path, capsys: pytest.Captur
     assert simulate.main(arguments) == 0
     assert simulate.main(arguments) == 2
     assert "--overwrite" in capsys.readouterr().err
+    (tmp_path / "figures" / "tokens.pdf").write_text("of a mission that an LLM flew")
     assert simulate.main([*arguments, "--overwrite"]) == 0
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"losses", "visits"}
 
 
 def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
