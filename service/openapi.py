@@ -159,7 +159,21 @@ ANSWERS: dict[tuple[str, str], Any] = {
         "constraint": "grammar",
         "detail": None,
     },
-    ("get", "/"): {"service": "AIC-VDS edge", "version": "0.1.0", "docs": "/docs", "metrics": "/metrics"},
+    ("get", "/missions"): {
+        "missions": [
+            {"mission_id": "patrol", "mode": "guided", "decisions": 3},
+            {"mission_id": "asleep", "mode": None, "decisions": None},
+        ],
+        "more": 0,
+        "newest": "patrol",
+    },
+    ("get", "/missions/{mission_id}/decisions/{decision_id}/prompt"): {
+        "decision_id": DECISION_ID,
+        "asked": True,
+        "static": "Each row is one sensor, the best first, with five numbers: ...",
+        "experiences": "52,-90,2,140 > 3 7: 0.0\n",
+        "state": "0,52,-83,0,106\n2,33,-109,0,320\n",
+    },
 }  # fmt: skip
 
 # Status to the field at fault and what is wrong with it.

@@ -59,6 +59,7 @@ MADE = {
     "make install": "what runs this was installed by it",
     "make demo": "`aicvds demo` is `serve` and `simulate`, which are run here",
     "make test": "this is part of it",
+    "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
     "make fuzz": "some minutes; tests/service/test_fuzz.py is a short one",
     "make soak": "ten minutes",

@@ -29,7 +29,8 @@ Start = Callable[..., tuple[str, subprocess.Popen[str]]]
 Open = Callable[..., Page]
 
 
-@pytest.fixture(scope="session")
+# Playwright runs an event loop in this thread as long as it lives: tests of other files could run none.
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     found = shutil.which("chromium") or shutil.which("google-chrome")
     if found is None:

@@ -78,7 +78,8 @@ def test_a_real_edge_takes_every_example_and_answers_as_the_examples_do() -> Non
                     decision_id = answer.json()["decision_id"]
         for method, path in ANSWERS:
             if method == "get":
-                answer = http.get(path.format(mission_id="preset"))
+                mission_id = "default" if "decision_id" in path else "preset"
+                answer = http.get(path.format(mission_id=mission_id, decision_id=decision_id))
                 assert answer.status_code == 200
                 assert answer.json().keys() == ANSWERS[method, path].keys()
                 check(
