@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
+import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Literal
 
@@ -18,6 +20,7 @@ log = logging.getLogger(__name__)
 
 # Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
 _MAX_LESSONS = 256
+_TELL_S = 10.0
 
 
 class Outcomes:
@@ -29,6 +32,7 @@ class Outcomes:
         self._keeper = keeper
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._room = threading.Semaphore(_MAX_LESSONS)
+        self._missed, self._tell_at = 0, -math.inf
         # Before the first lesson, and beside the first decisions.
         self._learning.submit(rehearse)
 
@@ -49,9 +53,16 @@ class Outcomes:
             elif taught:
                 self._room.release()
             elif sample is not None:
-                log.warning("mission %s: learning falls behind, an outcome is not learned from", mission.mission_id)
+                self._miss()
         self._metrics.feedback.labels(result).inc()
         return result
+
+    def _miss(self) -> None:
+        """One line now and then: where learning falls behind, hundreds of outcomes a second are not learned from."""
+        self._missed += 1
+        if (now := time.monotonic()) >= self._tell_at:
+            log.warning("learning falls behind: %d outcomes are not learned from", self._missed)
+            self._missed, self._tell_at = 0, now + _TELL_S
 
     def checkpoint(self, mission: Mission, least: int | None = None) -> Future[None] | None:
         """Begin to keep the mission's whole state, once what happened until now is learned; None where none is due.

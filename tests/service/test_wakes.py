@@ -214,7 +214,7 @@ def test_while_the_store_fails_nothing_is_deleted_made_or_confirmed(tmp_path: Pa
 
 
 def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
-    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(outcomes, "_MAX_LESSONS", 1)
     learn = outcomes.learn
@@ -230,6 +230,8 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
         time.sleep(0.5)
         assert 0 < mission.learner.updates < 15
         assert mission.feedback == 15
+        # Not a line for each.
+        assert sum("falls behind" in line.message for line in caplog.records) == 1
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
         store = Store(str(copied))
         kept = store.load("test")
