@@ -78,7 +78,7 @@ def test_kills_under_load(tmp_path: Path, report: Report, tables: Tables) -> Non
     for kill in range(KILLS + 1):
         began = time.perf_counter()
         with serving_edge(**settings) as (url, process), httpx.Client(base_url=url, timeout=30) as client:
-            client.get("/healthz").raise_for_status()
+            client.get("/readyz").raise_for_status()
             starts.append(time.perf_counter() - began)
             if kill:
                 # What the others acknowledge meanwhile is not in the count yet.
@@ -136,11 +136,11 @@ def lengthen(path: Path, rows: int, each: int) -> int:
 
 
 def start_s(path: Path) -> tuple[float, float]:
-    """Seconds until a process answers ``/healthz``, and until it has read a mission back."""
+    """Seconds until a process can decide, and until it has read a mission back."""
     began = time.perf_counter()
     settings = {"AICVDS_STORE": str(path), "AICVDS_MODE": "value", "AICVDS_MAX_MISSIONS": "10000"}
     with serving_edge(**settings) as (url, _), httpx.Client(base_url=url, timeout=60) as client:
-        client.get("/healthz").raise_for_status()
+        client.get("/readyz").raise_for_status()
         started = time.perf_counter()
         status = client.get(f"/missions/{'copy7' if path.stem == 'long' else 'test'}")
         assert (status.status_code, status.json()["decisions"]) == (200, 80)
