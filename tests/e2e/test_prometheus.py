@@ -177,10 +177,22 @@ def scraping(edge: str, simulator: int, folder: Path) -> Iterator[httpx.Client]:
         )
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+            ends = time.monotonic() + 60
+            while not ready(client):
+                assert time.monotonic() < ends and process.poll() is None, (folder / "prometheus.log").read_text()
+                time.sleep(0.1)
             yield client
     finally:
         process.kill()
         process.wait()
+
+
+def ready(prometheus: httpx.Client) -> bool:
+    """Whether it has started: before, it takes no connections, and then answers 503."""
+    try:
+        return prometheus.get("/-/ready").status_code == 200
+    except httpx.TransportError:
+        return False
 
 
 def has_data(prometheus: httpx.Client, expression: str) -> bool:
@@ -194,11 +206,7 @@ def lacking(prometheus: httpx.Client, expressions: set[str], seconds: float) -> 
     """Those that have returned no data within the time."""
     ends = time.monotonic() + seconds
     while expressions and time.monotonic() < ends:
-        try:
-            expressions = {expression for expression in expressions if not has_data(prometheus, expression)}
-        except httpx.TransportError:
-            # It is still starting.
-            time.sleep(0.5)
+        expressions = {expression for expression in expressions if not has_data(prometheus, expression)}
         time.sleep(0.5)
     return expressions
 
