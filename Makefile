@@ -18,7 +18,7 @@ help:
 	@echo "make test      install, run the tests"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      build the documentation into site/, to be read without a network"
-	@echo "make bench     how fast the edge and its LLM are, side by side with others: runs/*.json, 15 minutes"
+	@echo "make bench     how fast the edge and its LLM are, side by side with others: runs/*.json"
 	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
 	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
 	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
