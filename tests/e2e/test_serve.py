@@ -1,11 +1,14 @@
 """``aicvds`` and ``aicvds serve`` as processes."""
 
 import asyncio
+import json
 import re
 import signal
+import socket
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +146,25 @@ def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable
         answer = waiting.result(timeout=30)
         process.wait(timeout=15)
     assert (answer.status_code, answer.json()["reason"]) == (200, "llm_timeout")
+
+
+def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..., dict[str, Any]]) -> None:
+    body = json.dumps(report()).encode()
+    head = "POST /decide HTTP/1.1\r\nHost: edge\r\nContent-Type: application/json\r\n"
+    head += f"Content-Length: {len(body)}\r\n\r\n"
+    with serving_edge(AICVDS_MODE="policy") as (url, process):
+        assert httpx.get(f"{url}/readyz", timeout=60).status_code == 200
+        door = ("127.0.0.1", int(url.rpartition(":")[2]))
+        with socket.create_connection(door) as early:
+            process.send_signal(signal.SIGTERM)
+            with suppress(OSError):
+                while True:
+                    socket.create_connection(door).close()
+                    time.sleep(0.01)
+            early.sendall(head.encode() + body)
+            early.settimeout(10)
+            assert early.recv(65536).startswith(b"HTTP/1.1 200")
+        process.wait(timeout=15)
 
 
 def test_empty_variables_are_unset_ones(tmp_path: Path) -> None:
