@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from service.learner import Sample
+from service.gradient import Sample
 from service.packing import pack, unpack
 from service.repeats import Answered
 from service.rows import Cells

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from service.features import State
-from service.learner import Sample
+from service.gradient import Sample
 from service.mission import Mission
 from service.policy import decide_without_llm
 from service.reach import Reach, distances_ahead

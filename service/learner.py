@@ -1,12 +1,11 @@
 """Online value regression: both modules learn the realised cost of what was decided, one Adam step a feedback.
 
 A mission keeps only numbers, its weights and Adam's moments: an edge flies thousands, and torch's modules take more
-memory than what they compute with. The modules are the learning thread's, lent for each lesson.
+memory than what they compute with.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
@@ -19,26 +18,13 @@ from torch import Tensor, nn
 from service.adam import Moments, stepped
 from service.attention import Attention, AttentionWeights, attend
 from service.features import FEATURES
+from service.gradient import Parameters, Sample, descend
 from service.reach import LEVEL_FEATURES
 from service.velocity import ReachVelocityScorer, VelocityScorer, VelocityWeights, by_distance, by_reach
 from shared.wire import Features
 
 # Numbers that torch computes at once: a parameter of so many, or a multiple, is computed the same wherever it lies.
 _AT_ONCE = 32
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One decision as the modules saw it.
-
-    ``features`` are the admissible sensors' ``(n, d)``, ``chosen`` the row that was decided for, ``approach``
-    what the velocity scorer was told of that sensor (see :meth:`State.approach`), ``velocity`` the level flown.
-    """
-
-    features: NDArray[np.float32]
-    chosen: int
-    approach: NDArray[np.float32]
-    velocity: int
 
 
 class Weights:
@@ -100,70 +86,41 @@ class Modules(nn.Module):
 class Layout:
     """Where each parameter of a preset's modules stands in one array of numbers: those that fill lines first.
 
-    ``names`` and ``shapes`` are in the modules' own order.
+    ``names``, ``shapes`` and ``starts`` are in the modules' own order.
     """
 
     preset: Features
     names: tuple[str, ...]
     shapes: tuple[torch.Size, ...]
+    starts: tuple[int, ...]
 
     @classmethod
     def of(cls, modules: Modules) -> Self:
         """The modules' own."""
         names, parameters = zip(*modules.named_parameters(), strict=True)
-        return cls(modules.preset, names, tuple(p.shape for p in parameters))
-
-    @property
-    def _order(self) -> list[int]:
-        return sorted(range(len(self.shapes)), key=lambda index: self.shapes[index].numel() % _AT_ONCE != 0)
+        shapes = tuple(p.shape for p in parameters)
+        starts, end = dict[int, int](), 0
+        for index in sorted(range(len(shapes)), key=lambda index: shapes[index].numel() % _AT_ONCE != 0):
+            starts[index], end = end, end + shapes[index].numel()
+        return cls(modules.preset, names, shapes, tuple(starts[index] for index in range(len(shapes))))
 
     def views(self, flat: Tensor) -> list[Tensor]:
         """The parameters' places in the array, in the modules' order."""
-        order = self._order
-        parts = torch.split(flat, [self.shapes[index].numel() for index in order])
-        placed = {index: part.view(self.shapes[index]) for index, part in zip(order, parts, strict=True)}
-        return [placed[index] for index in range(len(order))]
+        return [flat[a : a + s.numel()].view(s) for a, s in zip(self.starts, self.shapes, strict=True)]
+
+    def arrays(self, flat: Tensor) -> Parameters:
+        """The same places as numpy has them."""
+        numbers = flat.numpy()
+        return Parameters(
+            *(numbers[a : a + s.numel()].reshape(s) for a, s in zip(self.starts, self.shapes, strict=True))
+        )
 
     def flat(self, parameters: Sequence[Tensor]) -> Tensor:
         """The array of parameters in the modules' order; raises ``RuntimeError`` where they have other shapes."""
         if [p.shape for p in parameters] != list(self.shapes):
             raise RuntimeError(f"of other modules than preset {self.preset}'s with these velocity levels")
-        return torch.cat([parameters[index].reshape(-1) for index in self._order])
-
-
-class Workbench:
-    """Modules that are whichever mission's learns just then: thousands share them."""
-
-    def __init__(self, layout: Layout) -> None:
-        # Preset `paper` has its levels in the last parameter; preset `reach` needs no number of them.
-        modules = Modules(layout.preset, layout.shapes[-1].numel(), seed=0)
-        self._modules, self._layout = modules, layout
-        self._parameters = list(modules.parameters())
-        self._weights = modules.weights().flat
-        for parameter, place in zip(self._parameters, layout.views(self._weights), strict=True):
-            parameter.data = place
-
-    def gradient(self, weights: Tensor, sample: Sample, cost: float) -> tuple[Tensor, float]:
-        """Of the loss of such weights on one outcome, ``(n,)``; and the loss."""
-        self._weights.copy_(weights)
-        loss = self._modules.loss(sample, -cost)
-        return self._layout.flat(torch.autograd.grad(loss, self._parameters)), loss.item()
-
-
-class _Benches(threading.local):
-    """One a thread: a mission that is read back learns beside those that fly."""
-
-    def __init__(self) -> None:
-        self._made: dict[Layout, Workbench] = {}
-
-    def of(self, layout: Layout) -> Workbench:
-        """The workbench for weights of this layout."""
-        if layout not in self._made:
-            self._made[layout] = Workbench(layout)
-        return self._made[layout]
-
-
-_benches = _Benches()
+        order = sorted(range(len(parameters)), key=self.starts.__getitem__)
+        return torch.cat([parameters[index].reshape(-1) for index in order])
 
 
 class Learner:
@@ -193,7 +150,8 @@ class Learner:
     def update(self, sample: Sample, cost: float) -> float:
         """One step on one outcome; returns the loss before it."""
         before = self._weights.flat
-        gradient, loss = _benches.of(self._layout).gradient(before, sample, cost)
+        gradient = torch.zeros(len(before))
+        loss = descend(self._layout.arrays(before), sample, -cost, into=self._layout.arrays(gradient))
         self._moments = self._moments or Moments.none(len(before))
         self._weights = Weights(self._layout, stepped(before, self._moments, gradient, self._learning_rate))
         # Who sees that it was learned sees the loss too.
@@ -230,11 +188,3 @@ class Learner:
             mean, square = flat(k["exp_avg"] for k in kept), flat(k["exp_avg_sq"] for k in kept)
             self._moments = Moments(mean, square, int(kept[0]["step"]))
         self.updates, self.last_loss = state["updates"], state["last_loss"]
-
-
-def rehearse() -> None:
-    """Update once on nothing: torch's first step back takes longer than the others."""
-    features = np.zeros((2, FEATURES["paper"]), np.float32)
-    learner = Learner(Modules("paper", 1, seed=0).weights(), learning_rate=1e-3)
-    learner.update(Sample(features, 0, np.zeros(1, np.float32), 0), 0.0)
-    learner.score(features)

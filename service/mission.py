@@ -14,8 +14,9 @@ from service.demonstrations import solved
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
 from service.experiences import NEAREST, Experience, Experiences
 from service.features import filled
+from service.gradient import Sample
 from service.guidance import OperatorGuidance
-from service.learner import Learner, Sample, Weights
+from service.learner import Learner, Weights
 from service.planner import Planner, can_plan
 from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template, note_block

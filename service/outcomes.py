@@ -9,8 +9,8 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Literal
 
+from service.gradient import Sample
 from service.journal import Journal, Unkept
-from service.learner import Sample, rehearse
 from service.live.watch import Live
 from service.metrics import Metrics
 from service.mission import Mission
@@ -18,7 +18,7 @@ from shared.wire import Outcome
 
 log = logging.getLogger(__name__)
 
-# Outcomes waiting to be learned from; with 10 sensors one takes a millisecond, with 10,000 a third of a second.
+# Outcomes waiting to be learned from, a fraction of a millisecond each.
 _MAX_LESSONS = 256
 _TELL_S = 10.0
 
@@ -33,8 +33,6 @@ class Outcomes:
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
         self._room = threading.Semaphore(_MAX_LESSONS)
         self._missed, self._tell_at = 0, -math.inf
-        # Before the first lesson, and beside the first decisions.
-        self._learning.submit(rehearse)
 
     def apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         """Record an outcome, unless it is recorded already; raises as :meth:`Mission.find`."""

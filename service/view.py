@@ -14,7 +14,7 @@ from service.asked import Asked
 from service.attention import top_k
 from service.events import Pending
 from service.features import State, augment
-from service.learner import Sample
+from service.gradient import Sample
 from service.mission import Mission
 from service.rows import cells
 from shared.wire import Candidate, UavState

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from service.examples import Batch, Example, Reward, Taught, fleet_cost, replay
-from service.learner import Modules, Sample
+from service.gradient import Sample
+from service.learner import Modules
 from service.pretrain import losses
 from service.recall import recall, references, velocity_agreement, velocity_error
 from shared.rollouts import Header, Reference, RolloutStep

@@ -9,18 +9,19 @@ import torch
 
 from service.checkpoint import initial_weights
 from service.features import FEATURES
-from service.learner import Learner, Modules, Sample
+from service.gradient import Sample, descend
+from service.learner import Learner, Modules
 from service.reach import LEVEL_FEATURES
 from shared.wire import Features
 
 PRESETS: list[Features] = ["paper", "reach"]
 
 
-def sample(preset: Features = "paper", seed: int = 0) -> Sample:
+def sample(preset: Features = "paper", seed: int = 0, sensors: int = 6) -> Sample:
     rng = np.random.default_rng(seed)
-    features = rng.random((6, FEATURES[preset]), dtype=np.float32)
+    features = rng.random((sensors, FEATURES[preset]), dtype=np.float32)
     approach = rng.random(1 if preset == "paper" else (15, LEVEL_FEATURES), dtype=np.float32)
-    return Sample(features=features, chosen=2, approach=approach, velocity=7)
+    return Sample(features=features, chosen=min(2, sensors - 1), approach=approach, velocity=7)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -55,22 +56,41 @@ def test_both_modules_learn_jointly_and_the_loss_falls(preset: Features) -> None
     assert learner.updates == 200
 
 
+@pytest.mark.parametrize("sensors", [1, 2, 10, 1000])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_lessons_gradient_is_autograds(preset: Features, sensors: int) -> None:
+    for seed in range(20):
+        modules = Modules(preset, 15, seed=seed)
+        case, cost = sample(preset, seed, sensors), 0.1 * seed
+        loss = modules.loss(case, -cost)
+        expected = torch.autograd.grad(loss, list(modules.parameters()))
+        weights = modules.weights()
+        found = torch.zeros_like(weights.flat)
+        told = descend(weights.layout.arrays(weights.flat), case, -cost, into=weights.layout.arrays(found))
+        assert told == pytest.approx(loss.item(), rel=1e-4, abs=1e-9)
+        for name, mine, its in zip(weights.layout.names, weights.layout.views(found), expected, strict=True):
+            torch.testing.assert_close(mine, its, rtol=1e-3, atol=1e-5 * (1 + float(its.abs().max())), msg=name)
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
     modules = Modules(preset, 15, seed=1)
     adam = torch.optim.Adam(modules.parameters(), lr=5e-3)
     learner = Learner(Modules(preset, 15, seed=1).weights(), learning_rate=5e-3)
     for seed in range(60):
-        adam.zero_grad()
-        modules.loss(sample(preset, seed), -0.3).backward()  # type: ignore[no-untyped-call]
+        weights = modules.weights()
+        gradient = torch.zeros_like(weights.flat)
+        descend(weights.layout.arrays(weights.flat), sample(preset, seed), -0.3, into=weights.layout.arrays(gradient))
+        for parameter, its in zip(modules.parameters(), weights.layout.views(gradient), strict=True):
+            parameter.grad = its.clone()
         adam.step()
         learner.update(sample(preset, seed), cost=0.3)
         assert torch.equal(
             learner.score(sample(preset, 99).features)[0], modules.weights().score(sample(preset, 99).features)[0]
         )
     kept = learner.state_dict()
-    for name, weights in modules.state_dict().items():
-        assert np.array_equal(kept["weights"][name], weights.numpy()), name
+    for name, values in modules.state_dict().items():
+        assert np.array_equal(kept["weights"][name], values.numpy()), name
     for index, moments in adam.state_dict()["state"].items():
         for name, value in moments.items():
             assert np.array_equal(kept["adam"][index][name], value.numpy()), (index, name)
@@ -132,8 +152,8 @@ def test_nothing_brings_torchs_compiler_into_the_process() -> None:
     # Its import takes seconds, on a busy machine longer than a decision may.
     script = (
         "import sys; from service.mission import Mission; from service.settings import Settings;"
-        "from shared.wire import MissionSpec; from service.learner import rehearse;"
-        "Mission('m', MissionSpec(), Settings()); rehearse();"
+        "from shared.wire import MissionSpec; from tests.service.test_learner import sample;"
+        "Mission('m', MissionSpec(), Settings()).learner.update(sample('reach'), 0.3);"
         "print([m for m in ('torch._dynamo', 'torch._inductor', 'sympy') if m in sys.modules])"
     )
     told = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -16,8 +16,8 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from service import outcomes
+from service.gradient import Sample
 from service.journal import Journal
-from service.learner import Sample
 from service.metrics import Metrics
 from service.mission import Mission
 from service.problems import Refused, Unavailable
