@@ -68,7 +68,7 @@ class State:
             self.since_visit / scenario.steps,
             self.urgency,
         )
-        stacked = np.stack([np.clip(c[self.admissible], 0.0, 1.0) for c in columns], axis=1)
+        stacked = np.array(columns).T[self.admissible].clip(0.0, 1.0)
         if self.reach is not None:
             room = scenario.queue_capacity - self.queue
             # A sensor that nothing arrives at never overflows.

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
 from typing import Literal
 
 from service.gradient import Sample
@@ -24,13 +27,18 @@ _TELL_S = 10.0
 
 
 class Outcomes:
-    """One thread learns, in the order that the outcomes came, for every mission of a service."""
+    """One thread learns, in the order that the outcomes came, for every mission of a service.
+
+    Belongs to the event loop that it is made on.
+    """
 
     def __init__(self, metrics: Metrics, keeper: Journal | Unkept, live: Live) -> None:
         self._metrics = metrics
         self._live = live
         self._keeper = keeper
         self._learning = ThreadPoolExecutor(max_workers=1, thread_name_prefix="learner")
+        self._loop = asyncio.get_running_loop()
+        self._begun: list[Callable[[], None]] = []
         self._room = threading.Semaphore(_MAX_LESSONS)
         self._missed, self._tell_at = 0, -math.inf
 
@@ -47,13 +55,24 @@ class Outcomes:
             sample = mission.apply(outcome, taught=taught)
             self._live.settled(mission, outcome)
             if sample is not None and taught:
-                self._learning.submit(self._learn, mission, sample, outcome.cost)
+                self._begin(partial(self._learn, mission, sample, outcome.cost))
             elif taught:
                 self._room.release()
             elif sample is not None:
                 self._miss()
         self._metrics.feedback.labels(result).inc()
         return result
+
+    def _begin(self, lesson: Callable[[], None]) -> None:
+        """Learn once the decision in hand waits for something: until then it needs the interpreter itself."""
+        if not self._begun:
+            self._loop.call_soon(self._hand_over)
+        self._begun.append(lesson)
+
+    def _hand_over(self) -> None:
+        for lesson in self._begun:
+            self._learning.submit(lesson)
+        self._begun.clear()
 
     def _miss(self) -> None:
         """One line now and then: where learning falls behind, hundreds of outcomes a second are not learned from."""
@@ -73,6 +92,7 @@ class Outcomes:
         track = self._keeper.due(mission) if least is None else self._keeper.due(mission, least)
         if track is None:
             return None
+        self._hand_over()
         keeper, seq, state = self._keeper, track.seq, mission.state_dict()
         return self._learning.submit(
             lambda: keeper.checkpoint(track, seq, {**state, "learner": mission.learner.state_dict()})
@@ -80,6 +100,7 @@ class Outcomes:
 
     def close(self, missions: list[Mission], within_s: float) -> None:
         """Checkpoint every mission after the lessons in hand, as far as there is time; the journal has the rest."""
+        self._hand_over()
         begun = [taken for mission in missions if (taken := self.checkpoint(mission, 1)) is not None]
         wait(begun, timeout=within_s)
         self._learning.shutdown(wait=True, cancel_futures=True)

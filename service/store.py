@@ -131,6 +131,8 @@ class Store:
             raise
         dialect = sqlite if self._engine.dialect.name == "sqlite" else postgresql
         self._insert: Any = dialect.insert
+        # Made once: what SQLAlchemy does to make a statement is a good part of what a commit takes.
+        self._new_entries = self._insert(journal).on_conflict_do_nothing()
 
     def close(self) -> None:
         """Let another edge have it."""
@@ -187,7 +189,7 @@ class Store:
 
     def _append(self, db: sa.Connection, entries: list[dict[str, Any]]) -> None:
         if entries:
-            db.execute(self._insert(journal).on_conflict_do_nothing(), entries)
+            db.execute(self._new_entries, entries)
 
     def _write(self, db: sa.Connection, item: Made | Checkpoint | Deleted) -> None:
         match item:

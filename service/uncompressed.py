@@ -7,6 +7,7 @@ millisecond, where to write and to tokenize them takes a hundred.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -61,9 +62,11 @@ class Uncompressed:
                 break
             digits += longer & ~unknown
         kinds = (np.where(unknown, 2, numbers < 0) * 3 ** np.arange(len(names))).sum(axis=1)
-        _, examples, times = np.unique(kinds, return_index=True, return_counts=True)
         total = count(self.head) if self.head else 0
-        for row, often in zip(examples.tolist(), times.tolist(), strict=True):
+        listed = kinds.tolist()
+        example = {kind: row for row, kind in enumerate(listed)}
+        for kind, often in Counter(listed).items():
+            row = example[kind]
             cells = {}
             for name, number, gone in zip(names, numbers[row].tolist(), unknown[row].tolist(), strict=True):
                 cells[name] = UNKNOWN if gone else f"-{_ANY}" if number < 0 else _ANY

@@ -14,6 +14,8 @@ from shared.scenario import Point, Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
 IntArray = NDArray[np.int64]
+# Sensors, by index.
+Which = slice | list[int]
 # Out of reach of everything.
 FAR_M = 1e9
 # The arrays that make a belief.
@@ -121,7 +123,7 @@ class FleetBelief:
                 last.progress_m += velocity * self._scenario.step_s
                 x, y = self._paths[uav].at(last.progress_m)
                 last.position = float(x), float(y)
-            packets = int(packets_per_step(self.distances(uav, [0])[0, sensor], self._scenario))
+            packets = int(packets_per_step(self.distances(uav, [0], [sensor]), self._scenario)[0, 0])
             if packets and (sensor, last.step) not in served:
                 served.add((sensor, last.step))
                 self.collect(sensor, packets, last.step)
@@ -129,7 +131,7 @@ class FleetBelief:
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
         """Subtract what a UAV collects in a step."""
-        self.base[sensor] = max(0.0, self.queue(step)[sensor] - packets)
+        self.base[sensor] = max(0.0, self.queue(step, [sensor])[0] - packets)
         self.since[sensor] = step
         self.visited[sensor] = max(int(self.visited[sensor]), step)
 
@@ -148,10 +150,11 @@ class FleetBelief:
             for uav, (step, (x, y), progress_m, told) in state["uavs"].items()
         }
 
-    def queue(self, step: int) -> FloatArray:
-        """Expected packets at the start of a step, shape ``(J,)``."""
+    def queue(self, step: int, which: Which = slice(None)) -> FloatArray:
+        """Expected packets at the start of a step, shape ``(J,)``, or of these sensors."""
+        rate = self.arrived[which] / self.watched[which]
         return np.minimum(
-            self.base + self.rate * np.maximum(step - self.since, 0), float(self._scenario.queue_capacity)
+            self.base[which] + rate * np.maximum(step - self.since[which], 0), float(self._scenario.queue_capacity)
         )
 
     def present(self, step: int) -> list[int]:
@@ -170,13 +173,16 @@ class FleetBelief:
         """Packets that a step can move from where the UAV is after flying so far ``(n,)``: shape ``(n, J)``."""
         return packets_per_step(self.distances(uav, metres), self._scenario)
 
-    def distances(self, uav: int, metres: ArrayLike) -> FloatArray:
-        """Horizontal distances to all sensors, ``(n, J)`` metres, after flying so far ``(n,)``; one unnamed is far."""
+    def distances(self, uav: int, metres: ArrayLike, which: Which = slice(None)) -> FloatArray:
+        """Horizontal distances to all sensors, ``(n, J)`` metres, or to these, after flying so far ``(n,)``.
+
+        A sensor that nobody has named is far.
+        """
         flown = np.asarray(metres, dtype=np.float64)
         last = self.uavs[uav]
         if last.progress_m is None:
             ahead = np.broadcast_to(np.asarray(last.position), (len(flown), 2))
         else:
             ahead = self._paths[uav].at(last.progress_m + flown)
-        offset = ahead[:, None, :] - self.places
+        offset = ahead[:, None, :] - self.places[which]
         return np.nan_to_num(np.hypot(offset[..., 0], offset[..., 1]), nan=FAR_M)
