@@ -130,8 +130,13 @@ def test_who_was_asked_later_and_answered_later_is_no_failure(edge: Edge, report
             await asyncio.sleep(0.3)
             return await super().respond(body, probed)
 
-    with serving(Slow("first", "0 7").app) as first, serving(Slow("second", "1 7").app) as second:
-        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", hedge_ms=50, deadline_ms=800)
+    class Slower(Slow):
+        async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+            await asyncio.sleep(0.5)
+            return await super().respond(body, probed)
+
+    with serving(Slow("first", "0 7").app) as first, serving(Slower("second", "1 7").app) as second:
+        client = edge(mode="llm", llm_url=f"{first}/v1,{second}/v1", hedge_ms=50, deadline_ms=1500)
         standing_by(client, 1)
         for step in range(12):
             assert client.post("/decide", json=report(step=step)).json()["model"] == "first"
