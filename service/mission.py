@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from service.applied import Applied
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_weights
 from service.demonstrations import solved
@@ -80,8 +81,7 @@ class Mission:
         self.records = Records(self.scenario)
         self.turns = Turns()
         self._pending: dict[str, Pending] = {}
-        # The oldest first.
-        self._applied: dict[str, tuple[float, bool]] = {}
+        self._applied = Applied(_APPLIED_PER_UAV * self.scenario.uavs)
         self.repeats = Repeats(_PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
         wanted = spec.planner == "on"
@@ -293,9 +293,7 @@ class Mission:
         back to the latest visit that was one.
         """
         decision = self._pending.pop(outcome.decision_id)
-        self._applied[decision.decision_id] = outcome.cost, outcome.failed
-        while len(self._applied) > _APPLIED_PER_UAV * self.scenario.uavs:
-            del self._applied[next(iter(self._applied))]
+        self._applied.add(decision.decision_id, outcome.cost, outcome.failed)
         self.feedback += 1
         if outcome.failed:
             self.records.withdraw(decision.sensor_id, decision.decision_id)
@@ -319,7 +317,7 @@ class Mission:
             "decisions": self.decisions,
             "feedback": self.feedback,
             "pending": [decision.state_dict() for decision in self._pending.values()],
-            "applied": [[name, *told] for name, told in self._applied.items()],
+            "applied": self._applied.state_dict(),
             "repeats": self.repeats.state_dict(),
             "memory": self.memory.state_dict(),
             "records": self.records.state_dict(),
@@ -333,7 +331,7 @@ class Mission:
         """As it was when the state was taken, but for the plan, which is made again."""
         self.decisions, self.feedback = state["decisions"], state["feedback"]
         self._pending = {told["decision_id"]: Pending.of(told) for told in state["pending"]}
-        self._applied = {name: (cost, failed) for name, cost, failed in state["applied"]}
+        self._applied.load_state_dict(state["applied"])
         self.repeats.load_state_dict(state["repeats"])
         self.memory.load_state_dict(state["memory"])
         self.records.load_state_dict(state["records"])
