@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -16,14 +16,12 @@ from service.gradient import Sample
 from service.mission import Mission
 from service.policy import decide_without_llm
 from service.reach import Reach, distances_ahead
+from service.reward import Reward, Speed
 from service.settings import Settings
 from service.view import View
 from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
 from shared.wire import Belief, Features, MissionSpec, Outcome
-
-Target = Literal["return", "immediate"]
-Speed = Literal["teacher", "look_ahead"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,28 +52,6 @@ class Example:
     sample: Sample
     reward: float
     taught: Taught | None
-
-
-@dataclass(frozen=True)
-class Reward:
-    """What a decision is worth.
-
-    ``return``: minus :func:`fleet_cost`, its mean over ``horizon`` steps with weights ``discount^n``; a mean, so that
-    it has the scale of the online updates' r = -c. ``immediate``: that r, the UAV's own cost of one step.
-    """
-
-    target: Target = "return"
-    horizon: int = 8
-    discount: float = 0.9
-
-    def of(self, steps: Sequence[RolloutStep], scenario: Scenario) -> list[float | None]:
-        """One of each of a UAV's steps in order; None where the mission ends before the horizon does."""
-        if self.target == "immediate":
-            return [-step.cost for step in steps]
-        costs = np.array([fleet_cost(step, scenario) for step in steps])
-        weights = self.discount ** np.arange(self.horizon)
-        means = np.correlate(costs, weights / weights.sum(), "valid") if len(costs) >= self.horizon else np.empty(0)
-        return [*(-means).tolist(), *[None] * (len(costs) - len(means))]
 
 
 def replay(
@@ -134,14 +110,6 @@ def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
     row = np.flatnonzero(state.ids == sensor_id)[:1]
     distance = distances_ahead(uav, state.position, state.progress_m, state.places[row], scenario)
     return Reach.of(distance, state.queue[row], state.urgency[row], scenario)
-
-
-def fleet_cost(step: RolloutStep, scenario: Scenario) -> float:
-    """``f + lost / (W I)``: a UAV's failure and its share of all that the fleet lost in the step.
-
-    Its own c would teach it to hover: what overflows out of its reach costs it nothing.
-    """
-    return float(step.failed) + step.fleet_lost / (scenario.queue_capacity * scenario.uavs)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,11 @@ import torch
 
 from service import checkpoint as checkpoints
 from service.checkpoint import initial_modules, initial_weights, save
-from service.examples import Batch, Example, Reward, replay
+from service.examples import Batch, Example, replay
 from service.learner import Modules
-from service.pretrain import losses
+from service.pretraining import losses
 from service.recall import recall, references
+from service.reward import Reward
 from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from shared.wire import Features

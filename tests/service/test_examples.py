@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from service.examples import Batch, Example, Reward, Taught, fleet_cost, replay
+from service.examples import Batch, Example, Taught, replay
 from service.gradient import Sample
 from service.learner import Modules
-from service.pretrain import losses
+from service.pretraining import losses
 from service.recall import recall, references, velocity_agreement, velocity_error
+from service.reward import Reward, fleet_cost
 from shared.rollouts import Header, Reference, RolloutStep
 from simulator.explore import explore
 from tests.service.making import PAPER
