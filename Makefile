@@ -1,15 +1,17 @@
-# make install | demo | test | check | docs | bench | faults | fuzz | soak | compose | clean
+# make install | demo | test | check | docs | bench | faults | fuzz | soak | compose | release | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 TORCH_INDEX ?=
 MINUTES ?= 10
+IMAGES ?= auto
+AICVDS_BUILD_NETWORK ?= default
 TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
-.PHONY: help install demo test check docs bench faults fuzz soak compose clean
+.PHONY: help install demo test check docs bench faults fuzz soak compose release clean
 .DEFAULT_GOAL := help
 
 help:
@@ -23,6 +25,7 @@ help:
 	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
 	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
+	@echo "make release   wheel, sdist and SBOM into dist/, tried, and the images; IMAGES=required: not without these"
 
 install: .venv/installed
 
@@ -43,7 +46,7 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	PYTHONHASHSEED=0 $(BIN)/mypy
-	PYTHONHASHSEED=0 $(BIN)/mypy benchmarks
+	PYTHONHASHSEED=0 $(BIN)/mypy benchmarks release.py
 	$(BIN)/lint-imports
 
 docs: install
@@ -69,6 +72,9 @@ soak: install
 
 compose:
 	tests/e2e/compose.sh
+
+release: install
+	$(BIN)/python release.py --images $(IMAGES) --build-network $(AICVDS_BUILD_NETWORK) $(TORCH_INDEX:%=--torch-index %)
 
 clean:
 	rm -rf .venv build dist *.egg-info

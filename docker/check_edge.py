@@ -1,6 +1,7 @@
-"""Run while the edge's image is built, in it: what was taken out of its packages must not be missed.
+"""Run while the edge's image is built, in it, and by `make release`: nothing that an edge needs may be missed.
 
-Starts the edge as the image does, has every mode decide with its LLM, its planner and a store, and lets it learn.
+Starts the edge as the image does, has every mode decide with its LLM, its planner and a store, lets it learn, and
+fetches the mission page.
 """
 
 import importlib
@@ -32,6 +33,7 @@ def main() -> None:
             assert url is not None
             try:
                 decide(url[0])
+                show(url[0])
             finally:
                 edge.send_signal(signal.SIGTERM)
                 sys.stderr.write(edge.communicate(timeout=30)[1])
@@ -61,12 +63,26 @@ def decide(url: str) -> None:
         time.sleep(0.2)
 
 
+def show(url: str) -> None:
+    """The mission page, with all that it names."""
+    page = fetched(f"{url}/").decode()
+    parts = re.findall(r'(?:src|href)="(static/[^"]+)"', page)
+    assert parts, page
+    for part in parts:
+        assert fetched(f"{url}/{part}"), part
+
+
 def asked(url: str, body: object = None, method: str | None = None) -> dict:
     """The answer, as JSON."""
     content = None if body is None else json.dumps(body).encode()
     request = urllib.request.Request(url, content, {"Content-Type": "application/json"}, method=method)
+    return json.loads(fetched(request))
+
+
+def fetched(request: str | urllib.request.Request) -> bytes:
+    """What comes back, by no proxy."""
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=90) as answer:
-        return json.load(answer)
+        return answer.read()
 
 
 if __name__ == "__main__":

@@ -31,7 +31,9 @@ FROM dependencies AS application
 COPY README.md LICENSE ./
 COPY shared/ shared/
 COPY service/ service/
-RUN pip wheel --no-deps --wheel-dir /wheels .
+# `make release` says which version this is: git is not in here, and would make every commit a build of its own above.
+ARG VERSION=""
+RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_AIC_VDS=$VERSION pip wheel --no-deps --wheel-dir /wheels .
 
 # What a running edge never opens, as docker/check_edge.py proves below:
 # - symbol tables of shared libraries (237 MB: 89 torch's, 80 llama.cpp's), which serve debuggers. Not of those in

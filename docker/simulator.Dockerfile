@@ -15,7 +15,9 @@ FROM dependencies AS application
 COPY README.md LICENSE ./
 COPY shared/ shared/
 COPY simulator/ simulator/
-RUN pip wheel --no-deps --wheel-dir /wheels .
+# `make release` says which version this is: git is not in here, and would make every commit a build of its own above.
+ARG VERSION=""
+RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_AIC_VDS=$VERSION pip wheel --no-deps --wheel-dir /wheels .
 
 # No mission needs the symbol tables of shared libraries (31 MB; strip breaks those in *.libs, which the wheels' makers
 # have rearranged) or the packages' own tests (22 MB).

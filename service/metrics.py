@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import version
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Summary
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Summary
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 
@@ -24,6 +25,7 @@ class Metrics:
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
         r = self.registry
+        Info("aicvds_build", "Which version this is", registry=r).info({"version": version("aic-vds")})
         self.decisions = Counter("aicvds_decisions", "Decisions answered", ["source", "reason"], registry=r)
         self.decision_seconds = Histogram(
             "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], registry=r, buckets=_DECISION_BUCKETS

@@ -132,8 +132,8 @@ def logged_mission(run: Path) -> Logged:
         raise BadUse(f"{run} is no folder; name one that `aicvds simulate --edge URL` wrote")
     if not (run / REQUESTS).exists():
         raise BadUse(
-            f"{run} holds no {REQUESTS}: `aicvds simulate --edge URL` writes it as of this version, "
-            f"{version('aic-vds')}, and a local --policy asks nothing. Fly the mission again"
+            f"{run} holds no {REQUESTS}: `aicvds simulate --edge URL` writes it, and a local --policy asks nothing. "
+            "Fly the mission again"
         )
     try:
         spec, requests = read_requests(run / REQUESTS)

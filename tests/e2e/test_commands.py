@@ -64,6 +64,7 @@ MADE = {
     "make fuzz": "some minutes; tests/service/test_fuzz.py is a short one",
     "make soak": "ten minutes",
     "make docs": "tests/test_docs.py builds the pages",
+    "make release": "minutes; it tries what it builds",
 }
 # Run by tests/e2e/test_readme.py, as they stand.
 CURLED, CURLED_ON = "curl ", ("README.md", "docs/guidance.md")

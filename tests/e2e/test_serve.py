@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,10 @@ def test_help_imports_nothing_that_takes_long(words: list[str], without: set[str
     imported = set(re.findall(r"^import time:.*\| +(\S+)$", shown.stderr, re.MULTILINE))
     assert "shared.cli" in imported
     assert not imported & without
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert run("--version").stdout == f"aicvds {version('aic-vds')}\n"
 
 
 @pytest.mark.parametrize("command", ["serve", "simulate", "demo", "keys", "model"])

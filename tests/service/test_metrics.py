@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any
 
 import httpx
@@ -44,6 +45,12 @@ def test_full_queues_are_a_risk_and_empty_ones_are_none(edge: Edge, report: Repo
         totals.append(numbers(client)["aicvds_overflow_risk_sum"])
     assert totals[0] < 0.05
     assert totals[1] - totals[0] > 0.95
+
+
+def test_the_version_is_that_of_the_package(edge: Edge) -> None:
+    client = edge()
+    assert numbers(client)[f'aicvds_build_info{{version="{version("aic-vds")}"}}'] == 1
+    assert client.get("/openapi.json").json()["info"]["version"] == version("aic-vds")
 
 
 def test_without_an_llm_no_breaker_is_open(edge: Edge) -> None:

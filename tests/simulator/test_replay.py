@@ -186,7 +186,7 @@ def test_a_folder_that_cannot_be_asked_again_says_why(
     (run / "requests.jsonl").write_text('{"spec": 1}\n\n')
     assert "requests.jsonl, line 1: " in refused(run)
     (run / "requests.jsonl").unlink()
-    assert "writes it as of this version, 0.1.0" in refused(run)
+    assert "holds no requests.jsonl" in refused(run)
 
 
 def test_an_earlier_replay_is_kept_unless_told(
