@@ -17,7 +17,7 @@ from torch import nn
 
 from service.attention import top_k
 from service.checkpoint import initial_weights
-from service.features import FEATURES
+from shared.features import FEATURES
 from shared.scenario import Scenario
 
 WINDOW = 512

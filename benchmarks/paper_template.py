@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from service.experiences import Experiences
-from service.features import State
 from service.prompt import Prompt, Template
 from service.rows import UNKNOWN, Cells
 from service.uncompressed import Uncompressed
+from shared.features import State
 from shared.scenario import Scenario
 
 EXPERIENCES = 30

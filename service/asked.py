@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from service.features import State
-from service.reach import Reach, distances_ahead
 from shared.channel import FloatArray, link_holds
+from shared.features import State
 from shared.guidance import Guidance
+from shared.reach import Reach, distances_ahead
 from shared.scenario import Scenario
 
 

@@ -16,12 +16,12 @@ from typing import Self
 import numpy as np
 
 from service.critic import Action
-from service.features import State
 from service.prompt import Prompt, Template, note_block
-from service.reach import Reach, distances_ahead
 from service.rows import Cells, Csv, cells
 from service.uncompressed import Uncompressed
 from shared.channel import FloatArray
+from shared.features import State
+from shared.reach import Reach, distances_ahead
 from shared.scenario import Scenario
 
 # OpenAI and vLLM tell the probabilities of at most 20 tokens.

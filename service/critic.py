@@ -18,10 +18,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from service.reach import VELOCITY_BONUS
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
+from shared.reach import VELOCITY_BONUS
 from shared.scenario import Scenario
 from shared.urgency import urgency
 

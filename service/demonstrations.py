@@ -14,9 +14,9 @@ from importlib.resources import files
 import numpy as np
 
 from service.attention import top_k
-from service.features import State, augment
 from service.learner import Weights
 from service.rows import Cells, cells
+from shared.features import State, augment
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, SensorId, Step, UavState, Wire
 

@@ -11,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from service.features import State
 from service.gradient import Sample
 from service.mission import Mission
 from service.policy import decide_without_llm
-from service.reach import Reach, distances_ahead
 from service.reward import Reward, Speed
 from service.settings import Settings
 from service.view import View
+from shared.features import State
+from shared.reach import Reach, distances_ahead
 from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
 from shared.wire import Belief, Features, MissionSpec, Outcome

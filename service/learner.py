@@ -17,10 +17,10 @@ from torch import Tensor, nn
 
 from service.adam import Moments, stepped
 from service.attention import Attention, AttentionWeights, attend
-from service.features import FEATURES
 from service.gradient import Parameters, Sample, descend
-from service.reach import LEVEL_FEATURES
 from service.velocity import ReachVelocityScorer, VelocityScorer, VelocityWeights, by_distance, by_reach
+from shared.features import FEATURES
+from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
 
 # Numbers that torch computes at once: a parameter of so many, or a multiple, is computed the same wherever it lies.

@@ -14,22 +14,22 @@ from service.checkpoint import initial_weights
 from service.demonstrations import solved
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
 from service.experiences import NEAREST, Experience, Experiences
-from service.features import filled
 from service.gradient import Sample
 from service.guidance import OperatorGuidance
 from service.learner import Learner, Weights
 from service.planner import Planner, can_plan
 from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template, note_block
-from service.records import NEVER, Records
 from service.repeats import Repeats
 from service.settings import Settings, prompt_tokens
 from service.spec import in_full, required
 from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.turns import Given, Turns
 from shared.channel import FloatArray
+from shared.features import filled
 from shared.fleetplan import FleetBelief
 from shared.guidance import Guidance, GuidanceAnswer
+from shared.records import NEVER, Records
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Belief, Features, MissionSpec, MissionStatus, Mode, Outcome, Selection, UavState
 

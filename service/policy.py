@@ -7,8 +7,8 @@ from collections.abc import Collection
 import numpy as np
 
 from service.asked import Asked
-from service.features import State
-from service.reach import Reach, distances_ahead
+from shared.features import State
+from shared.reach import Reach, distances_ahead
 from shared.scenario import Scenario
 
 

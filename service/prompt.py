@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from service.demonstrations import Solved
-from service.features import State
 from service.rows import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
 from service.uncompressed import Uncompressed
+from shared.features import State
 from shared.scenario import Scenario
 from shared.wire import Features, PromptStyle
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from numpy.typing import NDArray
 
-from service.features import State
+from shared.features import State
 from shared.wire import Features
 
 # A column's name and the text of a whole number, or UNKNOWN.

@@ -9,12 +9,12 @@ from itertools import groupby
 import numpy as np
 
 from service.demonstrations import Demonstration
-from service.features import State
 from service.mission import Mission
 from service.policy import decide_without_llm
 from service.settings import Settings
 from service.view import View
 from shared.channel import FloatArray
+from shared.features import State
 from shared.rollouts import Header, RolloutStep
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, UavState

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.features import State
 from service.rows import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
+from shared.features import State
 
 # How the tokenizer splits digits: three at a time, from the left, each a token.
 _DIGITS_A_TOKEN = 3

@@ -11,9 +11,9 @@ import numpy as np
 
 from service.llm.answer import NoDecision
 from service.mission import Mission
-from service.reach import distances_ahead
 from service.view import View
 from shared.channel import link_holds
+from shared.reach import distances_ahead
 
 
 def verify(mission: Mission, view: View, sensor: int, velocity: int) -> None:

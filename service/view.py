@@ -13,10 +13,10 @@ from torch import Tensor
 from service.asked import Asked
 from service.attention import top_k
 from service.events import Pending
-from service.features import State, augment
 from service.gradient import Sample
 from service.mission import Mission
 from service.rows import cells
+from shared.features import State, augment
 from shared.wire import Candidate, UavState
 
 _NO_FEATURES = np.empty((0, 0), np.float32)

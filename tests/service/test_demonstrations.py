@@ -7,10 +7,10 @@ import pytest
 
 from service.demonstrate import main
 from service.demonstrations import packaged
-from service.features import State
 from service.policy import decide_without_llm
 from service.problems import Refused
 from service.teachers import TEACHERS, farthest_first, likeness, solutions
+from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS, Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle

@@ -19,10 +19,10 @@ from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.client import Completion, Place
 from service.mission import Mission
-from service.reach import Reach
 from service.settings import Settings
 from service.trust import LLM
 from service.view import View
+from shared.reach import Reach
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
 from tests.running import listening, serving

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from service.checkpoint import initial_weights
-from service.features import FEATURES
 from service.gradient import Sample, descend
 from service.learner import Learner, Modules
-from service.reach import LEVEL_FEATURES
+from shared.features import FEATURES
+from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
 
 PRESETS: list[Features] = ["paper", "reach"]

@@ -2,9 +2,9 @@ import math
 
 import pytest
 
-from service.features import State
 from service.policy import decide_without_llm
 from shared.channel import link_holds
+from shared.features import State
 from shared.trajectory import trajectories
 from tests.service.making import PAPER, attended, mission, uav
 

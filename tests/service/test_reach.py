@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from service.features import FEATURES
-from service.reach import LEVEL_FEATURES, distances_ahead
 from service.rows import columns
 from service.view import View
 from shared.channel import link_holds, packets_per_step
+from shared.features import FEATURES
+from shared.reach import LEVEL_FEATURES, distances_ahead
 from shared.scenario import SCENARIOS, Point
 from shared.trajectory import trajectories
 from shared.wire import Features, MissionSpec, PromptStyle, UavState

@@ -1,7 +1,7 @@
 import numpy as np
 
-from service.features import FEATURES
 from shared.channel import channel_gain_db
+from shared.features import FEATURES
 from shared.urgency import urgency
 from tests.service.making import PAPER, attended, mission, uav
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.reach import Reach, distances_ahead
 from shared.channel import FloatArray, channel_gain_db
 from shared.fleetplan import FleetBelief
+from shared.reach import Reach, distances_ahead
 from shared.scenario import Point, Scenario
 from shared.urgency import overflow_probability, urgency
 from shared.wire import Features, UavState
