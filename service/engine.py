@@ -105,8 +105,8 @@ class Engine:
         logs.bind(request.mission_id, request.step)
         ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
         within_s = ends - RESERVE_S - time.perf_counter()
-        mission = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
-        return (await self._once(mission, key, request, lambda: self._one(mission, request, watch), ends))[0]
+        mission, whole = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+        return (await self._once(mission, key, request, lambda: self._one(mission, whole, watch), ends))[0]
 
     async def _one(self, mission: Mission, request: DecideRequest, watch: Stopwatch) -> list[DecideResponse]:
         if request.outcome is not None:
@@ -129,8 +129,8 @@ class Engine:
         logs.bind(request.mission_id, request.step)
         ends = watch.started + (request.deadline_ms or self._settings.deadline_ms) / 1e3
         within_s = ends - RESERVE_S - time.perf_counter()
-        mission = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
-        return await self._once(mission, key, request, lambda: self._all(mission, request, watch, ends), ends)
+        mission, whole = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+        return await self._once(mission, key, request, lambda: self._all(mission, whole, watch, ends), ends)
 
     async def _all(
         self, mission: Mission, request: BatchRequest, watch: Stopwatch, ends: float
@@ -273,6 +273,7 @@ class Engine:
         )
         counsel = None if choice.advice is None else Counsel(choice.model or "", choice.advice)
         mission.commit(pending, turn.attempt, counsel)
+        mission.bases.hold(uav, step, decision_id)
         self.live.drafted(mission, uav, prompt, answer)
         waited_ms = watch.stages.get("llm", 0.0) + watch.stages.get("plan", 0.0)
         self._own_s += ((answer.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY

@@ -83,8 +83,8 @@ class Guided:
     state: dict[str, Any]
 
 
-# Requests carry more; and the outcome that comes with a report is an event of its own.
-_REPORT = set(UavState.model_fields) - {"outcome"}
+# Requests carry more; the outcome that comes with a report is an event of its own, and how it was sent is past.
+_REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink"}
 # Of an outcome, what the mission's state follows from.
 _OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.applied import Applied
+from service.bases import Bases, Told
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_weights
 from service.demonstrations import solved
@@ -84,6 +85,7 @@ class Mission:
         self._applied = Applied(_APPLIED_PER_UAV * self.scenario.uavs)
         self.repeats = Repeats(_PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
+        self.bases = Bases()
         wanted = spec.planner == "on"
         self.planner = Planner(self.scenario, self.belief) if wanted and can_plan(self.scenario) else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
@@ -157,22 +159,24 @@ class Mission:
         """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
         return self.records.rates
 
-    def check(self, uav: UavState, step: int, at: str = "") -> None:
-        """Refuse, before anything is recorded, what this mission's world does not have.
+    def completed(self, uav: Told, step: int, at: str = "") -> Told:
+        """A UAV's report in full. What this mission's world does not have is refused, before anything is recorded.
 
         Args:
             at: where in the request's body this UAV stands, such as ``uavs[1].``.
 
         Raises:
-            Refused: an unknown UAV or sensor, a queue past its capacity, a beacon later than the step, or an outcome of
-                another UAV's decision.
+            Refused: an unknown UAV or sensor, a queue past its capacity, a beacon later than the step, an outcome of
+                another UAV's decision, or as :meth:`Bases.complete`.
+            Incomplete: the report leaves out what is not held.
             NotFound: an outcome of a decision that this mission does not know.
             Conflict: an outcome that contradicts an earlier one.
         """
         if uav.uav_id >= self.scenario.uavs:
             raise Refused(f"{at}uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
-        if (highest := max(uav.sensors.id)) >= self.scenario.sensors:
+        if (highest := max(uav.sensors.id, default=0)) >= self.scenario.sensors:
             raise Refused(f"{at}sensors.id", f"sensor {highest} is unknown: there are {self.scenario.sensors}, from 0")
+        uav = self.bases.complete(uav, step, self.belief.places, at)
         fullest = max((q for q in uav.sensors.queue if q is not None), default=0.0)
         if fullest > self.scenario.queue_capacity:
             limit = self.scenario.queue_capacity
@@ -186,6 +190,7 @@ class Mission:
                 raise Refused(
                     f"{at}outcome.decision_id", f"decision {name} is UAV {whose}'s, who alone knows its outcome"
                 )
+        return uav
 
     def holds(self, uavs: int) -> bool:
         """Whether the LLM's context is large enough for a prompt about so many UAVs at once."""

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -19,6 +20,8 @@ from service.store import Store
 from shared.wire import BatchRequest, DecideRequest, MissionSpec
 
 log = logging.getLogger(__name__)
+
+Asked = TypeVar("Asked", DecideRequest, BatchRequest)
 
 # The longest that who asks about a mission waits for its being read back; a decision no longer than its deadline.
 _WAKE_S = 10.0
@@ -75,33 +78,36 @@ class Missions:
         return mission
 
     async def checked(
-        self, request: DecideRequest | BatchRequest, *, may_make: bool, key: str | None, within_s: float
-    ) -> Mission:
-        """The mission for a request that fits it; one with scenario ``paper`` is made on first use, where one may.
+        self, request: Asked, *, may_make: bool, key: str | None, within_s: float
+    ) -> tuple[Mission, Asked]:
+        """The mission for a request that fits it, and the request with what it leaves out.
+
+        One with scenario ``paper`` is made on first use, where one may.
 
         Args:
-            key: a request that was answered under it already fits.
+            key: a request that was answered under it, or is being, fits already, and is left as it is.
             within_s: to wait, at most, for a mission that must be read back.
 
         Raises:
             NotFound: there is no such mission, and none may be made.
             Unavailable, Conflict: as :meth:`get`.
-            Refused: a UAV's report does not fit the mission's world; nothing was recorded.
+            Refused: a UAV's report does not fit the mission's world, or leaves out what is not held; nothing was
+                recorded.
         """
         mission_id = request.mission_id
         mission = await self._find(mission_id, within_s)
         if mission is not None and key is not None and mission.repeats.knows(key):
-            return mission
+            return mission, request
         if mission is None and not may_make:
             raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
         mission = mission or Mission(mission_id, MissionSpec(), self._settings)
         if isinstance(request, DecideRequest):
-            mission.check(request, request.step)
+            whole = mission.completed(request, request.step)
         else:
-            for index, uav in enumerate(request.uavs):
-                mission.check(uav, request.step, f"uavs[{index}].")
+            uavs = [mission.completed(u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)]
+            whole = request.model_copy(update={"uavs": uavs})
         self._add(mission)
-        return mission
+        return mission, whole
 
     async def put(self, mission_id: str, spec: MissionSpec) -> Mission:
         """Make a mission, or find it made by the same spec.

@@ -103,6 +103,8 @@ MISSION = {
     "visits": {"0": 0, "2": 1},
 }
 _FIRST = {"mission_id": "default", "step": 0, **STATE}
+# Sensor 1 was heard again, the others were not.
+_CHANGED = {"id": [1], "queue": [21.0], "battery": [49.9], "channel_gain": [-95.2], "last_seen": [2]}
 _BATCH = {"step": 0, "uavs": [STATE, {**STATE, "uav_id": 1, "position": [620.0, 480.0]}]}
 
 # By method and path; what the paper's UAV would send comes first.
@@ -112,6 +114,14 @@ REQUESTS: dict[tuple[str, str], dict[str, Example]] = {
         "outcome": {
             "summary": "A later request: what came of the decision before, and 1.5 s to answer",
             "value": {**_FIRST, "step": 1, "outcome": OUTCOME, "deadline_ms": 1500},
+        },
+        "held": {
+            "summary": "A full report that the edge is to hold, so that the next may tell only what changed",
+            "value": {**_FIRST, "step": 1, "uplink": "delta"},
+        },
+        "delta": {
+            "summary": "The next: the sensors that are not as they were in the report that `base` answered",
+            "value": {**_FIRST, "step": 2, "base": DECISION_ID, "sensors": _CHANGED},
         },
     },
     ("post", "/decide/batch"): {"fleet": {"summary": "Two UAVs at one step", "value": _BATCH}},

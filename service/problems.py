@@ -12,7 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
-from shared.wire import Problem
+from shared.wire import INCOMPLETE, Problem
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +28,7 @@ class Refused(Exception):
     """A request that cannot be served as it is; nothing was recorded for it."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
+    type = "about:blank"
 
     def __init__(self, field: str, detail: str) -> None:
         super().__init__(f"{field}: {detail}")
@@ -47,15 +48,23 @@ class Conflict(Refused):
     status = HTTPStatus.CONFLICT
 
 
+class Incomplete(Conflict):
+    """The request leaves out what the edge does not hold: to be sent again in full."""
+
+    type = INCOMPLETE
+
+
 class Unavailable(Refused):
     """The request is right, and the edge cannot serve it now, or not for sure: to be sent again."""
 
     status = HTTPStatus.SERVICE_UNAVAILABLE
 
 
-def problem_response(status: int, detail: str, errors: Sequence[dict[str, str]] = ()) -> Response:
-    """An ``application/problem+json`` response; never echoes what was sent."""
-    body = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
+def problem_response(
+    status: int, detail: str, errors: Sequence[dict[str, str]] = (), kind: str = "about:blank"
+) -> Response:
+    """An ``application/problem+json`` response of the type ``kind``; never echoes what was sent."""
+    body = Problem(type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
     return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
 
 
@@ -70,7 +79,8 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(Refused)
     async def refused(_: Request, error: Refused) -> Response:
-        response = problem_response(error.status, str(error), [{"field": error.field, "problem": error.detail}])
+        faults = [{"field": error.field, "problem": error.detail}]
+        response = problem_response(error.status, str(error), faults, error.type)
         if isinstance(error, Unavailable):
             response.headers["Retry-After"] = str(_RETRY_S)
         return response

@@ -73,8 +73,8 @@ class Repeats:
         return body
 
     def knows(self, key: str) -> bool:
-        """Whether there is an answer under this key."""
-        return key in self._answers
+        """Whether there is an answer under this key, or one is being made."""
+        return key in self._answers or key in self._underway
 
     def remember(self, answered: Answered) -> None:
         """Keep an answer; the oldest of too many is forgotten."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from shared.scenario import Scenario
 
@@ -18,6 +18,8 @@ MAX_STEP = 1_000_000
 MAX_ROUND_TRIP_MS = 600_000.0
 # Characters of an operator's note: it stands in every prompt.
 MAX_NOTE = 280
+# The type of the problem that the edge does not hold what a request leaves out: to be sent again in full.
+INCOMPLETE = "urn:aicvds:problem:incomplete"
 
 
 def _one_paragraph(text: str) -> str:
@@ -41,6 +43,7 @@ Features = Literal["paper", "reach"]
 Belief = Literal["fleet", "reported"]
 Selection = Literal["recent", "similar", "best"]
 Source = Literal["llm", "guided", "value", "policy"]
+Uplink = Literal["full", "delta", "pruned"]
 Reason = Literal[
     "mode_value",
     "mode_policy",
@@ -60,6 +63,10 @@ Reason = Literal[
 ]
 
 
+def _is_empty(column: list[float]) -> bool:
+    return not column
+
+
 class Wire(BaseModel):
     """Strict: no coercion between types, no NaN or infinity, no unknown field."""
 
@@ -70,35 +77,47 @@ class SensorColumns(Wire):
     """What one UAV knows of the sensors: parallel arrays of 1 to 10,000 entries, all of one length.
 
     ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last
-    beacon) are all ``null`` for a sensor never heard, and none of them for one that was.
+    beacon) are all ``null`` for a sensor never heard, and none of them for one that was. ``x`` and ``y`` may both be
+    left out of sensors whose places any UAV of the mission has told. Only with a ``base`` there may be no entry.
     """
 
-    id: Annotated[
-        list[SensorId], Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="no duplicates")
-    ]
-    x: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="m, surveyed")]
-    y: Annotated[list[Metres], Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="m, surveyed")]
+    id: Annotated[list[SensorId], Field(max_length=MAX_SENSORS, fail_fast=True, description="no duplicates")]
+    x: list[Metres] = Field(
+        default_factory=list,
+        max_length=MAX_SENSORS,
+        fail_fast=True,
+        exclude_if=_is_empty,
+        description="m, surveyed; left out: as told before",
+    )
+    y: list[Metres] = Field(
+        default_factory=list,
+        max_length=MAX_SENSORS,
+        fail_fast=True,
+        exclude_if=_is_empty,
+        description="m, surveyed; left out: as told before",
+    )
     queue: Annotated[
         list[Annotated[float, Field(ge=0, le=100_000)] | None],
-        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="packets waiting"),
+        Field(max_length=MAX_SENSORS, fail_fast=True, description="packets waiting"),
     ]
     battery: Annotated[
         list[Annotated[float, Field(ge=0, le=1e9)] | None],
-        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="J left"),
+        Field(max_length=MAX_SENSORS, fail_fast=True, description="J left"),
     ]
     channel_gain: Annotated[
         list[Annotated[float, Field(ge=-400, le=0)] | None],
-        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="dB, minus the path loss"),
+        Field(max_length=MAX_SENSORS, fail_fast=True, description="dB, minus the path loss"),
     ]
     last_seen: Annotated[
         list[Step | None],
-        Field(min_length=1, max_length=MAX_SENSORS, fail_fast=True, description="step of the last beacon"),
+        Field(max_length=MAX_SENSORS, fail_fast=True, description="step of the last beacon"),
     ]
 
     @model_validator(mode="after")
     def _rectangular(self) -> Self:
         expected = len(self.id)
-        for name in ("x", "y", "queue", "battery", "channel_gain", "last_seen"):
+        placed = ("x", "y") if self.x or self.y else ()
+        for name in (*placed, "queue", "battery", "channel_gain", "last_seen"):
             if len(getattr(self, name)) != expected:
                 raise ValueError(f"column {name} has {len(getattr(self, name))} entries, column id has {expected}")
         if len(set(self.id)) != expected:
@@ -141,8 +160,31 @@ class UavState(Wire):
     progress_m: float | None = Field(
         None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
     )
+    # Both left out where they are not told, for the same reason as an outcome's round trip.
+    base: DecisionId | None = Field(
+        None,
+        exclude_if=lambda told: told is None,
+        description="the decision that this UAV was last told by this mission: `sensors` has then only the rows that "
+        "are not as in the report which that decision answered, if any. 409 of type `"
+        + INCOMPLETE
+        + "` where the edge "
+        "does not hold that report (any more): send it in full",
+    )
+    uplink: Literal["delta"] | None = Field(
+        None,
+        exclude_if=lambda told: told is None,
+        description="`delta`: the edge holds this report, so that the UAV's next may name its decision as `base`, "
+        "which implies it",
+    )
     sensors: SensorColumns
     outcome: Outcome | None = Field(None, description="of this UAV's previous decision")
+
+    @field_validator("sensors", mode="after")
+    @classmethod
+    def _some_rows(cls, sensors: SensorColumns, told: ValidationInfo) -> SensorColumns:
+        if not sensors.id and told.data.get("base") is None:
+            raise ValueError("column id has no entries: a report without a base names at least one sensor")
+        return sensors
 
 
 class DecideRequest(UavState):

@@ -147,7 +147,7 @@ def test_a_failed_transmission_was_no_visit(edge: Edge, report: Report) -> None:
 
 
 BAD: list[tuple[str, Callable[[Body], Any], str]] = [
-    ("no sensors", lambda b: b["sensors"].update({k: [] for k in b["sensors"]}), "sensors.id"),
+    ("no sensors", lambda b: b["sensors"].update({k: [] for k in b["sensors"]}), "sensors"),
     ("no sensors column", lambda b: b.pop("sensors"), "sensors"),
     ("ragged", lambda b: b["sensors"]["queue"].pop(), "sensors"),
     ("duplicate IDs", lambda b: b["sensors"]["id"].__setitem__(1, 0), "sensors"),

@@ -94,7 +94,9 @@ def test_numbers_that_are_none(name: str, value: float) -> None:
         ({"sensors": columns(queue=["5", 1.0, None])}, "sensors.queue.0"),
         ({"sensors": columns(channel_gain=[1.0, -80.0, None])}, "sensors.channel_gain.0"),
         ({"sensors": columns(x=[None, 1.0, 2.0])}, "sensors.x.0"),
-        ({"sensors": {name: [] for name in columns()}}, "sensors.id"),
+        ({"sensors": {name: [] for name in columns()}}, "sensors"),
+        ({"base": "abc"}, "base"),
+        ({"uplink": "pruned"}, "uplink"),
         ({"outcome": {"decision_id": "abc", "cost": 0.0}}, "outcome.decision_id"),
         ({"outcome": {"decision_id": DECISION, "cost": -0.1}}, "outcome.cost"),
         ({"outcome": {"decision_id": DECISION, "cost": 0.0, "failed": 1}}, "outcome.failed"),
@@ -102,6 +104,19 @@ def test_numbers_that_are_none(name: str, value: float) -> None:
 )
 def test_a_field_out_of_form_is_named(change: dict[str, Any], field: str) -> None:
     assert f"\n{field}\n" in refusal(body(**change))
+
+
+def test_what_need_not_be_told_is_left_out() -> None:
+    told = columns()
+    del told["x"], told["y"]
+    request = DecideRequest.model_validate_json(json.dumps(body(sensors=told, base=DECISION)))
+    again = request.model_dump_json()
+    assert DecideRequest.model_validate_json(again) == request and '"x"' not in again
+    assert not {"base", "uplink"} & DecideRequest.model_validate(body()).model_dump().keys()
+    assert "column y has 0 entries, column id has 3" in refusal(body(sensors=columns(y=[])))
+    nobody: dict[str, Any] = dict.fromkeys(told, [])
+    assert "column id has no entries" in refusal(body(sensors=nobody))
+    assert DecideRequest.model_validate_json(json.dumps(body(sensors=nobody, base=DECISION))).sensors.id == []
 
 
 def test_a_missing_field_is_named() -> None:
