@@ -11,7 +11,7 @@ import math
 import random
 import time
 import uuid
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection, Generator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.wire import (
+    INCOMPLETE,
     MAX_ROUND_TRIP_MS,
     BatchRequest,
     BatchResponse,
@@ -35,13 +36,16 @@ from shared.wire import (
     Problem,
     Readiness,
     UavState,
+    Uplink,
 )
+from simulator.reports import reports_by
 
 RETRIED_STATUS = frozenset({429, 502, 503, 504})
 FIRST_BACKOFF_S = 0.1
 LONGEST_BACKOFF_S = 2.0
 LONGEST_RETRY_AFTER_S = 5.0
 POLL_S = 0.5
+NOT_MODIFIED = 304
 
 Answer = TypeVar("Answer", bound=BaseModel)
 Result = TypeVar("Result")
@@ -78,13 +82,15 @@ class EdgeUnreachable(EdgeError):
 class EdgeRefused(EdgeError):
     """The edge answered, and the answer was no.
 
-    ``status`` is the HTTP status, ``detail`` the problem's own words, ``errors`` its fields at fault.
+    ``status`` is the HTTP status, ``detail`` the problem's own words, ``errors`` its fields at fault, ``type`` its
+    type, ``about:blank`` where it has none of its own.
     """
 
-    def __init__(self, url: str, status: int, detail: str, errors: list[dict[str, str]] | None = None) -> None:
+    def __init__(self, url: str, problem: Problem, status: int) -> None:
         self.status = status
-        self.detail = detail
-        self.errors = errors or []
+        self.detail = detail = problem.detail
+        self.errors = problem.errors
+        self.type = problem.type
         fields = "; ".join(": ".join(error.values()) for error in self.errors)
         super().__init__(f"{url} refused with {status}: {detail}" + (f" ({fields})" if fields else ""))
 
@@ -100,13 +106,18 @@ class EdgeProtocolError(EdgeError):
 @dataclass(frozen=True)
 class Exchange:
     """One decision and what it took: milliseconds from the first attempt to the answer, retries included,
-    and the bytes of the request's body (of one attempt) and of the answer's."""
+    and the bytes of the request's body (of one attempt) and of the answer's.
+
+    A report that the edge could not complete was sent again in full: then of both bodies. ``attention_bytes`` is what
+    a UAV that prunes on board was sent before it asked, as it came.
+    """
 
     response: DecideResponse
     rtt_ms: float
     attempts: int
     request_bytes: int
     response_bytes: int
+    attention_bytes: int = 0
 
     def outcome(self, cost: float, failed: bool) -> Outcome:
         """What came of the decision, to be told with this UAV's next request."""
@@ -136,16 +147,21 @@ def edge_url(text: str) -> str:
 class Calls:
     """The calls to one edge. ``attempts`` is how often each is tried in all; ``seed`` fixes the pauses' draws.
 
+    ``uplink`` says how much of a report is sent.
+
     Raises:
         ValueError: ``base_url`` is no edge's URL (see :func:`edge_url`), or ``attempts`` is below 1.
     """
 
-    def __init__(self, base_url: str, attempts: int, seed: int) -> None:
+    def __init__(self, base_url: str, attempts: int, seed: int, uplink: Uplink) -> None:
         if attempts < 1:
             raise ValueError(f"attempts must be at least 1, not {attempts}")
         self.base_url = edge_url(base_url)
         self._attempts = attempts
         self._random = random.Random(f"backoff-{seed}")
+        self._reports = reports_by(uplink)
+        # What a reduced report leaves out need not say that it is nothing.
+        self._terse = uplink != "full"
 
     def wait_ready(
         self, timeout_s: float, wait_out: Collection[str], on_wait: Callable[[str], None] | None
@@ -197,33 +213,79 @@ class Calls:
 
     def decide(self, request: DecideRequest, attempts: int | None) -> Call[Exchange]:
         """``POST /decide``, timed."""
-        send = self._deciding("/decide", request)
+        mission_id, step = request.mission_id, request.step
+        fetched = yield from self._refresh(mission_id, step, request.uav_id)
         began = time.perf_counter()
-        answer, tried = yield from self._exchange(send, attempts)
+        answer, tried, sent = yield from self._decided(
+            "/decide", [request], lambda: self._reports.reduced(mission_id, step, request), attempts
+        )
         rtt_ms = (time.perf_counter() - began) * 1000
         response = self._parse(DecideResponse, answer, "/decide")
-        self._check(response, request, request.step, "/decide")
-        return Exchange(response, rtt_ms, tried, len(send.content or b""), len(answer.content))
+        self._check(response, request, step, "/decide")
+        return Exchange(response, rtt_ms, tried, sent, len(answer.content), fetched)
 
     def decide_batch(self, request: BatchRequest) -> Call[BatchResponse]:
         """``POST /decide/batch``."""
-        answer, _ = yield from self._exchange(self._deciding("/decide/batch", request))
+        mission_id, step = request.mission_id, request.step
+        for uav in request.uavs:
+            yield from self._refresh(mission_id, step, uav.uav_id)
+
+        def reduced() -> BatchRequest:
+            uavs = [self._reports.reduced(mission_id, step, uav) for uav in request.uavs]
+            return request.model_copy(update={"uavs": uavs})
+
+        answer, _, _ = yield from self._decided("/decide/batch", request.uavs, reduced, None)
         batch = self._parse(BatchResponse, answer, "/decide/batch")
         if len(batch.decisions) != len(request.uavs):
             raise EdgeProtocolError(f"{self.base_url}/decide/batch left a UAV without a decision")
         for response, uav in zip(batch.decisions, request.uavs, strict=True):
-            self._check(response, uav, request.step, "/decide/batch")
+            self._check(response, uav, step, "/decide/batch")
         return batch
+
+    def _refresh(self, mission_id: str, step: int, uav_id: int) -> Call[int]:
+        """Fetch what a UAV's uplink needs; returns the bytes. Without it reports are sent as before, or in full."""
+        fetched = 0
+        try:
+            while (wanted := self._reports.missing(mission_id, step, uav_id)) is not None:
+                headers = None if wanted.etag is None else {"If-None-Match": wanted.etag}
+                answer, _ = yield from self._exchange(Send("GET", wanted.path, headers=headers), attempts=1)
+                fetched += answer.num_bytes_downloaded
+                unchanged = answer.status_code == NOT_MODIFIED
+                told = None if unchanged else self._parse(wanted.model, answer, wanted.path)
+                self._reports.take(uav_id, step, told, answer.headers.get("ETag"))
+        except EdgeError:
+            # No decision is to fail by it.
+            return fetched
+        return fetched
+
+    def _decided(
+        self, path: str, uavs: Sequence[UavState], reduced: Callable[[], BaseModel], attempts: int | None
+    ) -> Call[tuple[httpx.Response, int, int]]:
+        """The answer, the attempts, and the bytes of the body: of both, where the edge wants it in full after all."""
+        send = self._deciding(path, reduced())
+        try:
+            answer, tried = yield from self._exchange(send, attempts)
+            return answer, tried, len(send.content or b"")
+        except EdgeRefused as refused:
+            if refused.type != INCOMPLETE:
+                raise
+        for uav in uavs:
+            self._reports.forget(uav.uav_id)
+        whole = self._deciding(path, reduced())
+        answer, tried = yield from self._exchange(whole, attempts)
+        return answer, 1 + tried, len(send.content or b"") + len(whole.content or b"")
 
     def _deciding(self, path: str, request: BaseModel) -> Send:
         # What is sent again, because its answer was lost on the way, gets that answer.
-        return Send("POST", path, request.model_dump_json().encode(), {"Idempotency-Key": uuid.uuid4().hex})
+        body = request.model_dump_json(exclude_defaults=self._terse).encode()
+        return Send("POST", path, body, {"Idempotency-Key": uuid.uuid4().hex})
 
     def _check(self, response: DecideResponse, asked: UavState, step: int, path: str) -> None:
         if response.sensor_id not in asked.sensors.id:
             raise EdgeProtocolError(f"{self.base_url}{path} chose sensor {response.sensor_id}, which was not offered")
         if (response.uav_id, response.step) != (asked.uav_id, step):
             raise EdgeProtocolError(f"{self.base_url}{path} answered for another UAV or step")
+        self._reports.answered(asked, response)
 
     def _asked(self, method: str, path: str, model: type[Answer], body: BaseModel | None = None) -> Call[Answer]:
         content = None if body is None else body.model_dump_json().encode()
@@ -255,8 +317,7 @@ class Calls:
         if answer.status_code in RETRIED_STATUS:
             raise _TryAgain(f"{answer.status_code} {_problem(answer).detail}", _retry_after(answer))
         if answer.status_code >= 400:
-            problem = _problem(answer)
-            raise EdgeRefused(url, answer.status_code, problem.detail, problem.errors)
+            raise EdgeRefused(url, _problem(answer), answer.status_code)
         return answer
 
     def _parse(self, model: type[Answer], answer: httpx.Response, path: str) -> Answer:

@@ -19,6 +19,7 @@ from shared.wire import (
     MissionSpec,
     MissionStatus,
     Readiness,
+    Uplink,
 )
 from simulator.calls import (
     Call,
@@ -51,7 +52,9 @@ class EdgeClient:
     Connection errors, timeouts and 429/502/503/504 are tried again, ``attempts`` times in all, after a
     random pause of at most 0.1 s, doubled each time up to 2 s; a ``Retry-After`` is honoured up to 5 s.
     ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network
-    (see ``simulator.uplink``); ``seed`` fixes the pauses' draws.
+    (see ``simulator.uplink``); ``seed`` fixes the pauses' draws. ``uplink`` says how much of a report is sent: all,
+    what changed (``delta``), or the sensors that the mission's attention keeps, computed here (``pruned``). It is given
+    all in any case, and sends all where the edge wants it.
 
     Raises (every method):
         EdgeUnreachable: no attempt got through.
@@ -68,8 +71,9 @@ class EdgeClient:
         api_key: str | None = None,
         seed: int = 0,
         transport: httpx.BaseTransport | None = None,
+        uplink: Uplink = "full",
     ) -> None:
-        self._calls = Calls(base_url, attempts, seed)
+        self._calls = Calls(base_url, attempts, seed, uplink)
         self.base_url = self._calls.base_url
         self._http = httpx.Client(
             headers=_headers(api_key),
@@ -169,8 +173,9 @@ class AsyncEdgeClient:
         api_key: str | None = None,
         seed: int = 0,
         transport: httpx.AsyncBaseTransport | None = None,
+        uplink: Uplink = "full",
     ) -> None:
-        self._calls = Calls(base_url, attempts, seed)
+        self._calls = Calls(base_url, attempts, seed, uplink)
         self.base_url = self._calls.base_url
         self._http = httpx.AsyncClient(
             headers=_headers(api_key),

@@ -14,7 +14,7 @@ import numpy as np
 
 from shared.channel import FloatArray
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome, SensorColumns
+from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome, SensorColumns, Uplink
 from simulator.client import EdgeClient, EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable, Exchange
 from simulator.policies import Policy, policy_named
 from simulator.record import DecidedBy, Decision, DecisionLog, Flown
@@ -255,6 +255,7 @@ class Flight:
         *,
         policy: str,
         edge: str | None,
+        uplink: Uplink | None = None,
         mission_id: str,
         mode: str | None,
         model: str | None,
@@ -271,6 +272,7 @@ class Flight:
             sensors=self.scenario.sensors,
             policy=policy,
             edge=edge,
+            uplink=uplink,
             mission_id=mission_id,
             mode=mode,
             model=next((d.model for d in reversed(self.decisions) if d.model), model),
@@ -385,6 +387,7 @@ def of_the_exchange(exchange: Exchange | None) -> dict[str, Any]:
         "attempts": exchange.attempts,
         "request_bytes": exchange.request_bytes,
         "response_bytes": exchange.response_bytes,
+        "attention_bytes": exchange.attention_bytes,
     }
 
 

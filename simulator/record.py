@@ -13,7 +13,7 @@ from typing import IO, Literal, Protocol, Self, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from shared.wire import Candidate, Tokens
+from shared.wire import Candidate, Tokens, Uplink
 
 SUMMARY, DECISIONS, REPORT, REQUESTS = "summary.json", "decisions.jsonl", "report.html", "requests.jsonl"
 FIGURES = "figures"
@@ -47,8 +47,9 @@ class Decision(Record):
     """One decision and what came of it.
 
     ``position`` is where it was taken, metres. ``source`` is ``onboard`` when the UAV decided itself, and then
-    ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null`` and ``attempts``, ``request_bytes`` and
-    ``response_bytes`` 0. ``rtt_ms`` includes retries; ``lost_packets`` and ``cost`` are this UAV's share.
+    ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null`` and ``attempts``, ``request_bytes``,
+    ``response_bytes`` and ``attention_bytes`` 0. ``rtt_ms`` includes retries; ``lost_packets`` and ``cost`` are this
+    UAV's share.
     """
 
     step: int
@@ -68,6 +69,7 @@ class Decision(Record):
     attempts: int = 0
     request_bytes: int = 0
     response_bytes: int = 0
+    attention_bytes: int = 0
     failed: bool = False
     collected: int = 0
     lost_packets: int = 0
@@ -120,7 +122,8 @@ class Flown(Record):
     """The mission's facts that no single decision holds.
 
     ``steps`` were asked for and ``steps_flown`` flown; ``policy`` is ``edge`` or a local policy's name;
-    ``deadline_ms`` is what the edge said last, or what it was asked for.
+    ``deadline_ms`` is what the edge said last, or what it was asked for. ``uplink`` says how much of a report was sent,
+    ``null`` where no edge was asked.
     """
 
     scenario: str
@@ -131,6 +134,7 @@ class Flown(Record):
     sensors: int
     policy: str
     edge: str | None
+    uplink: Uplink | None = None
     mission_id: str
     mode: str | None
     model: str | None
@@ -149,6 +153,7 @@ class Summary(Flown):
     and ``wqcs``, all over ``steps_flown`` steps of one world. ``late`` counts decisions whose round trip took more than
     their deadline + 50 ms. ``jain`` is Jain's index of the sensors' served visits, ``null`` when none was served;
     ``failures`` are failed transmissions; ``llm_asked`` counts decisions for which the LLM was asked, in vain or not.
+    ``uplink_bytes_mean`` is a decision's request, ``attention_bytes_mean`` what its UAV was sent to prune by.
     """
 
     decisions: int
@@ -161,6 +166,7 @@ class Summary(Flown):
     tokens: TokenSummary
     rtt_ms: RoundTrips
     uplink_bytes_mean: float | None
+    attention_bytes_mean: float | None = None
     jain: float | None
     llm_asked: int = 0
 
@@ -303,6 +309,7 @@ def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str,
         tokens=_tokens([d.tokens for d in from_edge if d.tokens is not None]),
         rtt_ms=round_trips(decisions),
         uplink_bytes_mean=mean([d.request_bytes for d in from_edge]),
+        attention_bytes_mean=mean([d.attention_bytes for d in from_edge]),
         jain=jain_index(visits_per_sensor(decisions, flown.sensors)),
         llm_asked=sum(asked_llm(d) for d in decisions),
     )

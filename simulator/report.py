@@ -182,6 +182,8 @@ def show(summary: Summary, console: Console) -> None:
     tokens, trips = summary.tokens, summary.rtt_ms
     if trips.p50 is not None:
         console.print(f"Round trip: median {trips.p50:.0f} ms, 99th percentile {trips.p99:.0f} ms")
+        down = f"; {summary.attention_bytes_mean:.0f} down, to prune by" if summary.attention_bytes_mean else ""
+        console.print(f"Uplink {summary.uplink}: {summary.uplink_bytes_mean:.0f} bytes a decision{down}")
     if summary.llm_asked and tokens.prompt_mean is not None:
         cached = "" if tokens.cached_pct is None else f"; {tokens.cached_pct:.0f} % read from the LLM's prefix cache"
         console.print(

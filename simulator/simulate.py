@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from tyro.conf import FlagCreatePairsOff, arg
 
-from shared.wire import Mode
+from shared.wire import Mode, Uplink
 from simulator.client import EdgeClient
 from simulator.commandline import (
     INTERRUPTED,
@@ -111,6 +111,8 @@ class Simulate:
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
     """How the edge decides: llm (the paper's method), guided (the LLM among other advisers), value (what its modules
     learned) or policy (the planner). Default: the edge's."""
+    uplink: Annotated[Uplink, arg(metavar="full|delta|pruned")] = "full"
+    """What a UAV sends: all, what changed (it is decided alike), or the k sensors that attention on board keeps."""
     deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
@@ -158,6 +160,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         policy=options.policy,
         edge=options.edge if options.policy == "edge" else None,
         mode=options.mode,
+        uplink=options.uplink,
         deadline_ms=options.deadline_ms,
         wait_s=options.wait_s,
         wait_out=("loading", "unavailable") if options.await_llm == "on" else ("loading",),
@@ -189,6 +192,10 @@ def check(options: Simulate) -> None:
         checked_edge(options.edge)
     elif options.edge is not None:
         raise BadUse(f"--policy {options.policy} asks no edge, so --edge contradicts it; give one of the two")
+    elif options.uplink != "full":
+        raise BadUse(
+            f"--policy {options.policy} asks no edge, so --uplink {options.uplink} means nothing; leave it out"
+        )
 
 
 @dataclass(frozen=True)
@@ -206,6 +213,7 @@ class Job:
     policy: str = "edge"
     edge: str | None = None
     mode: Mode | None = None
+    uplink: Uplink = "full"
     deadline_ms: int | None = None
     wait_s: float = 120.0
     wait_out: tuple[str, ...] = ("loading",)
@@ -264,7 +272,7 @@ def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
             seed=job.seed,
         )
     key = os.environ.get(API_KEY) or None
-    return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport)
+    return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport, uplink=job.uplink)
 
 
 def _scout(edge: str) -> EdgeClient:
@@ -373,6 +381,7 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
     facts = flight.facts(
         policy=job.policy,
         edge=job.edge,
+        uplink=job.uplink if job.edge else None,
         mission_id=job.mission_id,
         mode=mode,
         model=model,

@@ -90,6 +90,7 @@ def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
         (["--edge", "http://e", "--wait-s", "nan"], "--wait-s nan"),
         (["--edge", "http://e", "--reconnect-s", "-1"], "--reconnect-s -1"),
         (["--edge", "http://e", "--policy", "eof"], "--policy eof asks no edge"),
+        (["--policy", "eof", "--uplink", "delta"], "--uplink delta means nothing"),
         (["--edge", "http://e", "--out", __file__], "is a file"),
         (["--policy", "eof", "--out", f"{__file__}/below"], f"--out {__file__}/below: Not a directory"),
     ],

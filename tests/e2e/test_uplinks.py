@@ -1,0 +1,125 @@
+"""Missions over real HTTP on each uplink: delta decides as full does, to the bit, whatever is lost on the way."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from shared.scenario import SCENARIOS
+from shared.wire import FeedbackRequest, Uplink
+from simulator.client import EdgeClient
+from simulator.mission import Choice, EdgePilot, Flight, fly
+from simulator.site import Site
+from simulator.uplink import LossyTransport
+from simulator.world import Observation
+from tests.e2e.processes import output_until, serving_edge, started
+from tests.simulator.edge_stub import free_port
+
+SCENARIO = SCENARIOS["paper"].model_copy(update={"steps": 12})
+
+
+class Patient(EdgePilot):
+    """Tells each outcome on its own, and asks when all are learned from: what is learned beside decides by chance."""
+
+    def __init__(self, client: EdgeClient, mission_id: str) -> None:
+        super().__init__(client, mission_id, SCENARIO, 0, mode="value")
+        self._edge, self._name = client, mission_id
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        ends = time.monotonic() + 20
+        while (told := self._edge.mission(self._name)).learner_updates < told.feedback:
+            assert time.monotonic() < ends, told
+            time.sleep(0.002)
+        return super().decide(uav, observation, taken)
+
+    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+        assert choice.exchange is not None, self.last_error
+        outcome = choice.exchange.outcome(cost, failed)
+        self._edge.feedback(FeedbackRequest(mission_id=self._name, **outcome.model_dump()))
+
+
+class Deaf(httpx.HTTPTransport):
+    """Loses every third answer: the edge has decided, and the UAV does not know."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._random = random.Random(0)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        response = super().handle_request(request)
+        if request.url.path == "/decide" and self._random.random() < 0.3:
+            response.read()
+            raise httpx.ReadTimeout("the uplink lost the answer", request=request)
+        return response
+
+
+def flown(
+    url: str,
+    uplink: Uplink,
+    mission_id: str,
+    transport: httpx.BaseTransport | None = None,
+    on_step: Callable[[Flight], None] | None = None,
+) -> Flight:
+    with EdgeClient(url, timeout_s=20, attempts=20, uplink=uplink, transport=transport) as client:
+        pilot = Patient(client, mission_id)
+        with EdgeClient(url) as ground:
+            ground.put_mission(mission_id, pilot.spec)
+        flight = fly(Site(SCENARIO), pilot, seed=0, on_step=on_step)
+    assert pilot.last_error is None
+    return flight
+
+
+def decided(flight: Flight) -> list[Any]:
+    return [(d.step, d.uav_id, d.source, d.sensor_id, d.velocity, d.top_k, d.cost) for d in flight.decisions]
+
+
+def mean_bytes(flight: Flight) -> float:
+    return sum(d.request_bytes for d in flight.decisions) / len(flight.decisions)
+
+
+def test_delta_decides_as_full_to_the_bit_with_fewer_bytes() -> None:
+    with serving_edge(AICVDS_MODE="value") as (url, _):
+        full, delta = flown(url, "full", "full"), flown(url, "delta", "delta")
+    assert decided(delta) == decided(full)
+    # A UAV's first is full.
+    assert [d.request_bytes > 600 for d in delta.decisions] == [d.step == 0 for d in delta.decisions]
+    assert mean_bytes(delta) < 0.5 * mean_bytes(full)
+
+
+def test_delta_is_right_where_requests_and_answers_are_lost() -> None:
+    with serving_edge(AICVDS_MODE="value") as (url, _):
+        lossy = LossyTransport(Deaf(), drop=0.3, jitter_ms=2, seed=0)
+        full, delta = flown(url, "full", "full"), flown(url, "delta", "delta", lossy)
+        with EdgeClient(url) as ground:
+            # What was sent again was decided once.
+            assert ground.mission("delta").decisions == len(delta.decisions)
+    assert max(d.attempts for d in delta.decisions) > 2
+    assert decided(delta) == decided(full)
+
+
+def test_an_edge_that_is_killed_on_the_way(tmp_path: Path) -> None:
+    port = str(free_port())
+    common = {"AICVDS_MODE": "value", "AICVDS_STORE": str(tmp_path / "m.db")}
+    with serving_edge(**common) as (url, _):
+        full = flown(url, "full", "full")
+    with ExitStack() as stack:
+        edge = stack.enter_context(started("serve", "--port", port, **common))
+        output_until(edge, "running on")
+
+        def restarted(flight: Flight) -> None:
+            if flight.steps_flown == 6:
+                edge.kill()
+                edge.wait(20)
+                output_until(stack.enter_context(started("serve", "--port", port, **common)), "running on")
+
+        cut = flown(f"http://127.0.0.1:{port}", "delta", "cut", on_step=restarted)
+    assert decided(cut) == decided(full)
+    by_step = {step: [d.request_bytes for d in cut.decisions if d.step == step] for step in (5, 6, 7)}
+    # The edge that was started anew holds no report: each UAV told all of it once more.
+    assert min(by_step[6]) > 1000 > max(by_step[5] + by_step[7])
