@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Sequence
 
@@ -20,6 +21,7 @@ from service.problems import problem_response
 _OPEN = frozenset(("/healthz", "/readyz", "/"))
 # The page's scripts and styles; what it shows it asks for with a key.
 _OPEN_BELOW = "/static/"
+_ATTENTION = re.compile(r"/missions/[^/]+/attention")
 # Where the guard leaves the key's scopes for the routes.
 SCOPES = "aicvds.scopes"
 # For answers that go on: where the guard leaves a function that says whether the key is known still.
@@ -29,7 +31,8 @@ STILL_KNOWN = "aicvds.still_known"
 def scope_of(method: str, path: str) -> Scope | None:
     """What a key must be allowed for a request; None where none is needed, or any will do for reading."""
     if method in ("GET", "HEAD"):
-        return None
+        # What was learned is told to those who fly by it.
+        return "decide" if _ATTENTION.fullmatch(path) else None
     return "admin" if path.startswith("/missions") else "decide"
 
 

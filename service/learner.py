@@ -42,6 +42,11 @@ class Weights:
         views = layout.views(flat)
         self._attention, self._velocity = AttentionWeights(*views[:5]), VelocityWeights(*views[5:])
 
+    @property
+    def attention(self) -> AttentionWeights:
+        """Of the attention module."""
+        return self._attention
+
     @torch.inference_mode()
     def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
         """Scores ``(n,)`` and contexts ``(n, d')`` of the sensors."""
@@ -138,6 +143,11 @@ class Learner:
         self._weights = weights
         self.updates = 0
         self.last_loss: float | None = None
+
+    @property
+    def attention(self) -> AttentionWeights:
+        """The attention module's weights, as decisions use them now."""
+        return self._weights.attention
 
     def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
         """Scores ``(n,)`` and contexts ``(n, d')`` of n sensors' features ``(n, d)``."""

@@ -27,12 +27,12 @@ from service.spec import in_full, required
 from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.turns import Given, Turns
 from shared.channel import FloatArray
-from shared.features import filled
 from shared.fleetplan import FleetBelief
 from shared.guidance import Guidance, GuidanceAnswer
-from shared.records import NEVER, Records
+from shared.missions import MissionStatus
+from shared.records import Records, take_report
 from shared.scenario import Scenario, scenario_named
-from shared.wire import Belief, Features, MissionSpec, MissionStatus, Mode, Outcome, Selection, UavState
+from shared.wire import Belief, Features, MissionSpec, Mode, Outcome, Selection, UavState
 
 # An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
 _PENDING_PER_UAV = 8
@@ -246,16 +246,9 @@ class Mission:
 
         Returns the number of this request among the UAV's at this step, for :meth:`commit`.
         """
-        ids = np.asarray(uav.sensors.id)
-        seen = filled(uav.sensors.last_seen, NEVER).astype(np.int64)
-        queue = filled(uav.sensors.queue)
         if self.planner is not None:
             self.planner.begin(step)
-        self.belief.advance(step)
-        self.belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
-        places = np.stack((uav.sensors.x, uav.sensors.y), axis=1)
-        self.belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
-        self.records.hear(ids, seen, queue)
+        take_report(uav, step, self.records, self.belief)
         self.record(Reported(step, uav))
         return self.turns.attempt(step, uav.uav_id)
 

@@ -102,6 +102,22 @@ MISSION = {
     "learner_loss": 0.041,
     "visits": {"0": 0, "2": 1},
 }
+ATTENTION = {
+    "mission_id": "patrol",
+    "features": "paper",
+    "belief": "reported",
+    "top_k": 5,
+    "updates": 2,
+    "weights": [
+        # Of a module with d' = 1: a real one has d' = 32.
+        *(
+            {"name": name, "shape": [1, 5], "values": [0.21, -0.08, 0.31, 0.02, -0.4]}
+            for name in ("query", "key", "value")
+        ),
+        {"name": "score", "shape": [1, 1], "values": [-0.17]},
+        {"name": "bias", "shape": [1], "values": [-0.25]},
+    ],
+}
 _FIRST = {"mission_id": "default", "step": 0, **STATE}
 # Sensor 1 was heard again, the others were not.
 _CHANGED = {"id": [1], "queue": [21.0], "battery": [49.9], "channel_gain": [-95.2], "last_seen": [2]}
@@ -157,6 +173,7 @@ ANSWERS: dict[tuple[str, str], Any] = {
         "visits": {},
     },
     ("get", "/missions/{mission_id}"): MISSION,
+    ("get", "/missions/{mission_id}/attention"): ATTENTION,
     ("get", "/missions/{mission_id}/guidance"): GUIDANCE,
     ("post", "/missions/{mission_id}/guidance"): GUIDANCE,
     ("get", "/healthz"): {"status": "ok"},

@@ -8,12 +8,14 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
+from service import onboard
 from service.engine import Engine
 from service.guard import may_make_missions
 from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.problems import documented
 from shared.guidance import GuidanceAnswer, GuidanceStatus
+from shared.missions import MissionAttention, MissionStatus
 from shared.wire import (
     BatchRequest,
     BatchResponse,
@@ -23,7 +25,6 @@ from shared.wire import (
     FeedbackResponse,
     MissionId,
     MissionSpec,
-    MissionStatus,
     Readiness,
 )
 
@@ -46,6 +47,8 @@ RequestKey = Annotated[
         "mission the newest eight a UAV are remembered",
     ),
 ]
+
+HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
 
 
 @router.post(
@@ -97,6 +100,18 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     await engine.missions.delete(mission_id)
     engine.live.forget(mission_id)
     await engine.kept("mission_id")
+
+
+@router.get(
+    "/missions/{mission_id}/attention",
+    response_model=MissionAttention,
+    responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 422, 503)},
+    tags=["missions"],
+)
+async def get_attention(mission_id: MissionId, engine: TheEngine, request: Request, held: HeldTag = None) -> Response:
+    """The attention module's weights, with an ETag: to score the sensors on board, and report only the k best."""
+    mission = await engine.missions.get(mission_id)
+    return onboard.told(mission, held, request.headers.get("Accept-Encoding", ""))
 
 
 @router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])

@@ -1,4 +1,4 @@
-"""What a fleet's visits and beacons say of each sensor: its visiting record and its arrival rate."""
+"""What visits and beacons say of each sensor: its visiting record and its arrival rate; a fleet's, or one UAV's own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray
+from shared.features import filled
+from shared.fleetplan import FleetBelief
 from shared.scenario import Scenario
+from shared.wire import UavState
 
 # Weight, in steps, of the scenario's mean arrival rate against what is observed.
 _PRIOR_STEPS = 2.0
@@ -92,3 +95,15 @@ class Records:
         self.visits, self._confirmed, self._open = state["visits"], state["confirmed"], state["open"]
         self._seen, self._queue = state["seen"], state["queue"]
         self._arrivals, self._exposure = state["arrivals"], state["exposure"]
+
+
+def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> None:
+    """Take a UAV's report in full: into the sensors' records, and all of it into the belief."""
+    ids = np.asarray(uav.sensors.id)
+    seen = filled(uav.sensors.last_seen, NEVER).astype(np.int64)
+    queue = filled(uav.sensors.queue)
+    belief.advance(step)
+    belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
+    places = np.stack((uav.sensors.x, uav.sensors.y), axis=1)
+    belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
+    records.hear(ids, seen, queue)

@@ -364,58 +364,6 @@ class MissionSpec(Wire):
     )
 
 
-class MissionStatus(Wire):
-    """``GET /missions/{id}``; ``experiences`` is how many there are, ``prompt.experiences`` how many there can be."""
-
-    mission_id: MissionId
-    scenario: Scenario
-    mode: Mode
-    top_k: int
-    attention: Literal["on", "off"] = "on"
-    features: Features = "paper"
-    belief: Belief = "fleet"
-    verify: Literal["on", "off"] = "off"
-    planner: Literal["on", "off"] = Field("off", description="`on` where it is wanted, installed, and up to the size")
-    prompt: PromptStyle = PromptStyle()
-    init: Init
-    seed: int
-    decisions: int
-    feedback: int
-    experiences: int
-    learner_updates: int
-    learner_loss: float | None
-    visits: dict[int, int] = Field(description="sensor: step of the last visit")
-
-
-class MissionLine(Wire):
-    """One mission of the list. Of one that is only in the store, no more than its name is known."""
-
-    mission_id: MissionId
-    mode: Mode | None = None
-    decisions: int | None = None
-
-
-class MissionList(Wire):
-    """``GET /missions``: at most 200, the one that decided last first; ``more`` are not listed."""
-
-    missions: list[MissionLine]
-    more: int
-    newest: MissionId | None = Field(description="the one that decided last, since the edge started")
-
-
-class DecisionPrompt(Wire):
-    """``GET /missions/{id}/decisions/{decision_id}/prompt``, in the three blocks of the prompt.
-
-    ``asked`` says whether an LLM was asked by it; where none is, the prompt is made for the token accounting alone.
-    """
-
-    decision_id: DecisionId
-    asked: bool
-    static: str
-    experiences: str
-    state: str
-
-
 class Readiness(Wire):
     """``GET /readyz``: decisions can be made, and by whom."""
 

@@ -21,6 +21,7 @@ import httpx
 from pydantic import BaseModel, ValidationError
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
+from shared.missions import MissionStatus
 from shared.wire import (
     INCOMPLETE,
     MAX_ROUND_TRIP_MS,
@@ -31,7 +32,6 @@ from shared.wire import (
     FeedbackRequest,
     FeedbackResponse,
     MissionSpec,
-    MissionStatus,
     Outcome,
     Problem,
     Readiness,
@@ -253,7 +253,7 @@ class Calls:
                 unchanged = answer.status_code == NOT_MODIFIED
                 told = None if unchanged else self._parse(wanted.model, answer, wanted.path)
                 self._reports.take(uav_id, step, told, answer.headers.get("ETag"))
-        except EdgeError:
+        except (EdgeError, ValueError):
             # No decision is to fail by it.
             return fetched
         return fetched

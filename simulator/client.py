@@ -10,6 +10,7 @@ from typing import Self
 import httpx
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
+from shared.missions import MissionStatus
 from shared.wire import (
     BatchRequest,
     BatchResponse,
@@ -17,7 +18,6 @@ from shared.wire import (
     FeedbackRequest,
     FeedbackResponse,
     MissionSpec,
-    MissionStatus,
     Readiness,
     Uplink,
 )

@@ -13,7 +13,8 @@ from typing import IO, Self
 
 from pydantic import TypeAdapter
 
-from shared.wire import DecideRequest, MissionSpec, MissionStatus
+from shared.missions import MissionStatus
+from shared.wire import DecideRequest, MissionSpec
 from simulator.record import read_lines
 
 _LINE: TypeAdapter[MissionSpec | DecideRequest] = TypeAdapter(MissionSpec | DecideRequest)

@@ -18,7 +18,8 @@ from service.guard import STILL_KNOWN
 from service.live.watch import Live
 from service.problems import NotFound, documented
 from service.routes import TheEngine
-from shared.wire import DecisionId, DecisionPrompt, MissionId, MissionLine, MissionList, Reason
+from shared.missions import DecisionPrompt, MissionLine, MissionList
+from shared.wire import DecisionId, MissionId, Reason
 
 log = logging.getLogger(__name__)
 

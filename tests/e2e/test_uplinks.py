@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import time
 from collections.abc import Callable
@@ -123,3 +124,36 @@ def test_an_edge_that_is_killed_on_the_way(tmp_path: Path) -> None:
     by_step = {step: [d.request_bytes for d in cut.decisions if d.step == step] for step in (5, 6, 7)}
     # The edge that was started anew holds no report: each UAV told all of it once more.
     assert min(by_step[6]) > 1000 > max(by_step[5] + by_step[7])
+
+
+def test_pruned_reports_name_k_sensors_and_the_rest_is_known() -> None:
+    asked: list[dict[str, Any]] = []
+
+    class Tapped(httpx.HTTPTransport):
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            if request.url.path == "/decide":
+                asked.append(json.loads(request.content))
+            return super().handle_request(request)
+
+    with serving_edge(AICVDS_MODE="value") as (url, _):
+        flight = flown(url, "pruned", "pruned", Tapped())
+    assert [len(body["sensors"]["id"]) for body in asked] == [10] * 3 + [5] * 33
+    assert [d.attention_bytes > 0 for d in flight.decisions] == [d.step in (0, 10) for d in flight.decisions]
+    for body, decision in zip(asked, flight.decisions, strict=True):
+        assert decision.sensor_id in body["sensors"]["id"] and ("x" in body["sensors"]) == (decision.step == 0)
+        assert {c.sensor_id for c in decision.top_k} <= set(body["sensors"]["id"])
+
+
+def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot() -> None:
+    with serving_edge(AICVDS_MODE="value") as (url, _):
+
+        def forget(flight: Flight) -> None:
+            if flight.steps_flown == 6:
+                httpx.delete(f"{url}/missions/pruned").raise_for_status()
+                httpx.put(f"{url}/missions/pruned", json={"mode": "value"}).raise_for_status()
+
+        flight = flown(url, "pruned", "pruned", on_step=forget)
+    assert {d.source for d in flight.decisions} == {"value"}
+    # The first UAV tells all, and where it is: the others' k sensors are known by that.
+    again = [d for d in flight.decisions if d.step >= 1 and d.request_bytes > 900]
+    assert [(d.step, d.uav_id) for d in again] == [(6, 0)]

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from scipy.special import pdtrc
 
 from shared.scenario import SCENARIOS, Scenario
-from shared.urgency import overflow_probability, urgency
+from shared.urgency import above_by_sum, overflow_probability, urgency
 
 PAPER = SCENARIOS["paper"]
 
@@ -57,3 +58,12 @@ def test_urgency_stays_in_0_to_1_and_never_falls_as_the_queue_fills(
     assert got.shape == (3,)
     assert np.all((got >= 0) & (got <= 1))
     assert np.all(np.diff(got) >= -1e-12)
+
+
+def test_the_sum_is_scipys() -> None:
+    random = np.random.default_rng(0)
+    for capacity in (1, 60, 5_000):
+        room = np.floor(random.uniform(0, capacity, 400))
+        mean = random.uniform(0, 1.2 * capacity, 400) * (random.random(400) > 0.05)
+        assert np.allclose(above_by_sum(room, mean), pdtrc(room, mean), rtol=0, atol=1e-9)
+    assert above_by_sum(np.empty(0), np.empty(0)).shape == (0,)

@@ -18,6 +18,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from shared.missions import MissionStatus
 from shared.scenario import Scenario, scenario_named
 from shared.wire import (
     BatchRequest,
@@ -28,7 +29,6 @@ from shared.wire import (
     FeedbackRequest,
     FeedbackResponse,
     MissionSpec,
-    MissionStatus,
     Problem,
     Readiness,
     Tokens,
