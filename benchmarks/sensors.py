@@ -7,11 +7,10 @@ and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The shar
 clock, ``latency_ms``, less the LLM's; the round trip, less the LLM's too, has also the HTTP and the parsing. Decisions
 that fell to the LLM-free policy, as where no sensor was heard, are counted and left out. Every decision brings the last
 one's outcome, as a UAV's does; its lesson may run beside it, but earlier ones are waited for, as a UAV asks once in ten
-seconds. Then the wire: bytes of a request, plain, gzip and zstd, and the time that the edge needs to unpack and to
-parse it, taken as the round trip of a request that it refuses after that. Of the three uplinks of the design only
-``full`` is built: ``delta`` (the beacons that are news since the UAV's last request, without the places) and ``pruned``
-(the k sensors that an attention on board would keep) are what they would be; their time is that of a request in full
-about as many sensors. Prints tables, writes JSON.
+seconds. Then the wire: bytes of one request on each uplink (``full``, ``delta``, ``pruned``), as the clients send it,
+plain, gzip and zstd, and the time that the edge needs to unpack, to parse and to complete it, taken as the round trip
+of a request that it refuses after that, for its outcome of a decision that nobody knows; and what ``pruned`` takes
+besides, the bytes of attention's weights and the scoring on board. Prints tables, writes JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import httpx
 import numpy as np
@@ -38,16 +37,19 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from shared.missions import MissionAttention
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, Mode, SensorColumns
+from shared.wire import DecideRequest, MissionSpec, Mode, Outcome, Uplink
 from simulator.client import EdgeClient
 from simulator.demo import HOST, edge_process, usable_port
 from simulator.mission import Choice, EdgePilot, fly
+from simulator.pruning import PrunedReports
+from simulator.reports import DeltaReports
 from simulator.site import Site
 from simulator.world import Observation
 
 GOALS = {"share_1000_to_10": 3.0, "share_10000_to_10": 40.0, "memory_mb": 200.0}
-UAVS, TOP_K = 3, 5
+UAVS = 3
 # The longest that a lesson may take.
 NO_LESSON_S = 5.0
 MODES: tuple[Mode, ...] = ("value", "llm")
@@ -157,23 +159,27 @@ def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest
 
 
 def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) -> dict[str, Any]:
-    """Bytes and milliseconds of one request, in full and as less would be, by encoding."""
-    told = now.sensors
-    scenario = Scenario(sensors=len(told.id))
-    name = f"wire-{scenario.sensors}"
-    news = [row for row, step in enumerate(told.last_seen) if step != before.sensors.last_seen[row]]
-    # What the paper's UAV would send: the sensors that its own attention kept, of those in range.
-    kept = [row for row, step in enumerate(told.last_seen) if step == now.step][:TOP_K] or [0]
-    # No UAV of that number flies, which the edge sees once it has read all of it.
-    common = {"mission_id": name, "uav_id": 99, "outcome": None}
-    bodies = {
-        rows: now.model_copy(update={**common, "sensors": _of(told, which)}).model_dump_json().encode()
-        for rows, which in (("full", list(range(len(told.id)))), ("delta", news or [0]), ("pruned", kept))
-    }
-    sizes = {"full": len(told.id), "delta": len(news), "pruned": len(kept)}
-    found: dict[str, Any] = {rows: {"sensors": size} for rows, size in sizes.items()}
-    with httpx.Client(base_url=edge.url, timeout=60) as client:
-        client.put(f"/missions/{name}", json={"scenario": scenario.model_dump()}).raise_for_status()
+    """Bytes and milliseconds of one request, as each uplink sends it after the one before, by encoding."""
+    name = f"wire-{len(now.sensors.id)}"
+    unknown = Outcome(decision_id="0" * 32, cost=0.0)
+    before = before.model_copy(update={"mission_id": name, "outcome": None})
+    now = now.model_copy(update={"mission_id": name, "outcome": unknown})
+    delta, pruned = DeltaReports(), PrunedReports()
+    with EdgeClient(edge.url, timeout_s=60) as client, httpx.Client(base_url=edge.url, timeout=60) as http:
+        scenario = Scenario(sensors=len(now.sensors.id), steps=now.step + 1)
+        pruned.take(now.uav_id, now.step, client.put_mission(name, MissionSpec(scenario=scenario)), None)
+        weights = http.get(f"/missions/{name}/attention", headers={"Accept-Encoding": "identity"}).content
+        pruned.take(now.uav_id, now.step, MissionAttention.model_validate_json(weights), None)
+        first = delta.reduced(name, before.step, before)
+        answer = client.decide(pruned.reduced(name, before.step, first)).response
+        for reports in (delta, pruned):
+            reports.answered(before, answer)
+        began = time.perf_counter()
+        sent = {"full": now, "pruned": pruned.reduced(name, now.step, now)}
+        onboard_ms = (time.perf_counter() - began) * 1e3
+        sent["delta"] = delta.reduced(name, now.step, now)
+        found: dict[str, Any] = {rows: {"sensors": len(sent[rows].sensors.id)} for rows in get_args(Uplink)}
+        bodies = {rows: sent[rows].model_dump_json(exclude_defaults=rows != "full").encode() for rows in found}
         took: dict[tuple[str, str], list[float]] = {(rows, e): [] for rows in bodies for e in ENCODINGS}
         for _ in range(repeats):
             for rows, encoding in took:
@@ -181,24 +187,18 @@ def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) ->
                 headers |= {} if encoding == "plain" else {"Content-Encoding": encoding}
                 content = ENCODINGS[encoding](bodies[rows])
                 began = time.perf_counter()
-                answer = client.post("/decide", content=content, headers=headers)
+                told = http.post("/decide", content=content, headers=headers)
                 took[rows, encoding].append((time.perf_counter() - began) * 1e3)
-                assert answer.status_code == 422 and "uav_id" in answer.text, answer.text
-    # A delta need not say again where its sensors are.
-    less = {**json.loads(bodies["delta"]), "base": before.step}
-    less["sensors"] = {column: values for column, values in less["sensors"].items() if column not in ("x", "y")}
-    sent = {**bodies, "delta": json.dumps(less, separators=(",", ":")).encode()}
+                assert told.status_code == 404 and "outcome.decision_id" in told.text, told.text
+        http.delete(f"/missions/{name}").raise_for_status()
     for (rows, encoding), times in took.items():
         found[rows][encoding] = {
-            "bytes": len(ENCODINGS[encoding](sent[rows])),
+            "bytes": len(ENCODINGS[encoding](bodies[rows])),
             "read_ms": round(float(np.median(times)), 2),
         }
+    found["pruned"]["onboard_ms"] = round(onboard_ms, 2)
+    found["pruned"]["weights_bytes"] = {e: len(encode(weights)) for e, encode in ENCODINGS.items()}
     return found
-
-
-def _of(sensors: SensorColumns, rows: list[int]) -> SensorColumns:
-    columns = {name: [values[row] for row in rows] for name, values in sensors.model_dump().items()}
-    return SensorColumns.model_validate(columns)
 
 
 def main(args: Sensors) -> int:
@@ -280,6 +280,10 @@ def _tell(console: Console, found: dict[str, Any], args: Sensors) -> None:
             ]
             encodings.add_row(f"{int(sensors):,}", f"{name} {told['sensors']:,}", *cells)
     console.print(encodings)
+    for sensors, payloads in found["wire"].items():
+        extra = payloads["pruned"]
+        weights = ", ".join(f"{size:,} {encoding}" for encoding, size in extra["weights_bytes"].items())
+        console.print(f"pruned, J = {int(sensors):,}: {extra['onboard_ms']:.1f} ms on board; weights {weights} bytes")
     console.print(f"goals: share at 1,000 to 10 at most {GOALS['share_1000_to_10']:g}, at 10,000 under", end=" ")
     console.print(f"{GOALS['share_10000_to_10']:g}; memory under {GOALS['memory_mb']:g} MB. Wrote {args.out}")
 
