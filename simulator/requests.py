@@ -1,8 +1,8 @@
 """``requests.jsonl``: what a mission asked its edge, so that ``aicvds replay`` can ask it again.
 
 The first line is the mission's spec as the edge made it, its defaults resolved and its scenario in full; then one
-``POST /decide`` a line, in the order asked, the outcome that it carried included. What came of the last decisions is in
-``decisions.jsonl``.
+``POST /decide`` a line, in the order asked and in full whatever the uplink, the outcome that it carried included. What
+came of the last decisions is in ``decisions.jsonl``.
 """
 
 from __future__ import annotations
