@@ -19,7 +19,7 @@ from simulator.mission import Choice, EdgePilot, Flight, fly
 from simulator.site import Site
 from simulator.uplink import LossyTransport
 from simulator.world import Observation
-from tests.e2e.processes import output_until, serving_edge, started
+from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.simulator.edge_stub import free_port
 
 SCENARIO = SCENARIOS["paper"].model_copy(update={"steps": 12})
@@ -157,3 +157,21 @@ def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot() -> None:
     # The first UAV tells all, and where it is: the others' k sensors are known by that.
     again = [d for d in flight.decisions if d.step >= 1 and d.request_bytes > 900]
     assert [(d.step, d.uav_id) for d in again] == [(6, 0)]
+
+
+def test_simulate_tells_the_uplink_and_its_bytes(tmp_path: Path) -> None:
+    told = {}
+    with serving_edge(AICVDS_MODE="value") as (url, _):
+        for uplink in ("full", "delta", "pruned"):
+            out = tmp_path / uplink
+            done = run("simulate", "--edge", url, "--steps", "6", "--uplink", uplink, "--out", str(out))
+            assert done.returncode == 0, done.stderr
+            assert f"Uplink {uplink}: " in done.stdout
+            told[uplink] = json.loads((out / "summary.json").read_text())
+            assert told[uplink]["uplink"] == uplink and f"uplink {uplink}" in (out / "report.html").read_text()
+            # In full, whatever was sent: it can be asked again.
+            lines = (out / "requests.jsonl").read_text().splitlines()[1:]
+            assert {len(json.loads(line)["sensors"]["x"]) for line in lines} == {10}
+    sizes = {uplink: summary["uplink_bytes_mean"] for uplink, summary in told.items()}
+    assert max(sizes["delta"], sizes["pruned"]) < 0.7 * sizes["full"]
+    assert told["pruned"]["attention_bytes_mean"] > told["full"]["attention_bytes_mean"] == 0
