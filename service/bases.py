@@ -30,7 +30,7 @@ class Base:
 class Bases:
     """The last report of each UAV that asks for it, by what it was told then.
 
-    In memory only: what is lost with the process, or the mission, the UAV tells anew.
+    In memory only, 40 bytes a sensor: what is lost with the process, or the mission, the UAV tells anew.
     """
 
     def __init__(self) -> None:
