@@ -100,7 +100,7 @@ def test_delta_is_right_where_requests_and_answers_are_lost() -> None:
         with EdgeClient(url) as ground:
             # What was sent again was decided once.
             assert ground.mission("delta").decisions == len(delta.decisions)
-    assert max(d.attempts for d in delta.decisions) > 2
+    assert max(d.attempts for d in delta.decisions) > 1
     assert decided(delta) == decided(full)
 
 
