@@ -52,7 +52,7 @@ GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0)}
 class Overhead:
     """Put load on the edge, on a bare forwarder and on LiteLLM's proxy."""
 
-    rounds: int = 7
+    rounds: int = 6
     """How often all are measured, one after the other."""
     seconds: float = 2.0
     """How long each is, each time, at each number of UAVs."""
