@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 
 # glibc's names for what mallopt sets (malloc.h).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _BYTES = 128 * 1024
-_TRIM_EVERY_S = 60.0
 
 
 def hand_back_memory() -> None:
@@ -23,15 +21,3 @@ def hand_back_memory() -> None:
         return
     for what, value in ((_ARENA_MAX, 1), (_MMAP_THRESHOLD, _BYTES), (_TRIM_THRESHOLD, _BYTES)):
         mallopt(what, value)
-
-
-async def trim_now_and_then() -> None:
-    """Give back the pages that lie free between those in use, until cancelled; elsewhere than with glibc do nothing.
-
-    What missions remember comes and goes in pieces, and from the free space between them malloc itself gives nothing
-    back: without this an edge of 200 missions grew by 5 to 15 MB an hour, of which nothing was in use.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    while trim is not None:
-        await asyncio.sleep(_TRIM_EVERY_S)
-        await asyncio.to_thread(trim, 0)

@@ -12,7 +12,6 @@ import torch
 from fastapi import FastAPI
 
 from service import problems
-from service.allocator import trim_now_and_then
 from service.engine import Engine
 from service.guard import Guard
 from service.headers import CarefulHeaders
@@ -59,11 +58,9 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine
         llm.start()
-        trimming = asyncio.create_task(trim_now_and_then(), name="trim-memory")
         try:
             yield {"engine": engine, "llm": llm, "metrics": metrics}
         finally:
-            trimming.cancel()
             engine.live.close()
             await engine.compiler.close()
             await engine.asking.close()
