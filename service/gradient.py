@@ -2,7 +2,7 @@
 
 Of all sensors' scores the loss reads one: the attention's row of the sensor decided. So a lesson costs as much as there
 are sensors, where going back through the whole attention costs the square; and some thirty products of small arrays
-take a fifth of the time that torch's autograd takes for them.
+take a tenth of the time that torch's autograd takes for them.
 """
 
 from __future__ import annotations
