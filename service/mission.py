@@ -40,7 +40,7 @@ _APPLIED_PER_UAV = 64
 
 
 class Mission:
-    """One fleet's state. Only the event loop touches it, apart from the learner's own thread.
+    """One fleet's state. Only the event loop touches it.
 
     Everything that changes it is an event, which ``record`` hears of: the same events in the same order, on the same
     spec, make the same mission again (see :mod:`service.replaying`).

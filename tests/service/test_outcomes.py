@@ -1,0 +1,55 @@
+"""What is learned of outcomes, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from service.engine import Engine
+from service.mission import Mission
+from tests.service.keeping import fly, running, same, settled, state
+
+Report = Callable[..., dict[str, Any]]
+
+
+def _decided(told: Any) -> Any:
+    """A mission's state without the decisions' names, which are random."""
+    if isinstance(told, dict):
+        names = {"turns", "pending", "applied", "repeats", "records", "trust"}
+        return {key: _decided(value) for key, value in told.items() if key not in names}
+    return told
+
+
+def test_the_same_flight_learns_the_same(tmp_path: Path, report: Report) -> None:
+    """A lesson's place among the decisions is the outcome's, not a matter of which thread is faster."""
+
+    def flown(name: str) -> tuple[dict[str, Any], list[int]]:
+        with running(tmp_path / name) as (client, engine):
+            fly(client, report, range(20))
+            mission = settled(engine, engine.missions.awake[0], 57)
+            return _decided(state(mission)), mission.visits.tolist()
+
+    (one, visits), (other, visits_again) = flown("one.db"), flown("other.db")
+    assert visits == visits_again
+    assert same(one, other)
+    assert one["learner"]["updates"] == 57
+
+
+def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Path, report: Report) -> None:
+    def told_by(client: httpx.Client, engine: Engine, cost: float | None) -> tuple[list[Any], Mission]:
+        first = client.post("/decide", json=report(step=1)).json()
+        outcome = {} if cost is None else {"outcome": {"decision_id": first["decision_id"], "cost": cost}}
+        second = client.post("/decide", json=report(step=2) | outcome).json()
+        return second["top_k"], engine.missions.awake[0]
+
+    with running(tmp_path / "with.db") as (client, engine):
+        taught, mission = told_by(client, engine, 7.0)
+        settled(engine, mission, 1)
+        later = client.post("/decide", json=report(step=2)).json()["top_k"]
+    with running(tmp_path / "without.db") as (client, engine):
+        untaught, _ = told_by(client, engine, None)
+    assert taught == untaught
+    assert later != taught
