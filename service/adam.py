@@ -30,10 +30,13 @@ class Moments:
 
 @torch.no_grad()
 def stepped(weights: Tensor, moments: Moments, gradient: Tensor, learning_rate: float) -> Tensor:
-    """The weights ``(n,)`` after one more step down the gradient ``(n,)``; the moments are changed."""
+    """The weights ``(n,)`` after one more step down the gradient ``(n,)``.
+
+    The moments are changed, and the gradient's place is used for something else.
+    """
     moments.steps += 1
     mean, square = moments.mean, moments.square
     mean.lerp_(gradient, 1 - _BETA1)
     square.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
-    spread = (square.sqrt() / (1 - _BETA2**moments.steps) ** 0.5).add_(_EPS)
+    spread = torch.sqrt(square, out=gradient).div_((1 - _BETA2**moments.steps) ** 0.5).add_(_EPS)
     return torch.addcdiv(weights, mean, spread, value=-learning_rate / (1 - _BETA1**moments.steps))

@@ -6,6 +6,7 @@ memory than what they compute with.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
@@ -25,6 +26,8 @@ from shared.wire import Features
 
 # Numbers that torch computes at once: a parameter of so many, or a multiple, is computed the same wherever it lies.
 _AT_ONCE = 32
+# How many of the parameters are the attention module's: the first.
+_ATTENTION = len(AttentionWeights._fields)
 
 
 class Weights:
@@ -39,24 +42,34 @@ class Weights:
 
     def __init__(self, layout: Layout, flat: Tensor) -> None:
         self.layout, self.flat = layout, flat
-        views = layout.views(flat)
-        self._attention, self._velocity = AttentionWeights(*views[:5]), VelocityWeights(*views[5:])
+        # Made when they are asked for: each lesson makes other weights, and few decisions ask for all.
+        self._attention: AttentionWeights | None = None
+        self._velocity: VelocityWeights | None = None
 
     @property
     def attention(self) -> AttentionWeights:
         """Of the attention module."""
+        if self._attention is None:
+            self._attention = AttentionWeights(*self.layout.views(self.flat, slice(_ATTENTION)))
         return self._attention
+
+    @property
+    def velocity(self) -> VelocityWeights:
+        """Of the velocity module."""
+        if self._velocity is None:
+            self._velocity = VelocityWeights(*self.layout.views(self.flat, slice(_ATTENTION, None)))
+        return self._velocity
 
     @torch.inference_mode()
     def score(self, features: NDArray[np.float32]) -> tuple[Tensor, Tensor]:
         """Scores ``(n,)`` and contexts ``(n, d')`` of the sensors."""
-        return attend(self._attention, torch.from_numpy(features))
+        return attend(self.attention, torch.from_numpy(features))
 
     @torch.inference_mode()
     def velocities(self, z: Tensor, approach: NDArray[np.float32]) -> Tensor:
         """Values ``(levels,)`` of the velocities for one sensor."""
         values = by_distance if self.layout.preset == "paper" else by_reach
-        return values(self._velocity, z, torch.from_numpy(approach))
+        return values(self.velocity, z, torch.from_numpy(approach))
 
 
 class Modules(nn.Module):
@@ -109,9 +122,15 @@ class Layout:
             starts[index], end = end, end + shapes[index].numel()
         return cls(modules.preset, names, shapes, tuple(starts[index] for index in range(len(shapes))))
 
-    def views(self, flat: Tensor) -> list[Tensor]:
-        """The parameters' places in the array, in the modules' order."""
-        return [flat[a : a + s.numel()].view(s) for a, s in zip(self.starts, self.shapes, strict=True)]
+    @property
+    def size(self) -> int:
+        """How many numbers there are."""
+        return sum(shape.numel() for shape in self.shapes)
+
+    def views(self, flat: Tensor, which: slice = slice(None)) -> list[Tensor]:
+        """The parameters' places in the array, in the modules' order, or of some of them."""
+        places = zip(self.starts[which], self.shapes[which], strict=True)
+        return [flat[a : a + s.numel()].view(s) for a, s in places]
 
     def arrays(self, flat: Tensor) -> Parameters:
         """The same places as numpy has them."""
@@ -128,12 +147,29 @@ class Layout:
         return torch.cat([parameters[index].reshape(-1) for index in order])
 
 
+class _Places(threading.local):
+    """Each thread's place for the gradient of a layout; made anew for each lesson, they would scatter the heap."""
+
+    def __init__(self) -> None:
+        self._made: dict[Layout, tuple[Tensor, Parameters]] = {}
+
+    def of(self, layout: Layout) -> tuple[Tensor, Parameters]:
+        """The gradient's array, and the places of the parameters in it."""
+        if layout not in self._made:
+            gradient = torch.zeros(layout.size)
+            self._made[layout] = gradient, layout.arrays(gradient)
+        return self._made[layout]
+
+
+_places = _Places()
+
+
 class Learner:
     """Adam over one mission's weights.
 
-    ``update`` belongs to the learning thread; ``score`` and ``velocities`` may be called from any: they compute with a
-    finished copy, replaced whole after each update, so a decision never sees half a step and never waits for one. Until
-    the first update the copy is every mission's that began with it.
+    ``update`` belongs to the event loop; ``score`` and ``velocities`` may be called from any thread: they compute with
+    a finished copy, replaced whole after each update, so a decision never sees half a step. Until the first update the
+    copy is every mission's that began with it.
     """
 
     def __init__(self, weights: Weights, *, learning_rate: float) -> None:
@@ -160,8 +196,9 @@ class Learner:
     def update(self, sample: Sample, cost: float) -> float:
         """One step on one outcome; returns the loss before it."""
         before = self._weights.flat
-        gradient = torch.zeros(len(before))
-        loss = descend(self._layout.arrays(before), sample, -cost, into=self._layout.arrays(gradient))
+        gradient, into = _places.of(self._layout)
+        gradient.zero_()
+        loss = descend(self._layout.arrays(before), sample, -cost, into=into)
         self._moments = self._moments or Moments.none(len(before))
         self._weights = Weights(self._layout, stepped(before, self._moments, gradient, self._learning_rate))
         # Who sees that it was learned sees the loss too.
@@ -170,7 +207,7 @@ class Learner:
         return loss
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights and Adam's moments as arrays; from the learning thread, or where there is none."""
+        """Weights and Adam's moments as arrays."""
         views = self._layout.views
         adam: dict[int, dict[str, NDArray[np.float32]]] = {}
         if (kept := self._moments) is not None:
