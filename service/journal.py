@@ -14,16 +14,18 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
+from zlib import crc32
 
 from service.events import Decided, Event
 from service.metrics import Metrics
 from service.mission import Mission
+from service.packing import pack
 from service.store import Checkpoint, Deleted, Entry, Item, Made, Store
 
 log = logging.getLogger(__name__)
 
-# A mission is checkpointed after so many events, so that it is read back in a fraction of a second. A lesson takes a
-# millisecond with 10 sensors, some 100 with 1,000 times as many: it counts for one more every hundred sensors.
+# A mission is checkpointed after so many events, so that it is read back in a fraction of a second. A decision about
+# many sensors takes longer to play again: it counts for one more every hundred of them.
 _EVENTS = 256
 _SENSORS = 100
 _MOST_AT_ONCE = 1000
@@ -69,7 +71,7 @@ class Unkept:
 
 
 class Journal:
-    """Writes to a store. Called from the event loop, but for :meth:`checkpoint`, which any thread may call."""
+    """Writes to a store. Called from the event loop, or when that has ended."""
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
         self._store = store
@@ -93,11 +95,15 @@ class Journal:
         """A mission is made, and its events are heard from now on."""
         with self._changed:
             self._add(Made(mission.mission_id, mission.asked_for, mission.spec))
-        self.follow(mission, 0, [])
+        # Missions that begin together, and fly alike, are not to be checkpointed all at once.
+        self._follow(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS)
 
     def follow(self, mission: Mission, seq: int, played: Sequence[Event]) -> None:
         """Hear a mission's events, of which so many are in the store, these since its last checkpoint."""
-        track = Track(mission, seq, sum(map(_weight, played)))
+        self._follow(mission, seq, sum(map(_weight, played)))
+
+    def _follow(self, mission: Mission, seq: int, since: int) -> None:
+        track = Track(mission, seq, since)
         self._tracks[mission.mission_id] = track
 
         def record(event: Event) -> None:
@@ -131,7 +137,8 @@ class Journal:
         While the store fails events would gather without end, so those that the checkpoint stands for leave the queue.
         It takes the place of the last of them: what comes after is written no sooner than it.
         """
-        taken = Checkpoint(track.mission.mission_id, seq, state)
+        # Packed at once: as it is, it would take the memory of a thousand small objects until it is written.
+        taken = Checkpoint(track.mission.mission_id, seq, pack(state))
         with self._changed:
             if track.over:
                 return

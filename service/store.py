@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from service.events import Event, decode, encode
-from service.packing import pack, unpack
+from service.packing import unpack
 from shared.wire import MissionSpec
 
 # The newest of service/migrations/versions.
@@ -79,11 +79,11 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A mission's whole state after event ``seq``."""
+    """A mission's whole state after event ``seq``, packed."""
 
     mission_id: str
     seq: int
-    state: dict[str, Any]
+    state: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +133,11 @@ class Store:
         self._insert: Any = dialect.insert
         # Made once: what SQLAlchemy does to make a statement is a good part of what a commit takes.
         self._new_entries = self._insert(journal).on_conflict_do_nothing()
+        put = self._insert(checkpoints)
+        newer = {"seq": put.excluded.seq, "state": put.excluded.state}
+        self._new_checkpoint = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
+        of, until = sa.bindparam("of"), sa.bindparam("until")
+        self._covered = sa.delete(journal).where((journal.c.mission_id == of) & (journal.c.seq <= until))
 
     def close(self) -> None:
         """Let another edge have it."""
@@ -201,10 +206,8 @@ class Store:
                 }
                 db.execute(self._insert(missions).on_conflict_do_nothing(), row)
             case Checkpoint(mission_id, seq, state):
-                put = self._insert(checkpoints).values(mission_id=mission_id, seq=seq, state=pack(state))
-                newer = {"seq": put.excluded.seq, "state": put.excluded.state}
-                db.execute(put.on_conflict_do_update(index_elements=["mission_id"], set_=newer))
-                db.execute(sa.delete(journal).where((journal.c.mission_id == mission_id) & (journal.c.seq <= seq)))
+                db.execute(self._new_checkpoint, {"mission_id": mission_id, "seq": seq, "state": state})
+                db.execute(self._covered, {"of": mission_id, "until": seq})
             case Deleted(mission_id):
                 for table in (missions, checkpoints, journal):
                     db.execute(sa.delete(table).where(table.c.mission_id == mission_id))

@@ -236,3 +236,16 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) 
         assert status["feedback"] >= len(acknowledged)
         applied = engine.missions.awake[0]._applied
         assert all(name in applied for name in acknowledged[-20:])
+
+
+def test_missions_that_begin_together_are_not_checkpointed_all_at_once(tmp_path: Path) -> None:
+    """A checkpoint takes a millisecond of the event loop, and hundreds of fleets may fly in step."""
+    with running(tmp_path / "m.db") as (client, engine):
+        for n in range(20):
+            assert client.put(f"/missions/fleet{n}", json={"mode": "value"}).status_code == 200
+        assert isinstance(engine.keeper, journal.Journal)
+        least = {
+            next(n for n in range(journal._EVENTS, -1, -1) if engine.keeper.due(mission, n) is not None)
+            for mission in engine.missions.awake
+        }
+    assert len(least) > 10
