@@ -17,12 +17,6 @@ if TYPE_CHECKING:
 
     from service.settings import Settings
 
-# The longest that a request takes from its connection's being accepted to its first bytes, when the service ends.
-_ARRIVING_S = 0.25
-# In-flight decisions are hurried to end within 4 s; past this, shutting down does not wait for them. With the last
-# checkpoints and the last commit it is less than the 10 s after which `docker stop` kills.
-_SHUTDOWN_S = 5
-
 
 @dataclass(frozen=True)
 class Serve:
@@ -85,50 +79,16 @@ def _serve(listener: socket.socket, host: str) -> int:
             "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
 
-    import asyncio
-
-    import uvicorn
-
     from service import logs
-    from service.loading import Loading
+    from service.server import Server
 
     logs.configure(settings.log_level, settings.log_format)
-    loading = Loading(partial(_application, settings), lambda: setattr(server, "should_exit", True))
-    config = uvicorn.Config(
-        loading,
-        log_config=None,
-        log_level=settings.log_level,
-        timeout_graceful_shutdown=_SHUTDOWN_S,
-        access_log=settings.log_level == "debug",
-    )
-
-    class Server(uvicorn.Server):
-        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-            loading.give_up()
-            if loading.app is not None:
-                loading.app.state.engine.asking.hurry()
-                loading.app.state.engine.live.close()
-            await self._close_the_door(sockets or [])
-            await super().shutdown(sockets)
-            # What uvicorn does after this is to say goodbye, and to raise the signal again.
-            logs.hurry()
-
-        async def _close_the_door(self, sockets: list[socket.socket]) -> None:
-            """Accept who has connected, then nobody else, and let their requests arrive: uvicorn would drop them."""
-            for _ in range(3):
-                await asyncio.sleep(0)
-            for server in self.servers:
-                server.close()
-            for listening in sockets:
-                listening.close()
-            await asyncio.sleep(_ARRIVING_S)
-
-    server = Server(config)
+    server = Server(partial(_application, settings), settings.log_level)
     server.run(sockets=[listener])
-    if isinstance(loading.error, _Unusable):
-        return _refused(str(loading.error))
-    if loading.error is not None:
-        raise loading.error
+    if isinstance(server.error, _Unusable):
+        return _refused(str(server.error))
+    if server.error is not None:
+        raise server.error
     return 0
 
 
