@@ -232,7 +232,7 @@ class Engine:
             await _until(turn.plan, turn.deadline)
             watch.lap("plan")
         view = View.of(mission, uav, step)
-        self._metrics.overflow_risk.observe(view.state.overflow_risk(mission.scenario))
+        self._metrics.overflow_risk.observe(view.state.overflow_risk)
         watch.lap("augment")
         view.attend(mission)
         watch.lap("attend")

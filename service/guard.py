@@ -40,7 +40,7 @@ def _is_open(path: str) -> bool:
     return path in _OPEN or path.startswith(_OPEN_BELOW)
 
 
-async def may_make_missions(request: Request) -> bool:
+def may_make_missions(request: Request) -> bool:
     """Whether who asks may make a mission by asking about one that there is not: with a key, only an admin."""
     scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
     return scopes is None or "admin" in scopes

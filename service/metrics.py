@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import version
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Summary
@@ -67,6 +68,8 @@ class Metrics:
             "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
         )
         self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
+        # To find a child by its labels takes as long as to count it; there are few.
+        self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
 
     def record_llm(self, statuses: Mapping[str, int], left_alone: int) -> None:
         """Where the LLM servers stand now.
@@ -81,9 +84,9 @@ class Metrics:
 
     def record_decision(self, decision: DecideResponse) -> None:
         """Count one answered decision: source, stages, overhead, tokens, lateness."""
-        self.decisions.labels(decision.source, decision.reason or "none").inc()
+        self._decisions(decision.source, decision.reason or "none").inc()
         for stage, milliseconds in decision.latency_ms.items():
-            self.decision_seconds.labels(stage).observe(milliseconds / 1e3)
+            self._seconds(stage).observe(milliseconds / 1e3)
         total = decision.latency_ms["total"]
         self.overhead_seconds.observe((total - decision.latency_ms.get("llm", 0.0)) / 1e3)
         if total > decision.deadline_ms:

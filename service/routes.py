@@ -37,7 +37,6 @@ async def _engine(request: Request) -> Engine:
 
 
 TheEngine = Annotated[Engine, Depends(_engine)]
-MayMake = Annotated[bool, Depends(may_make_missions)]
 RequestKey = Annotated[
     str | None,
     Header(
@@ -57,9 +56,10 @@ HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, d
     responses=documented(400, 404, 409, 413, 415, 422, 503),
     tags=["decisions"],
 )
-async def decide(body: DecideRequest, engine: TheEngine, may_make: MayMake, key: RequestKey = None) -> Response:
+async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
     """Which sensor to collect from, and how fast to fly the next step."""
-    answer = await engine.decide(body, may_make=may_make, key=key)
+    engine: Engine = request.state.engine
+    answer = await engine.decide(body, may_make=may_make_missions(request), key=key)
     took = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
     # As text at once: FastAPI would check and convert its own model's instance again.
     return Response(answer.model_dump_json(), media_type="application/json", headers=took)
@@ -67,10 +67,10 @@ async def decide(body: DecideRequest, engine: TheEngine, may_make: MayMake, key:
 
 @router.post("/decide/batch", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])
 async def decide_batch(
-    body: BatchRequest, engine: TheEngine, may_make: MayMake, key: RequestKey = None
+    body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
-    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make, key=key))
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make_missions(request), key=key))
 
 
 @router.post("/feedback", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])

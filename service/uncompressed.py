@@ -77,5 +77,5 @@ class Uncompressed:
         """The columns' names, their whole numbers ``(J, C)``, and which of these only a beacon could have told."""
         columns = full_columns(self.state)
         told = np.array([name in ALWAYS_KNOWN for name in columns])
-        numbers = np.rint(np.stack(list(columns.values()), axis=1)).astype(np.int64)
+        numbers = np.rint(np.array(list(columns.values())).T).astype(np.int64)
         return list(columns), numbers, ~self.state.heard[:, None] & ~told

@@ -76,9 +76,9 @@ class View:
             scores = scores + torch.from_numpy(added.astype(np.float32))
         kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(self._admissible)))
         self.rows = [self._admissible[i] for i in kept]
-        ids, told = self.state.ids[self.rows].tolist(), scores[kept].tolist()
+        ids, told = self.state.ids[self.rows].tolist(), scores.tolist()
         self.candidates = [
-            Candidate(sensor_id=sensor, score=round(score, 6)) for sensor, score in zip(ids, told, strict=True)
+            Candidate(sensor_id=sensor, score=round(told[i], 6)) for sensor, i in zip(ids, kept, strict=True)
         ]
 
     def shown(self, mission: Mission) -> list[int]:

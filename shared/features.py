@@ -12,7 +12,7 @@ from shared.channel import FloatArray, channel_gain_db
 from shared.fleetplan import FleetBelief
 from shared.reach import Reach, distances_ahead
 from shared.scenario import Point, Scenario
-from shared.urgency import overflow_probability, urgency
+from shared.urgency import overflow_probability, urgency_of
 from shared.wire import Features, UavState
 
 # Numbers a sensor in each preset.
@@ -24,8 +24,9 @@ class State:
     """One UAV's view at one step; arrays have shape ``(J,)``, ``places`` ``(J, 2)``, in the request's order.
 
     ``progress_m`` along the trajectory, if the UAV told it; ``queue`` packets, ``battery`` J, ``gain`` dB,
-    ``rate`` packets a step, ``since_visit`` steps, ``urgency`` 0..1, ``distance`` m from the UAV now. Sensors
-    never heard (``heard`` false) hold zeros in what only a beacon tells. ``reach`` only in preset ``reach``.
+    ``rate`` packets a step, ``since_visit`` steps, ``overflow`` (the probability of one before the next visit) and
+    ``urgency`` 0..1, ``distance`` m from the UAV now. Sensors never heard (``heard`` false) hold zeros in what only a
+    beacon tells. ``reach`` only in preset ``reach``.
     """
 
     position: Point
@@ -39,6 +40,7 @@ class State:
     gain: FloatArray
     rate: FloatArray
     since_visit: FloatArray
+    overflow: FloatArray
     urgency: FloatArray
     distance: FloatArray
     reach: Reach | None = None
@@ -48,10 +50,10 @@ class State:
         """Whether each sensor was heard and has a battery."""
         return self.heard & (self.battery > 0)
 
-    def overflow_risk(self, scenario: Scenario) -> float:
+    @property
+    def overflow_risk(self) -> float:
         """Share of the sensors heard that are expected to overflow before their next visit, 0..1; 0 of none."""
-        heard = self.heard
-        return float(overflow_probability(self.queue[heard], self.rate[heard], scenario).mean()) if heard.any() else 0.0
+        return float(self.overflow[self.heard].mean()) if self.heard.any() else 0.0
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """What attention sees of the admissible sensors, ``(n, d)``, each number 0..1.
@@ -68,7 +70,7 @@ class State:
             self.since_visit / scenario.steps,
             self.urgency,
         )
-        stacked = np.array(columns).T[self.admissible].clip(0.0, 1.0)
+        stacked = np.minimum(np.maximum(np.array(columns).T[self.admissible], 0.0), 1.0)
         if self.reach is not None:
             room = scenario.queue_capacity - self.queue
             # A sensor that nothing arrives at never overflows.
@@ -123,13 +125,16 @@ def augment(
     beacon = filled(sensors.last_seen, -1.0)
     heard, fresh = beacon >= 0, beacon == step
     position = (uav.position[0], uav.position[1])
-    places = np.stack((sensors.x, sensors.y), axis=1)
-    distance = np.linalg.norm(places - position, axis=1)
+    places = np.array((sensors.x, sensors.y), dtype=np.float64).T
+    distance = np.sqrt(np.square(places - position).sum(axis=1))
     queue, battery, rate = filled(sensors.queue), filled(sensors.battery), rates[ids]
     if belief is not None:
         heard = np.ones_like(heard)
         queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], belief.rate[ids]
-    urgencies = urgency(queue, rate, scenario)
+    overflow = overflow_probability(queue, rate, scenario)
+    urgencies = urgency_of(queue, overflow, scenario)
+    given_away = np.zeros(scenario.sensors, dtype=np.bool_)
+    given_away[list(reserved)] = True
     reach = None
     if preset == "reach":
         ahead = distances_ahead(uav.uav_id, position, uav.progress_m, places, scenario)
@@ -140,12 +145,13 @@ def augment(
         places=places,
         ids=ids,
         heard=heard,
-        admissible=heard & (battery > 0) & ~np.isin(ids, list(reserved)),
+        admissible=heard & (battery > 0) & ~given_away[ids],
         queue=queue,
         battery=battery,
         gain=np.where(fresh, filled(sensors.channel_gain), channel_gain_db(distance, scenario)),
         rate=rate,
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
+        overflow=overflow,
         urgency=urgencies,
         distance=distance,
         reach=reach,

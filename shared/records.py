@@ -104,6 +104,6 @@ def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief)
     queue = filled(uav.sensors.queue)
     belief.advance(step)
     belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
-    places = np.stack((uav.sensors.x, uav.sensors.y), axis=1)
+    places = np.array((uav.sensors.x, uav.sensors.y), dtype=np.float64).T
     belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
     records.hear(ids, seen, queue)

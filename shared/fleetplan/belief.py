@@ -185,4 +185,6 @@ class FleetBelief:
         else:
             ahead = self._paths[uav].at(last.progress_m + flown)
         offset = ahead[:, None, :] - self.places[which]
-        return np.nan_to_num(np.hypot(offset[..., 0], offset[..., 1]), nan=FAR_M)
+        metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
+        metres_off[np.isnan(metres_off)] = FAR_M
+        return metres_off
