@@ -136,8 +136,8 @@ class Store:
         put = self._insert(checkpoints)
         newer = {"seq": put.excluded.seq, "state": put.excluded.state}
         self._new_checkpoint = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
-        of, until = sa.bindparam("of"), sa.bindparam("until")
-        self._covered = sa.delete(journal).where((journal.c.mission_id == of) & (journal.c.seq <= until))
+        covered = (journal.c.mission_id == sa.bindparam("of")) & (journal.c.seq <= sa.bindparam("until"))
+        self._covered = sa.delete(journal).where(covered)
 
     def close(self) -> None:
         """Let another edge have it."""
