@@ -65,7 +65,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
             await engine.compiler.close()
             await engine.asking.close()
             await llm.close()
-            await asyncio.to_thread(engine.close)
+            await engine.close()
             if store is not None:
                 store.close()
             await asyncio.to_thread(traces.close)

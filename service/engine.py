@@ -88,8 +88,12 @@ class Engine:
         self._outcomes = Outcomes(metrics, self.keeper, self.live)
         self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
 
-    def close(self) -> None:
-        """Finish the lessons and the plans in hand, drop those that are queued, and write what is to be kept."""
+    async def close(self) -> None:
+        """Finish the lessons and the plan in hand, drop the plans that are queued, and write what is to be kept."""
+        self._outcomes.finish()
+        await asyncio.to_thread(self._keep)
+
+    def _keep(self) -> None:
         self._planning.shutdown(wait=True, cancel_futures=True)
         self.missions.close()
         self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)

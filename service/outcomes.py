@@ -104,8 +104,13 @@ class Outcomes:
                 self._waiting.append(lesson)
         self._keeper.checkpoint(track, track.seq, {**mission.state_dict(), "learner": mission.learner.state_dict()})
 
+    def finish(self) -> None:
+        """Learn what waits, now; on the event loop, before :meth:`close` leaves it."""
+        while self._waiting:
+            self._learn(self._waiting.popleft())
+
     def close(self, missions: list[Mission], within_s: float) -> None:
-        """Checkpoint every mission after the lessons in hand, as far as there is time; the journal has the rest."""
+        """Checkpoint every mission, as far as there is time; the journal has the rest."""
         ends = time.monotonic() + within_s
         for mission in missions:
             if time.monotonic() >= ends:
