@@ -52,11 +52,12 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
+# Fewer rounds than the figures in docs/benchmarks.md are of, so that a slow machine needs no more than 15 minutes.
 bench: install
-	$(BIN)/python benchmarks/startup.py
-	$(BIN)/python benchmarks/overhead.py
-	$(BIN)/python benchmarks/tokens.py
-	$(BIN)/python benchmarks/llm.py
+	$(BIN)/python benchmarks/startup.py --rounds 5
+	$(BIN)/python benchmarks/overhead.py --rounds 5
+	$(BIN)/python benchmarks/tokens.py --seeds 3
+	$(BIN)/python benchmarks/llm.py --rounds 4
 	$(BIN)/python benchmarks/sensors.py
 	$(BIN)/python benchmarks/fleet.py
 	$(BIN)/python benchmarks/world.py

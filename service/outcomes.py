@@ -32,7 +32,7 @@ class Lesson(NamedTuple):
 
 
 class Outcomes:
-    """Learns on the event loop, one lesson a turn of it, in the order that the outcomes came.
+    """Learns on the event loop, a few lessons a turn of it, in the order that the outcomes came.
 
     A lesson takes less than to hand it to another thread, which would take the interpreter from the decisions just as
     long; and a fleet that is flown again in the same order learns the same.
@@ -72,8 +72,11 @@ class Outcomes:
         self._waiting.append(lesson)
 
     def _turn(self) -> None:
-        """One lesson, so that nobody waits for more than that."""
-        if self._waiting:
+        """A lesson, and a quarter of what waits besides: nobody waits for many, and as many are learned as come.
+
+        In a turn of the loop in which 64 UAVs ask, 64 outcomes may come.
+        """
+        for _ in range(min(len(self._waiting), 1 + len(self._waiting) // 4)):
             self._learn(self._waiting.popleft())
         if self._waiting:
             self._loop.call_soon(self._turn)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import httpx
 
 from service.engine import Engine
 from service.mission import Mission
+from shared.scenario import scenario_named
 from tests.service.keeping import fly, running, same, settled, state
 
 Report = Callable[..., dict[str, Any]]
@@ -53,3 +55,21 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
         untaught, _ = told_by(client, engine, None)
     assert taught == untaught
     assert later != taught
+
+
+def test_as_many_lessons_are_learned_as_outcomes_come(tmp_path: Path, report: Report) -> None:
+    """Of many UAVs that ask at once, each turn of the event loop brings many outcomes: none is left out for that."""
+    uavs, steps = 64, 12
+    spec = {"mode": "value", "scenario": scenario_named("paper").model_copy(update={"uavs": uavs}).model_dump()}
+    with running(tmp_path / "m.db") as (client, engine), ThreadPoolExecutor(uavs) as pool:
+        assert client.put("/missions/test", json=spec).status_code == 200
+
+        def flown(uav_id: int) -> None:
+            owed: dict[str, Any] = {}
+            for step in range(steps):
+                answer = client.post("/decide", json=report(step=step, uav_id=uav_id) | owed)
+                assert answer.status_code == 200, answer.text
+                owed = {"outcome": {"decision_id": answer.json()["decision_id"], "cost": 0.5}}
+
+        assert len(list(pool.map(flown, range(uavs)))) == uavs
+        settled(engine, engine.missions.awake[0], uavs * (steps - 1))
