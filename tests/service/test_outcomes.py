@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import asyncio
+import uuid
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import httpx
 
 from service.engine import Engine
+from service.journal import Unkept
+from service.live.watch import Live
+from service.metrics import Metrics
 from service.mission import Mission
-from shared.scenario import scenario_named
+from service.outcomes import Outcomes
+from service.settings import Settings
+from shared.wire import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state
+from tests.service.making import attended, uav
 
 Report = Callable[..., dict[str, Any]]
 
@@ -57,19 +64,20 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
     assert later != taught
 
 
-def test_as_many_lessons_are_learned_as_outcomes_come(tmp_path: Path, report: Report) -> None:
+def test_as_many_lessons_are_learned_as_outcomes_come() -> None:
     """Of many UAVs that ask at once, each turn of the event loop brings many outcomes: none is left out for that."""
-    uavs, steps = 64, 12
-    spec = {"mode": "value", "scenario": scenario_named("paper").model_copy(update={"uavs": uavs}).model_dump()}
-    with running(tmp_path / "m.db") as (client, engine), ThreadPoolExecutor(uavs) as pool:
-        assert client.put("/missions/test", json=spec).status_code == 200
+    turns = 30
 
-        def flown(uav_id: int) -> None:
-            owed: dict[str, Any] = {}
-            for step in range(steps):
-                answer = client.post("/decide", json=report(step=step, uav_id=uav_id) | owed)
-                assert answer.status_code == 200, answer.text
-                owed = {"outcome": {"decision_id": answer.json()["decision_id"], "cost": 0.5}}
+    async def flown() -> list[int]:
+        outcomes = Outcomes(Metrics(), Unkept(), Live())
+        fleets = [Mission(f"fleet{n}", MissionSpec(mode="value"), Settings(mode="value")) for n in range(40)]
+        for turn in range(turns):
+            for mission in fleets:
+                name = uuid.uuid4().hex
+                mission.commit(attended(mission, uav(), turn).pending(mission, name, 1, 7))
+                outcomes.apply(mission, Outcome(decision_id=name, cost=0.5))
+            await asyncio.sleep(0)
+        outcomes.finish()
+        return [mission.learner.updates for mission in fleets]
 
-        assert len(list(pool.map(flown, range(uavs)))) == uavs
-        settled(engine, engine.missions.awake[0], uavs * (steps - 1))
+    assert asyncio.run(flown()) == [turns] * 40
