@@ -4,10 +4,10 @@
 
 Starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided`` at
 once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, and
-full after some 300 outcomes; until the pieces freed meanwhile fit those that are asked for takes twice as long again.
-So the edge is measured after 900 outcomes of every mission, a quarter of an hour: the slope of the resident memory by
-least squares, with its 95% interval, and the first and last count of tasks, connections and open files. Prints it, and
-writes the same as JSON.
+full after some 300 outcomes; the resident memory grows on after that, ever more slowly, as its highest mark does. So
+the edge is measured after 900 outcomes of every mission, some 20 minutes: the slope of the resident memory by least
+squares, with its 95% interval, and the first and last count of tasks, connections and open files. The LLM's states
+come and go by megabytes: `--guided 0` shows what is left without them. Prints it, and writes the same as JSON.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from simulator.client import EdgeClient
 from simulator.demo import HOST, usable_port
 
 MISSIONS, UAVS, SENSORS = 200, 3, 10
-# Outcomes after which a mission's memory, and the heap's order, are what they will be.
+# Outcomes after which a mission remembers no more than before, and the resident memory grows but little.
 WARM = 900
 SAMPLE_S = 2.0
 WORKERS = 3
