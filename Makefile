@@ -57,7 +57,7 @@ bench: install
 	$(BIN)/python benchmarks/startup.py --rounds 5
 	$(BIN)/python benchmarks/overhead.py --rounds 5
 	$(BIN)/python benchmarks/tokens.py --seeds 3
-	$(BIN)/python benchmarks/llm.py --rounds 4
+	$(BIN)/python benchmarks/llm.py --rounds 3
 	$(BIN)/python benchmarks/sensors.py
 	$(BIN)/python benchmarks/fleet.py
 	$(BIN)/python benchmarks/world.py
