@@ -20,7 +20,7 @@ from service.events import Decided, Event
 from service.metrics import Metrics
 from service.mission import Mission
 from service.packing import pack
-from service.store import Checkpoint, Deleted, Entry, Item, Made, Store
+from service.store import Checkpoint, Deleted, Entry, Item, Made, Store, cause
 
 log = logging.getLogger(__name__)
 
@@ -82,6 +82,7 @@ class Journal:
         self._changed = threading.Condition()
         self._added = self._wanted = self._written = 0
         self._failing = self._closing = False
+        self._why = ""
         self._waiting: list[tuple[int, asyncio.Future[bool]]] = []
         self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
         self._thread.start()
@@ -225,9 +226,11 @@ class Journal:
 
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()
-        if not self._failing:
-            log.error("the store fails, what waits is tried again: %s", str(error).splitlines()[0])
-        self._failing = True
+        why = cause(error)
+        # Once each: where the database is away a while, and then another edge's, both are told.
+        if not self._failing or why != self._why:
+            log.error("the store fails, what waits is tried again: %s", why)
+        self._failing, self._why = True, why
         self._tell()
 
     def _give_up(self) -> None:

@@ -95,8 +95,9 @@ def _serve(listener: socket.socket, host: str) -> int:
 def _application(settings: Settings) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
     from service.app import create_app
+    from service.hold import StoreUnusable
     from service.keys import BadKeys
-    from service.store import Store, StoreUnusable
+    from service.store import Store
 
     try:
         return create_app(settings, None if settings.store == "none" else Store(settings.store))

@@ -6,27 +6,24 @@ holds is deleted from the journal in the same transaction that brings it.
 
 from __future__ import annotations
 
-import fcntl
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from service.events import Event, decode, encode
+from service.hold import DatabaseHold, FileHold, StoreUnusable
 from service.packing import unpack
 from shared.wire import MissionSpec
 
 # The newest of service/migrations/versions.
-SCHEMA = "0001"
+SCHEMA = "0002"
 # Milliseconds that a transaction waits for another program's lock of the file.
 _BUSY_MS = 1000
 _CONNECT_S = 5
-# Any number that no other program of the same database takes.
-_ADVISORY_LOCK = 0x41494356
 
 metadata = sa.MetaData()
 missions = sa.Table(
@@ -53,10 +50,12 @@ journal = sa.Table(
     sa.Column("body", sa.LargeBinary, nullable=False),
     sqlite_with_rowid=False,
 )
-
-
-class StoreUnusable(Exception):
-    """The store cannot be opened; the text says why, and names no password."""
+terms = sa.Table(
+    "terms",
+    metadata,
+    sa.Column("term", sa.Integer, primary_key=True),
+    sa.Column("began", sa.DateTime, nullable=False, server_default=sa.func.now()),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,19 +117,20 @@ class Store:
     """
 
     def __init__(self, url: str) -> None:
-        self._guard: IO[str] | sa.Connection | None = None
+        self._hold: FileHold | DatabaseHold | None = None
         try:
             self._engine = _engine(url)
-            self._take()
+            sqlite_file = self._engine.dialect.name == "sqlite"
+            self._hold = FileHold(self._engine) if sqlite_file else DatabaseHold(self._engine, terms)
             self._migrate()
+            self._hold.begin_term()
         except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
             self.close()
-            raise StoreUnusable(_cause(error)) from None
+            raise StoreUnusable(cause(error)) from None
         except StoreUnusable:
             self.close()
             raise
-        dialect = sqlite if self._engine.dialect.name == "sqlite" else postgresql
-        self._insert: Any = dialect.insert
+        self._insert: Any = (sqlite if sqlite_file else postgresql).insert
         # Made once: what SQLAlchemy does to make a statement is a good part of what a commit takes.
         self._new_entries = self._insert(journal).on_conflict_do_nothing()
         put = self._insert(checkpoints)
@@ -141,10 +141,9 @@ class Store:
 
     def close(self) -> None:
         """Let another edge have it."""
-        if self._guard is not None:
-            with suppress(sa.exc.SQLAlchemyError):
-                self._guard.close()
-            self._guard = None
+        if self._hold is not None:
+            self._hold.close()
+            self._hold = None
         if hasattr(self, "_engine"):
             self._engine.dispose()
 
@@ -179,9 +178,12 @@ class Store:
 
         Raises:
             sqlalchemy.exc.SQLAlchemyError: nothing was written.
+            StoreUnusable: nor will anything be: the store is closed, or another edge's by now.
         """
+        if self._hold is None:
+            raise StoreUnusable("it is closed")
         entries: list[dict[str, Any]] = []
-        with self._writing() as db:
+        with self._hold.transaction() as db:
             for item in items:
                 if isinstance(item, Entry):
                     kind, body = encode(item.event)
@@ -211,38 +213,6 @@ class Store:
             case Deleted(mission_id):
                 for table in (missions, checkpoints, journal):
                     db.execute(sa.delete(table).where(table.c.mission_id == mission_id))
-
-    @contextmanager
-    def _writing(self) -> Iterator[sa.Connection]:
-        """A transaction of whoever holds the store; raises where that is another edge by now."""
-        if self._engine.dialect.name == "sqlite":
-            with self._engine.begin() as db:
-                yield db
-            return
-        # The lock is this connection's: one that broke may have let another edge in.
-        if self._guard is None or not isinstance(self._guard, sa.Connection) or self._guard.invalidated:
-            self._take()
-        assert isinstance(self._guard, sa.Connection)
-        with self._guard.begin():
-            yield self._guard
-
-    def _take(self) -> None:
-        """Hold the store as long as this process lives, however it ends."""
-        file = self._engine.url.database
-        if self._engine.dialect.name == "sqlite":
-            self._guard = open(f"{file}.lock", "w")  # noqa: SIM115
-            try:
-                fcntl.flock(self._guard, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise StoreUnusable(f"another edge uses {file}") from None
-            return
-        self._guard = self._engine.connect()
-        with self._guard.begin():
-            taken = self._guard.scalar(sa.select(sa.func.pg_try_advisory_lock(_ADVISORY_LOCK)))
-        if not taken:
-            self._guard.close()
-            self._guard = None
-            raise StoreUnusable(f"another edge uses the database {file}")
 
     def _migrate(self) -> None:
         """Bring the schema up to date; alembic, slow to import, only where it is not."""
@@ -294,7 +264,7 @@ def _prepare(connection: Any, _: object) -> None:
         connection.execute(f"PRAGMA {pragma}")
 
 
-def _cause(error: Exception) -> str:
-    """Without the statement and its parameters; drivers name no password."""
+def cause(error: Exception) -> str:
+    """An error in one line, without the statement and its parameters; drivers name no password."""
     origin = getattr(error, "orig", None) or error
     return str(origin).strip().splitlines()[0] if str(origin).strip() else type(origin).__name__

@@ -116,7 +116,7 @@ async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_pat
 async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = Store(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
-    write, failures = store.write, iter([OSError("no such device"), MemoryError()])
+    write, failures = store.write, iter([MemoryError(), OSError("no such device")])
 
     def moody(items: Sequence[Item]) -> None:
         if (failure := next(failures, None)) is not None:

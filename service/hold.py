@@ -1,0 +1,106 @@
+"""One edge has a store at a time: a SQLite file by its lock, a PostgreSQL database by an advisory lock and a term."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import IO
+
+import sqlalchemy as sa
+
+# Any number that no other program of the same database takes.
+_ADVISORY_LOCK = 0x41494356
+
+
+class StoreUnusable(Exception):
+    """The store cannot be opened or written to; the text says why, and names no password."""
+
+
+class FileHold:
+    """Has a SQLite file as long as this process lives, however it ends.
+
+    Raises:
+        StoreUnusable: another edge has it.
+        OSError: there can be no lock file beside it.
+    """
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+        file = engine.url.database
+        self._lock: IO[str] = open(f"{file}.lock", "w")  # noqa: SIM115
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._lock.close()
+            raise StoreUnusable(f"another edge uses {file}") from None
+
+    def begin_term(self) -> None:
+        """A lock that cannot be lost needs none."""
+
+    @contextmanager
+    def transaction(self) -> Iterator[sa.Connection]:
+        """A transaction, committed at its end; raises ``SQLAlchemyError`` where it was not."""
+        with self._engine.begin() as db:
+            yield db
+
+    def close(self) -> None:
+        """Let another edge have it."""
+        self._lock.close()
+
+
+class DatabaseHold:
+    """Has a PostgreSQL database as long as its connection lives.
+
+    A connection that broke lets another edge in, unseen. So each edge begins a term of its own, a number in the
+    database. One that takes the lock again in another's term knows missions as they were before it, and writes nothing.
+
+    Raises:
+        StoreUnusable: another edge has it.
+        sqlalchemy.exc.SQLAlchemyError: it cannot be reached.
+    """
+
+    def __init__(self, engine: sa.Engine, terms: sa.Table) -> None:
+        self._engine = engine
+        self._terms = terms
+        self._term: int | None = None
+        self._connection = self._locked()
+
+    def begin_term(self) -> None:
+        """From now on this edge alone writes."""
+        with self._connection.begin():
+            made = sa.insert(self._terms).returning(self._terms.c.term)
+            self._term = self._connection.scalar(made)
+
+    @contextmanager
+    def transaction(self) -> Iterator[sa.Connection]:
+        """A transaction of the connection that has the lock, which is taken again where it was lost.
+
+        Raises:
+            StoreUnusable: another edge has, or had, the database meanwhile.
+            sqlalchemy.exc.SQLAlchemyError: nothing was committed.
+        """
+        if self._connection.closed or self._connection.invalidated:
+            self._connection.close()
+            self._connection = self._locked()
+            with self._connection.begin():
+                newest = self._connection.scalar(sa.select(sa.func.max(self._terms.c.term)))
+            if newest != self._term:
+                self._connection.close()
+                raise StoreUnusable("another edge has had it since: end this one, its missions are out of date")
+        with self._connection.begin():
+            yield self._connection
+
+    def close(self) -> None:
+        """Let another edge have it."""
+        with suppress(sa.exc.SQLAlchemyError):
+            self._connection.close()
+
+    def _locked(self) -> sa.Connection:
+        connection = self._engine.connect()
+        with connection.begin():
+            taken = connection.scalar(sa.select(sa.func.pg_try_advisory_lock(_ADVISORY_LOCK)))
+        if not taken:
+            connection.close()
+            raise StoreUnusable(f"another edge uses the database {self._engine.url.database}")
+        return connection
