@@ -34,8 +34,8 @@ class Lesson(NamedTuple):
 class Outcomes:
     """Learns on the event loop, a few lessons a turn of it, in the order that the outcomes came.
 
-    A lesson takes less than to hand it to another thread, which would take the interpreter from the decisions just as
-    long; and a fleet that is flown again in the same order learns the same.
+    A thread's lesson would take the interpreter from the decisions just as long, and the thread must be woken besides;
+    and a fleet that is flown again in the same order learns the same.
     """
 
     def __init__(self, metrics: Metrics, keeper: Journal | Unkept, live: Live) -> None:
