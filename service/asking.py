@@ -80,7 +80,9 @@ class Asking:
         self._closing = True
         ends = asyncio.get_running_loop().time() + _HURRY_S
         for limit in self._waiting:
-            limit.reschedule(min(limit.when() or ends, ends))
+            # One that has just expired is on its way out, and cannot be changed.
+            if not limit.expired():
+                limit.reschedule(min(limit.when() or ends, ends))
 
     async def close(self) -> None:
         """Give up what goes on in the background."""

@@ -1,0 +1,35 @@
+"""Closing time, for those who wait for the LLM."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from service.journal import Journal
+from tests.running import listening
+from tests.service.keeping import running
+from tests.service.stub_llm import misbehaving, silent, wait_for
+
+Report = Callable[..., dict[str, Any]]
+
+
+def test_closing_time_at_the_moment_of_a_deadline_fails_nobody(tmp_path: Path, report: Report) -> None:
+    with (
+        listening(misbehaving(silent)) as llm,
+        running(tmp_path / "m.db", mode="llm", llm_url=f"{llm}/v1", planner="off") as (client, engine),
+        ThreadPoolExecutor(1) as pool,
+    ):
+        wait_for(client, "ready")
+        late = pool.submit(client.post, "/decide", json=report(deadline_ms=300))
+
+        async def every_turn_of_the_loop() -> None:
+            while not late.done():
+                engine.asking.hurry()
+                await asyncio.sleep(0)
+
+        assert isinstance(engine.keeper, Journal)
+        asyncio.run_coroutine_threadsafe(every_turn_of_the_loop(), engine.keeper._loop).result(timeout=30)
+        assert (late.result().status_code, late.result().json()["reason"]) == (200, "llm_timeout")
