@@ -27,7 +27,7 @@ class Applied:
 
     def add(self, decision_id: str, cost: float, failed: bool) -> None:
         """Remember one; the oldest of too many is forgotten."""
-        self._costs[bytes.fromhex(decision_id)] = -cost if failed else cost
+        self._costs[bytes.fromhex(decision_id)] = math.copysign(cost, -1.0 if failed else 1.0)
         while len(self._costs) > self._most:
             del self._costs[next(iter(self._costs))]
 

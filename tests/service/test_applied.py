@@ -16,6 +16,12 @@ def test_what_was_applied_is_known_with_its_sign_and_its_zero() -> None:
     assert again.state_dict() == told
 
 
+def test_a_cost_of_minus_zero_is_no_failure() -> None:
+    applied = Applied(most=1)
+    applied.add("0" * 32, -0.0, False)
+    assert applied["0" * 32] == (0.0, False)
+
+
 def test_the_oldest_is_forgotten() -> None:
     applied = Applied(most=2)
     for n in range(3):
