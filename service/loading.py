@@ -81,6 +81,8 @@ class Loading:
                 # A million objects of torch and others stay as long as the process: no collection need look at them,
                 # which takes a tenth of a second in the midst of a decision.
                 gc.freeze()
+                # Python collects again when what is new is a quarter of what it found last: that is little from now on.
+                gc.collect()
                 self._settled.set()
                 await self._ended.wait()
         except Exception as error:
