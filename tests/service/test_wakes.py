@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -132,6 +134,44 @@ async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path, monke
     assert store.missions() == ["test"]
     journal.close(5)
     store.close()
+
+
+def test_a_mission_deleted_twice_is_gone_when_that_is_said(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, go = Store.write, threading.Event()
+
+    def slowly(self: Store, items: Sequence[Item]) -> None:
+        go.wait(30)
+        write(self, items)
+
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+        monkeypatch.setattr(Store, "write", slowly)
+        # A disk that takes longer than an answer may.
+        assert [client.delete("/missions/test").status_code for _ in range(2)] == [503, 503]
+        go.set()
+        assert client.delete("/missions/test").status_code == 404
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    left = Store(str(copied))
+    assert left.missions() == []
+    left.close()
+
+
+@pytest.mark.parametrize("mode", ["value", "policy", "guided"])
+def test_a_deleted_mission_is_gone_from_memory_before_any_collection(tmp_path: Path, report: Report, mode: str) -> None:
+    with running(tmp_path / "m.db", mode=mode) as (client, engine):
+        fly(client, report, range(3))
+        deleted = weakref.ref(engine.missions.awake[0])
+        gc.disable()
+        try:
+            assert client.delete("/missions/test").status_code == 204
+            ends = time.monotonic() + 10
+            while deleted() is not None:
+                assert time.monotonic() < ends
+                time.sleep(0.05)
+        finally:
+            gc.enable()
 
 
 def test_a_mission_deleted_while_it_wakes_stays_deleted(
