@@ -65,8 +65,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
             await engine.compiler.close()
             await engine.asking.close()
             await llm.close()
-            await engine.close()
-            if store is not None:
+            if await engine.close() and store is not None:
                 store.close()
             await asyncio.to_thread(traces.close)
 

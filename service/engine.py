@@ -88,16 +88,20 @@ class Engine:
         self._outcomes = Outcomes(metrics, self.keeper, self.live)
         self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
 
-    async def close(self) -> None:
-        """Finish the lessons and the plan in hand, drop the plans that are queued, and write what is to be kept."""
-        self._outcomes.finish()
-        await asyncio.to_thread(self._keep)
+    async def close(self) -> bool:
+        """Finish the lessons and the plan in hand, drop the plans that are queued, and write what is to be kept.
 
-    def _keep(self) -> None:
+        Returns:
+            whether the store may be closed: False while a write that was given up still waits for it.
+        """
+        self._outcomes.finish()
+        return await asyncio.to_thread(self._keep)
+
+    def _keep(self) -> bool:
         self._planning.shutdown(wait=True, cancel_futures=True)
         self.missions.close()
         self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
-        self.keeper.close(_LAST_COMMIT_S)
+        return self.keeper.close(_LAST_COMMIT_S)
 
     async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
         """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input.

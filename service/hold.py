@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import IO
@@ -27,7 +28,8 @@ class FileHold:
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
-        file = engine.url.database
+        # By its own name: another edge may know it by a link.
+        file = os.path.realpath(engine.url.database or "")
         self._lock: IO[str] = open(f"{file}.lock", "w")  # noqa: SIM115
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -81,26 +83,41 @@ class DatabaseHold:
             sqlalchemy.exc.SQLAlchemyError: nothing was committed.
         """
         if self._connection.closed or self._connection.invalidated:
-            self._connection.close()
-            self._connection = self._locked()
-            with self._connection.begin():
-                newest = self._connection.scalar(sa.select(sa.func.max(self._terms.c.term)))
-            if newest != self._term:
-                self._connection.close()
-                raise StoreUnusable("another edge has had it since: end this one, its missions are out of date")
+            self._connection = self._taken_again()
         with self._connection.begin():
             yield self._connection
 
     def close(self) -> None:
         """Let another edge have it."""
-        with suppress(sa.exc.SQLAlchemyError):
-            self._connection.close()
+        _end(self._connection)
+
+    def _taken_again(self) -> sa.Connection:
+        connection = self._locked()
+        try:
+            with connection.begin():
+                newest = connection.scalar(sa.select(sa.func.max(self._terms.c.term)))
+            if newest != self._term:
+                raise StoreUnusable("another edge has had it since: end this one, its missions are out of date")
+        except BaseException:
+            _end(connection)
+            raise
+        return connection
 
     def _locked(self) -> sa.Connection:
         connection = self._engine.connect()
-        with connection.begin():
-            taken = connection.scalar(sa.select(sa.func.pg_try_advisory_lock(_ADVISORY_LOCK)))
-        if not taken:
-            connection.close()
-            raise StoreUnusable(f"another edge uses the database {self._engine.url.database}")
+        try:
+            with connection.begin():
+                taken = connection.scalar(sa.select(sa.func.pg_try_advisory_lock(_ADVISORY_LOCK)))
+            if not taken:
+                raise StoreUnusable(f"another edge uses the database {self._engine.url.database}")
+        except BaseException:
+            _end(connection)
+            raise
         return connection
+
+
+def _end(connection: sa.Connection) -> None:
+    """End a connection and its locks; closed only, it would go back to the pool and keep them."""
+    with suppress(sa.exc.SQLAlchemyError):
+        connection.invalidate()
+        connection.close()

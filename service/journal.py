@@ -66,7 +66,7 @@ class Unkept:
         return True
 
     def close(self, within_s: float) -> bool:
-        """There is nothing to write."""
+        """Nobody writes."""
         return True
 
 
@@ -122,6 +122,8 @@ class Journal:
         with self._changed:
             if (track := self._tracks.pop(mission_id, None)) is not None:
                 track.over = True
+                # Mission and hearer hold each other: all of it would stay in memory until a collection finds it.
+                track.mission.record = _unheard
             self._add(Deleted(mission_id))
 
     def due(self, mission: Mission, least: int = _EVENTS) -> Track | None:
@@ -171,12 +173,12 @@ class Journal:
                 self._waiting.remove(mine)
 
     def close(self, within_s: float) -> bool:
-        """Write what waits, once more; returns whether all is written."""
+        """Write what waits, once more; returns whether that has ended, and the store may be closed."""
         with self._changed:
             self._closing = True
             self._changed.notify()
         self._thread.join(within_s)
-        return not self._queue
+        return not self._thread.is_alive()
 
     def _add(self, item: Item) -> None:
         """The caller holds the lock."""
@@ -251,6 +253,10 @@ class Journal:
         for ticket, waiting in self._waiting:
             if not waiting.done() and (ticket <= self._written or self._failing):
                 waiting.set_result(ticket <= self._written)
+
+
+def _unheard(event: Event) -> None:
+    """What still happens to a deleted mission."""
 
 
 def _weight(event: Event) -> int:

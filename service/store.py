@@ -23,7 +23,9 @@ from shared.wire import MissionSpec
 SCHEMA = "0002"
 # Milliseconds that a transaction waits for another program's lock of the file.
 _BUSY_MS = 1000
+# The longest that PostgreSQL is waited for: to connect, for a statement, and for a network that says nothing.
 _CONNECT_S = 5
+_STATEMENT_MS = 5000
 
 metadata = sa.MetaData()
 missions = sa.Table(
@@ -255,7 +257,12 @@ def _engine(url: str) -> sa.Engine:
         return engine
     if parsed.get_backend_name() != "postgresql":
         raise ValueError(f"{parsed.get_backend_name()} is not known: use a SQLite file or postgresql://")
-    return sa.create_engine(parsed, pool_pre_ping=True, connect_args={"connect_timeout": _CONNECT_S})
+    limits = {
+        "connect_timeout": _CONNECT_S,
+        "tcp_user_timeout": _STATEMENT_MS,
+        "options": f"-c lock_timeout={_BUSY_MS} -c statement_timeout={_STATEMENT_MS}",
+    }
+    return sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
 
 
 def _prepare(connection: Any, _: object) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,14 +16,6 @@ from tests.service.keeping import fly, running
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
-
-
-def test_two_edges_do_not_share_a_store(address: str) -> None:
-    first = Store(address)
-    with pytest.raises(StoreUnusable, match="another edge"):
-        Store(address)
-    first.close()
-    Store(address).close()
 
 
 def _damaged(path: Path) -> None:
@@ -95,49 +86,3 @@ def test_a_store_of_an_older_version_is_brought_up_to_date_with_its_missions(tmp
     with engine.connect() as newer:
         assert newer.scalar(text("SELECT version_num FROM alembic_version")) == SCHEMA
     engine.dispose()
-
-
-def _break_holds(url: str) -> None:
-    """As a network that fails does: PostgreSQL ends the connection that has the lock."""
-    root = create_engine(url.replace("postgresql://", "postgresql+psycopg://"), isolation_level="AUTOCOMMIT")
-    holders = "SELECT pid FROM pg_locks WHERE locktype = 'advisory'"
-    with root.connect() as db:
-        db.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({holders}) AS holders"))
-    root.dispose()
-
-
-def test_an_edge_whose_hold_on_postgresql_broke_takes_it_again_or_writes_no_more(postgres: str, report: Report) -> None:
-    with running(postgres) as (client, _):
-        client.delete("/missions/test")
-        fly(client, report, range(2))
-        _break_holds(postgres)
-        # Nobody else came: the first write finds out, the next takes the hold again.
-        ends = time.monotonic() + 30
-        while not client.post("/decide", json=report(step=5)).json()["stored"]:
-            assert time.monotonic() < ends
-            time.sleep(0.1)
-        with pytest.raises(StoreUnusable, match="another edge"):
-            Store(postgres)
-
-
-def test_an_edge_that_comes_back_after_another_had_the_database_writes_nothing_into_what_that_one_wrote(
-    postgres: str, report: Report, caplog: pytest.LogCaptureFixture
-) -> None:
-    with running(postgres) as (first, _):
-        first.delete("/missions/test")
-        fly(first, report, range(2))
-        _break_holds(postgres)
-        with running(postgres) as (second, _):
-            fly(second, report, range(2, 4))
-            flown = second.get("/missions/test").json()
-        # The other has ended, and the lock is free: the first, which was not asked meanwhile, has it as of step 2.
-        ends = time.monotonic() + 30
-        while "another edge has had it since" not in caplog.text:
-            assert time.monotonic() < ends
-            late = first.post("/decide", json=report(step=9)).json()
-            assert not late["stored"]
-            time.sleep(0.1)
-        outcome = {"mission_id": "test", "decision_id": late["decision_id"], "cost": 0.5, "failed": False}
-        assert first.post("/feedback", json=outcome).status_code == 503
-    with running(postgres) as (third, _):
-        assert third.get("/missions/test").json() == flown
