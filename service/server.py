@@ -10,6 +10,7 @@ import uvicorn
 from starlette.applications import Starlette
 
 from service import logs
+from service.heads import BoundedHeads
 from service.loading import Loading
 
 # The longest that a request takes from its connection's being accepted to its first bytes, when the service ends.
@@ -35,6 +36,9 @@ class Server(uvicorn.Server):
         config = uvicorn.Config(
             self._loading,
             log_config=None,
+            http=BoundedHeads,
+            # There are none; their library would take heads that nobody counts.
+            ws="none",
             log_level=log_level,
             timeout_graceful_shutdown=_SHUTDOWN_S,
             access_log=log_level == "debug",
