@@ -15,6 +15,7 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Asked
 
 from service.keys import Key, Keys, Scope
+from service.limits import READING
 from service.problems import problem_response
 
 # What says nothing of missions: probes of containers and load balancers carry no key.
@@ -30,14 +31,15 @@ STILL_KNOWN = "aicvds.still_known"
 
 def scope_of(method: str, path: str) -> Scope | None:
     """What a key must be allowed for a request; None where none is needed, or any will do for reading."""
-    if method in ("GET", "HEAD"):
+    if method in READING:
         # What was learned is told to those who fly by it.
         return "decide" if _ATTENTION.fullmatch(path) else None
     return "admin" if path.startswith("/missions") else "decide"
 
 
-def _is_open(path: str) -> bool:
-    return path in _OPEN or path.startswith(_OPEN_BELOW)
+def _is_open(method: str, path: str) -> bool:
+    # Nothing else is done there: a stranger's body would only be waited for.
+    return method in READING and (path in _OPEN or path.startswith(_OPEN_BELOW))
 
 
 def may_make_missions(request: Request) -> bool:
@@ -58,7 +60,7 @@ class Guard:
         self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
 
     async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_open(scope["path"]):
+        if scope["type"] != "http" or _is_open(scope["method"], scope["path"]):
             await self.app(scope, receive, send)
             return
         presented = _presented(scope["headers"])

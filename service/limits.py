@@ -1,7 +1,8 @@
-"""The door: requests are bounded in number, and bodies in size before and after they are unpacked."""
+"""The door: requests are bounded in number, and bodies in time and in size, before and after they are unpacked."""
 
 from __future__ import annotations
 
+import asyncio
 import re
 import zlib
 from collections.abc import Callable
@@ -11,9 +12,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import problem_response
 
+# What is read has no body: nothing of it is kept.
+READING = ("GET", "HEAD")
 _NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
 # A page's stream lasts as long as the page: it has a limit of its own, and takes no decision's place.
 _STREAMS = re.compile(r"/missions/[^/]+/events")
+# Meanwhile a body keeps the place of a decision.
+_BODY_S = 10.0
 
 
 class _TooLarge(Exception):
@@ -38,7 +43,7 @@ class Crowd:
         self._inside = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in _NEVER_REFUSED or _STREAMS.fullmatch(scope["path"]):
+        if scope["type"] != "http" or _is_let_in(scope["method"], scope["path"]):
             await self.app(scope, receive, send)
             return
         if self._inside >= self._most:
@@ -54,10 +59,15 @@ class Crowd:
             self._inside -= 1
 
 
+def _is_let_in(method: str, path: str) -> bool:
+    return method in READING and (path in _NEVER_REFUSED or _STREAMS.fullmatch(path) is not None)
+
+
 class BodyLimit:
     """Pure ASGI middleware: reads the body up to ``limit`` bytes and undoes ``Content-Encoding: gzip | zstd``.
 
-    Answers 413 past the limit, 415 for another encoding, 400 for a damaged one, each as a problem document.
+    Answers 413 past the limit, 408 to what has not come within 10 s, 415 for another encoding, 400 for a damaged one,
+    each as a problem document.
     """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
@@ -76,13 +86,20 @@ class BodyLimit:
             await response(scope, receive, send)
             return
         try:
-            body = await self._read(receive, headers.get(b"content-length", b""))
+            async with asyncio.timeout(_BODY_S):
+                body = await self._read(receive, headers.get(b"content-length", b""))
             if body is None:
                 return
             body = _DECODERS[encoding](body, self.limit)
         except _TooLarge:
             fault = {"field": "body", "problem": f"larger than {self.limit} bytes"}
             response = problem_response(413, f"body: larger than {self.limit} bytes", [fault])
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+            return
+        except TimeoutError:
+            fault = {"field": "body", "problem": f"not here within {_BODY_S:g} s"}
+            response = problem_response(408, f"body: not here within {_BODY_S:g} s", [fault])
             response.headers["Connection"] = "close"
             await response(scope, receive, send)
             return

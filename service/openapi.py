@@ -207,6 +207,7 @@ ANSWERS: dict[tuple[str, str], Any] = {
 PROBLEMS: dict[int, tuple[str, str]] = {
     400: ("body", "There was an error parsing the body"),
     404: ("mission_id", "there is no mission patrol"),
+    408: ("body", "not here within 10 s"),
     409: ("mission_id", "mission patrol has another spec: DELETE it or choose another ID"),
     413: ("body", "larger than 2000000 bytes"),
     415: ("body", "Content-Encoding 'br': use gzip, zstd or none"),

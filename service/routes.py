@@ -53,7 +53,7 @@ HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, d
 @router.post(
     "/decide",
     response_model=DecideResponse,
-    responses=documented(400, 404, 409, 413, 415, 422, 503),
+    responses=documented(400, 404, 408, 409, 413, 415, 422, 503),
     tags=["decisions"],
 )
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
@@ -65,7 +65,7 @@ async def decide(body: DecideRequest, request: Request, key: RequestKey = None) 
     return Response(answer.model_dump_json(), media_type="application/json", headers=took)
 
 
-@router.post("/decide/batch", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])
+@router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
 async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
@@ -73,13 +73,13 @@ async def decide_batch(
     return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make_missions(request), key=key))
 
 
-@router.post("/feedback", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["decisions"])
+@router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
 async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
     """What came of a decision. Sent twice, it is applied once; acknowledged, it is on disk."""
     return await engine.feedback(body)
 
 
-@router.put("/missions/{mission_id}", responses=documented(400, 409, 413, 415, 422, 503), tags=["missions"])
+@router.put("/missions/{mission_id}", responses=documented(400, 408, 409, 413, 415, 422, 503), tags=["missions"])
 async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
     """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
     mission = await engine.missions.put(mission_id, body)
@@ -124,7 +124,7 @@ async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStat
 
 
 @router.post(
-    "/missions/{mission_id}/guidance", responses=documented(400, 404, 409, 413, 415, 422, 503), tags=["missions"]
+    "/missions/{mission_id}/guidance", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["missions"]
 )
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
     """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""

@@ -40,7 +40,7 @@ from shared.wire import (
 )
 from simulator.reports import reports_by
 
-RETRIED_STATUS = frozenset({429, 502, 503, 504})
+RETRIED_STATUS = frozenset({408, 429, 502, 503, 504})
 FIRST_BACKOFF_S = 0.1
 LONGEST_BACKOFF_S = 2.0
 LONGEST_RETRY_AFTER_S = 5.0

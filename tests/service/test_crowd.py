@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import select
+import socket
 import threading
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
+from service.keys import KeyFile
 from tests.running import listening
 from tests.service.stub_llm import misbehaving, silent, wait_for
 
@@ -58,3 +65,48 @@ def test_past_the_most_requests_the_next_is_refused_and_probes_are_not(edge: Edg
             assert {client.get(path).status_code for path in ("/healthz", "/readyz", "/metrics")} == {200}
             assert [asked.result() for asked in inside] == [200, 200]
         assert client.get("/missions/m0").status_code == 200
+
+
+def test_strangers_whose_bodies_never_come_keep_nobody_out(edge: Edge, report: Report, tmp_path: Path) -> None:
+    file = KeyFile()
+    key = file.add("fleet", frozenset({"decide", "admin"}), per_minute=1000)
+    file.write(tmp_path / "keys.json")
+    client = edge(keys=tmp_path / "keys.json", max_requests=2)
+    with ExitStack() as held:
+        for path in ("/", "/healthz", "/readyz", "/static/", "/metrics", "/missions/m/events"):
+            assert begun(held, client, f"POST {path}").recv(65536).startswith(b"HTTP/1.1 401 ")
+        answer = client.post("/decide", json=report(), headers={"Authorization": f"Bearer {key}"})
+        assert answer.status_code == 200
+
+
+def test_a_body_that_does_not_come_gives_its_place_back(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.limits._BODY_S", 0.5)
+    client = edge(max_requests=2)
+    with ExitStack() as held:
+        for waiting in [begun(held, client, "POST /decide") for _ in range(2)]:
+            with waiting.makefile("rb") as said:
+                head, _, body = said.read().partition(b"\r\n\r\n")
+            assert head.startswith(b"HTTP/1.1 408 ")
+            assert b"\r\ncontent-type: application/problem+json" in head
+            assert json.loads(body)["errors"][0]["field"] == "body"
+        assert client.post("/decide", json=report()).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics", "/missions/m/events"])
+def test_what_may_always_be_read_is_in_the_crowd_where_a_body_is_sent(edge: Edge, path: str) -> None:
+    client = edge(max_requests=1)
+    with ExitStack() as held:
+        both = [begun(held, client, f"POST {path}") for _ in range(2)]
+        answered, _, _ = select.select(both, [], [], 30)
+        assert [answer.recv(65536)[:13] for answer in answered] == [b"HTTP/1.1 503 "]
+        assert client.get("/healthz").status_code == 200
+
+
+def begun(held: ExitStack, client: httpx.Client, asked: str) -> socket.socket:
+    """A request of whose body nothing is sent."""
+    address = (client.base_url.host, client.base_url.port or 0)
+    connection = held.enter_context(socket.create_connection(address, timeout=30))
+    connection.sendall(f"{asked} HTTP/1.1\r\nhost: x\r\ncontent-length: 10\r\n\r\n".encode())
+    return connection

@@ -225,3 +225,12 @@ def test_the_guard_stands_before_the_body(edge: Edge, tmp_path: Path) -> None:
     answer = client.post("/decide", content=b"x" * 2_000_000)
     assert answer.status_code == 401
     assert json.loads(answer.text)["title"] == "Unauthorized"
+
+
+@pytest.mark.parametrize("path", ["/", "/healthz", "/readyz", "/static/page.js"])
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE"])
+def test_what_is_open_is_open_for_reading_only(edge: Edge, tmp_path: Path, method: str, path: str) -> None:
+    made(tmp_path / "keys.json", fleet=("decide",))
+    client = edge(keys=tmp_path / "keys.json")
+    assert client.request(method, path, content=b"{}").status_code == 401
+    assert client.get("/healthz").status_code == 200
