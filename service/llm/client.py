@@ -13,6 +13,7 @@ import aiohttp
 import httpx
 
 from service.llm.answer import Constraint, NoDecision, constrain, constrain_labels
+from service.llm.bounded import BoundedConnector, allowing
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_PLACE = 256 * 1024, 8 * 1024
@@ -78,7 +79,7 @@ class LLMClient:
         if api_key:
             headers["Authorization"] = f"Bearer {api_key}"
         # How many ask at once is bounded before; the certificates are those that httpx trusts.
-        connector = aiohttp.TCPConnector(limit=0, ssl=httpx.create_ssl_context(trust_env=trust_env))
+        connector = BoundedConnector(limit=0, ssl=httpx.create_ssl_context(trust_env=trust_env))
         self._http = aiohttp.ClientSession(
             headers=headers,
             connector=connector,
@@ -125,9 +126,11 @@ class LLMClient:
         content = bytearray()
         sent = None if body is None else json.dumps(body, ensure_ascii=False, separators=(",", ":")).encode()
         try:
-            async with self._http.request(
-                method, f"{self.base_url}/{path}", data=sent, allow_redirects=False, **self._by
-            ) as response:
+            with allowing(most):
+                asked = await self._http.request(
+                    method, f"{self.base_url}/{path}", data=sent, allow_redirects=False, **self._by
+                )
+            async with asked as response:
                 if response.headers.get("Content-Encoding", "identity") != "identity":
                     raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
                 async for chunk in response.content.iter_any():

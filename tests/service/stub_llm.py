@@ -104,6 +104,18 @@ async def endless(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) ->
         await writer.drain()
 
 
+def pouring(head: bytes, more: bytes) -> Handler:
+    """What is no body, without end."""
+
+    async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(head)
+        while True:
+            writer.write(more)
+            await writer.drain()
+
+    return fault
+
+
 def saying(status: bytes, body: bytes) -> Handler:
     async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"HTTP/1.1 %s\r\ncontent-length: %d\r\nconnection: close\r\n\r\n%s" % (status, len(body), body))
@@ -139,4 +151,16 @@ FAULTS: dict[str, tuple[Handler, str]] = {
     "no text": (saying(b"200 OK", b'{"choices": [{"message": {"content": null}}]}'), "llm_error"),
     "compressed": (_compressed, "llm_error"),
     "not http": (saying(b"", b"\x00\x01"), "llm_error"),
+}
+
+_PROCESSING = b"HTTP/1.1 102 Processing\r\n\r\n" * 5000
+
+# What no body's bound ends.
+FLOODS: dict[str, tuple[Handler, str]] = {
+    "endless 102": (pouring(b"", _PROCESSING), "llm_error"),
+    "endless trailers": (
+        pouring(b"HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n0\r\n", b"x: y\r\n" * 5000),
+        "llm_error",
+    ),
+    "endless after its answer": (pouring(b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}", _PROCESSING), "llm_error"),
 }

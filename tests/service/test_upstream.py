@@ -13,7 +13,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
 from tests.running import listening, serving
-from tests.service.stub_llm import FAULTS, PROBE, StubLlm, misbehaving, said, saying, wait_for
+from tests.service.stub_llm import FAULTS, FLOODS, PROBE, StubLlm, misbehaving, said, saying, wait_for
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -76,9 +76,9 @@ def test_an_answer_is_checked_whatever_the_server_promised(edge: Edge, report: R
     assert f'aicvds_llm_requests_total{{outcome="{reason}"}} 1.0' in metrics
 
 
-@pytest.fixture(params=FAULTS)
+@pytest.fixture(params=FAULTS | FLOODS)
 def faulty(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
-    fault, reason = FAULTS[request.param]
+    fault, reason = (FAULTS | FLOODS)[request.param]
     with ExitStack() as stack:
         yield stack.enter_context(listening(misbehaving(fault))), reason
 
