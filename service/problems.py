@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 _UNION_TAGS = ("constrained-", "function-")
 
 CONTENT_TYPE = "application/problem+json"
+# A field that there is has a shorter name, wherever it stands; what is sent in the place of one is not sent back.
+_MOST_NAME = 80
 # When to ask again what cannot be served now.
 _RETRY_S = 1
 
@@ -111,4 +113,4 @@ def _path(location: Sequence[int | str]) -> str:
     # A JSON syntax error has the byte offset for a location.
     if not parts or (len(parts) == 1 and isinstance(parts[0], int)):
         return "body"
-    return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in parts).removeprefix(".")
+    return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in parts).removeprefix(".")[:_MOST_NAME]

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from shared.channel import FloatArray
 from shared.scenario import Scenario
-from shared.wire import MissionId, SensorId, Wire
+from shared.wire import MissionId, Received, SensorId, Wire
 
 Level = Annotated[int, Field(ge=0, le=14)]
 MAX_WISHES = 1000
@@ -25,7 +25,7 @@ MAX_EVERY = 1000
 LATE_PACKETS = 20.0
 
 
-class SensorWish(Wire):
+class SensorWish(Received):
     """What is asked for one sensor.
 
     A sensor with ``visit_every`` n is to be visited in one step of any n that follow each other.
@@ -36,17 +36,17 @@ class SensorWish(Wire):
     visit_every: int | None = Field(None, ge=1, le=MAX_EVERY, description="steps")
 
 
-class Guidance(Wire):
+class Guidance(Received):
     """What is asked of a fleet: wishes for sensors, and the velocities that must not be flown.
 
     The velocities are a hard rule: neither ``forbidden_velocities`` nor any outside ``min_velocity..max_velocity`` are
     flown, m/s. Weights and visits are weighed against each other.
     """
 
-    sensors: list[SensorWish] = Field([], max_length=MAX_WISHES)
+    sensors: list[SensorWish] = Field([], max_length=MAX_WISHES, fail_fast=True)
     min_velocity: Level | None = None
     max_velocity: Level | None = None
-    forbidden_velocities: list[Level] = Field([], max_length=15)
+    forbidden_velocities: list[Level] = Field([], max_length=15, fail_fast=True)
 
     @model_validator(mode="after")
     def _each_sensor_once(self) -> Self:
@@ -234,7 +234,7 @@ class GuidanceStatus(Wire):
     failure: str | None = Field(None, description="why nothing could be made of the note")
 
 
-class GuidanceAnswer(Wire):
+class GuidanceAnswer(Received):
     """``POST /missions/{id}/guidance``: confirm or reject what was understood, or give a structure in its place.
 
     A structure given is confirmed by being given, with or without an LLM, a note, or anything understood of it.

@@ -7,6 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from shared.names import few_names
+
 Point = tuple[float, float]
 
 Coordinate = Annotated[float, Field(ge=-1e7, le=1e7)]
@@ -26,6 +28,7 @@ class Scenario(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+    _few_names = model_validator(mode="before")(few_names)
 
     name: str = Field("paper", pattern=r"^[a-z][a-z0-9_]{0,31}$")
     sensors: int = Field(10, ge=1, le=10_000, description="number of ground sensors J")
@@ -38,12 +41,14 @@ class Scenario(BaseModel):
         (),
         max_length=10_000,
         strict=False,
+        fail_fast=True,
         description="sensor positions inside the area, one a sensor, of layout `surveyed`",
     )
     pipeline: tuple[Annotated[Point, Field(strict=False)], ...] = Field(
         ((50.0, 120.0), (350.0, 300.0), (500.0, 560.0), (720.0, 640.0), (950.0, 900.0)),
         max_length=1000,
         strict=False,
+        fail_fast=True,
         description="polyline that layout `pipeline` strings the sensors along, and that pictures of layout "
         "`surveyed` show; none: ()",
     )
@@ -55,10 +60,13 @@ class Scenario(BaseModel):
     max_velocity: int = Field(14, ge=1, le=14, description="velocity levels are 0..max, in m/s")
     lap_radius_m: float = Field(300.0, ge=1, le=1e6)
     lap_offset_m: float = Field(250.0, ge=0, le=1e6, description="lap centres' distance from the area's centre")
-    routes: tuple[Annotated[tuple[Waypoint, ...], Field(strict=False, min_length=2, max_length=1000)], ...] = Field(
+    routes: tuple[
+        Annotated[tuple[Waypoint, ...], Field(strict=False, min_length=2, max_length=1000, fail_fast=True)], ...
+    ] = Field(
         (),
         max_length=100,
         strict=False,
+        fail_fast=True,
         description="waypoints of each UAV's trajectory, instead of laps; flown round where the last is the first, "
         "else there and back",
     )

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from shared.names import few_names
 from shared.scenario import Scenario
 
 MAX_SENSORS = 10_000
@@ -73,7 +74,13 @@ class Wire(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-class SensorColumns(Wire):
+class Received(Wire):
+    """What comes from anybody: an object of far too many names is one error, not one a name."""
+
+    _few_names = model_validator(mode="before")(few_names)
+
+
+class SensorColumns(Received):
     """What one UAV knows of the sensors: parallel arrays of 1 to 10,000 entries, all of one length.
 
     ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last
@@ -135,7 +142,7 @@ class SensorColumns(Wire):
         return self
 
 
-class Outcome(Wire):
+class Outcome(Received):
     """What came of an earlier decision; applied once, however often it is sent."""
 
     decision_id: DecisionId
@@ -152,7 +159,7 @@ class Outcome(Wire):
     )
 
 
-class UavState(Wire):
+class UavState(Received):
     """One UAV at one waypoint."""
 
     uav_id: UavId
@@ -195,7 +202,7 @@ class DecideRequest(UavState):
     deadline_ms: DeadlineMs | None = None
 
 
-class BatchRequest(Wire):
+class BatchRequest(Received):
     """``POST /decide/batch``: a fleet's UAVs at one step, decided in the order given."""
 
     mission_id: MissionId = "default"
@@ -303,7 +310,7 @@ class FeedbackResponse(Wire):
     result: Literal["applied", "duplicate"]
 
 
-class PromptStyle(Wire):
+class PromptStyle(Received):
     """How the prompt shows the sensors: JSON is one object a line, Markdown a table with its header.
 
     ``shuffled`` draws the rows' order anew for every step and UAV, from the mission's seed. Experiences are appended
@@ -324,7 +331,7 @@ class PromptStyle(Wire):
     demonstrations: int = Field(0, ge=0, le=20, description="worked examples, solved by the teacher")
 
 
-class MissionSpec(Wire):
+class MissionSpec(Received):
     """``PUT /missions/{id}``: the world that a fleet flies in and how it decides.
 
     ``attention`` off is the paper's baseline: every admissible sensor stands in the prompt, in the request's

@@ -1,0 +1,52 @@
+"""Bodies with more faults than can be told: a few are, and none of what was sent comes back whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+
+Body = dict[str, Any]
+Report = Callable[..., Body]
+Edge = Callable[..., httpx.Client]
+
+
+def fields(answer: httpx.Response) -> list[str]:
+    assert answer.status_code == 422
+    return [error["field"] for error in answer.json()["errors"]]
+
+
+_NAMES = {f"{number:x}": 0 for number in range(150_000)}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "field"),
+    [
+        ("POST", "/decide", _NAMES, "body"),
+        ("POST", "/feedback", _NAMES, "body"),
+        ("POST", "/decide", {"step": 0, "uav_id": 0, "position": [0.0, 0.0], "sensors": _NAMES}, "sensors"),
+        ("POST", "/decide/batch", {"step": 0, "uavs": [_NAMES]}, "uavs[0]"),
+        ("PUT", "/missions/m", {"prompt": _NAMES}, "prompt"),
+        ("POST", "/missions/m/guidance", {"guidance": _NAMES}, "guidance"),
+        ("POST", "/missions/m/guidance", {"guidance": {"sensors": [{}] * 1000}}, "guidance.sensors[0].sensor_id"),
+        ("PUT", "/missions/m", {"scenario": _NAMES}, "scenario"),
+        ("PUT", "/missions/m", {"scenario": {"sites": [["a", "b"]] * 10_000}}, "scenario.sites[0][0]"),
+        ("PUT", "/missions/m", {"scenario": {"pipeline": [["a", "b"]] * 1000}}, "scenario.pipeline[0][0]"),
+        ("PUT", "/missions/m", {"scenario": {"routes": [[["a", "b"]] * 9] * 99}}, "scenario.routes[0][0][0]"),
+    ],
+)
+def test_faults_without_number_are_a_few(edge: Edge, method: str, path: str, body: Body, field: str) -> None:
+    client = edge(max_body_bytes=10_000_000)
+    client.put("/missions/m", json={})
+    told = fields(client.request(method, path, json=body))
+    # Of a scenario there is one more for its being no name, of a point one for each number, of a route its length.
+    assert field in told
+    assert len(told) <= 4
+
+
+def test_a_name_that_is_no_field_is_not_sent_back_whole(edge: Edge, report: Report) -> None:
+    answer = edge().post("/decide", json=report(**{"k" * 1_000_000: 0}))
+    assert fields(answer) == ["k" * 80]
+    assert len(answer.content) < 1000
