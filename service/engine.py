@@ -81,6 +81,7 @@ class Engine:
         self._counter = counter
         self._metrics = metrics
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
+        self._judging = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="critic")
         self._plans: set[asyncio.Task[None]] = set()
         self._own_s = _OWN_S
         self.keeper: Journal | Unkept = Unkept() if store is None else Journal(store, metrics)
@@ -98,7 +99,8 @@ class Engine:
         return await asyncio.to_thread(self._keep)
 
     def _keep(self) -> bool:
-        self._planning.shutdown(wait=True, cancel_futures=True)
+        for threads in (self._planning, self._judging):
+            threads.shutdown(wait=True, cancel_futures=True)
         self.missions.close()
         self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
         return self.keeper.close(_LAST_COMMIT_S)
@@ -346,17 +348,24 @@ class Engine:
     async def _weigh(self, mission: Mission, view: View, deliberation: Deliberation, turn: Turn) -> Choice:
         """Mode ``guided``: the LLM's word weighed with the others' and with the critic, which thinks while it is asked.
 
-        Without one the others decide: source ``policy``, with the reason.
+        Without a word the others decide: source ``policy``, with the reason; without the critic, the policy.
         """
-        thinking = asyncio.create_task(asyncio.to_thread(deliberation.judge))
+        thinking = asyncio.get_running_loop().run_in_executor(self._judging, deliberation.judge)
         word = turn.word
         try:
             if word is None:
                 word = await self.asking.word(mission, deliberation.offer, deliberation.prompt, turn.deadline)
                 turn.watch.lap("llm")
+            await asyncio.wait({thinking}, timeout=max(0.0, turn.deadline - time.perf_counter()))
+            judgement = thinking.result() if thinking.done() else None
         finally:
-            judgement = await thinking
+            # Nobody waits for it any more: one that is queued is not begun.
+            thinking.cancel()
         turn.watch.lap("judge")
+        if judgement is None:
+            self._metrics.critic_timeouts.inc()
+            sensor, velocity = self._by_policy(mission, view)
+            return Choice(sensor, velocity, word.reason or "critic_timeout", word.completion, word.model)
         trust = mission.trust_in(word.model)
         gone = mission.reserved(view.step, view.uav_id)
         told = word.of(deliberation.offer.actions)

@@ -46,6 +46,9 @@ class Metrics:
         self.llm_trust = Histogram(
             "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
         )
+        self.critic_timeouts = Counter(
+            "aicvds_critic_timeouts", "Decisions of mode guided that could not wait for the critic", registry=r
+        )
         self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
         self.costs_clipped = Counter(

@@ -61,6 +61,7 @@ Reason = Literal[
     "rule_reach",
     "rule_battery",
     "llm_busy",
+    "critic_timeout",
 ]
 
 
