@@ -18,6 +18,8 @@ IntArray = NDArray[np.int64]
 Which = slice | list[int]
 # Out of reach of everything.
 FAR_M = 1e9
+# Packets a step: less than one in the longest mission there may be; and the steps that its prior is worth.
+_NOTHING, _CERTAIN_STEPS = 1e-6, 1000.0
 # The arrays that make a belief.
 _KEPT = ("arrived", "watched", "base", "since", "heard", "battery", "places", "visited")
 
@@ -60,9 +62,10 @@ class FleetBelief:
         self._paths = trajectories(scenario)
         self._drawn_variance = ((1 - fewest) * capacity) ** 2 / 12
         spread = (scenario.arrival_rate_max - scenario.arrival_rate_min) ** 2 / 12
-        # A range of no width is known: a prior worth very many steps.
-        prior_steps = scenario.mean_arrival_rate / max(spread, 1e-3)
-        self.arrived: FloatArray = np.full(count, scenario.mean_arrival_rate * prior_steps)
+        mean = scenario.mean_arrival_rate
+        # A range of no width is known: a prior worth very many steps. So is a world in which nothing ever arrives.
+        prior_steps = mean / max(spread, 1e-3) if mean > _NOTHING else _CERTAIN_STEPS
+        self.arrived: FloatArray = np.full(count, mean * prior_steps)
         self.watched: FloatArray = np.full(count, prior_steps)
         self.base: FloatArray = np.full(count, (1 + fewest) / 2 * capacity)
         self.since: IntArray = np.zeros(count, dtype=np.int64)

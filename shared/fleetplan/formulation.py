@@ -100,7 +100,8 @@ class Formulation:
     def _affordable(self) -> IntArray:
         """Packets that each battery pays for over the best link of all, that from right above, shape ``(J,)``."""
         world = self.problem.scenario
-        joules = world.transmit_power_w * world.packet_bits / float(rate_bps(0.0, world))
+        # In a world so noisy that nothing gets through, as little as flying it does.
+        joules = world.transmit_power_w * world.packet_bits / max(float(rate_bps(0.0, world)), 1e-12)
         return np.asarray(np.floor(np.minimum(self.problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
 
     def _fly(self, uav: int) -> None:

@@ -138,3 +138,12 @@ def test_a_uav_asked_again_is_not_held_to_what_it_was_told() -> None:
     fleet.tell(0, 0, sensor=1, velocity=3)
     fleet.locate(0, 0, start(fleet, 0), 0.0)
     assert fleet.decided(0) == {}
+
+
+@pytest.mark.parametrize("most", [0.0, 5e-324, 1e-300])
+def test_a_world_in_which_nothing_arrives_is_known_to_be_one(most: float) -> None:
+    fleet = FleetBelief(Scenario(name="idle", sensors=2, uavs=2, arrival_rate_min=0.0, arrival_rate_max=most))
+    hear(fleet, [10.0, 58.0], [0, 0])
+    np.testing.assert_allclose(fleet.rate, 0.0, atol=1e-12)
+    np.testing.assert_allclose(fleet.queue(1_000_000), [10.0, 58.0])
+    assert np.isfinite(np.random.default_rng(0).gamma(fleet.arrived, 1.0 / fleet.watched)).all()

@@ -63,6 +63,12 @@ def test_a_plan_is_as_good_as_trying_every_action_sequence(seed: int) -> None:
     assert (found.lost_packets, found.lower_bound, found.optimal) == (best, best, True)
 
 
+def test_where_nothing_gets_through_noise_there_is_still_a_plan() -> None:
+    problem = tiny(0, noise_dbm_hz=0.0, bandwidth_hz=1e12)
+    found = plan(problem, ENOUGH)
+    assert found.optimal and not fly(problem, found.actions).link.any()
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_bound_from_hopeful_links_is_never_above_the_optimum(seed: int) -> None:
     problem = tiny(seed, horizon=4)

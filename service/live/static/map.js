@@ -57,11 +57,11 @@ export class MissionMap {
       mark.told = told;
       const full = Math.min(1, queue[id] / capacity);
       set(mark.disc, { r: px(this.radius * 0.78 * Math.sqrt(full)) });
-      set(mark.ring, { "stroke-dasharray": `${urgency[id].toFixed(3)} 2` });
+      set(mark.ring, { "stroke-dasharray": `${(urgency[id] ?? 0).toFixed(3)} 2` });
       mark.group.classList.toggle("unheard", heard[id] < 0);
       const known = heard[id] < 0 ? "never heard" : `last heard at step ${heard[id]}`;
       const visit = visits[id] < 0 ? "no visit" : `last visit at step ${visits[id]}`;
-      mark.text = `Sensor ${id}: queue ${shown(queue[id])} of ${capacity} packets, urgency ${urgency[id].toFixed(2)}, ${known}, ${visit}`;
+      mark.text = `Sensor ${id}: queue ${shown(queue[id])} of ${capacity} packets, urgency ${(urgency[id] ?? 0).toFixed(2)}, ${known}, ${visit}`;
       set(mark.group, { "aria-label": mark.text });
     }
     const newest = this.#paths(mission);
