@@ -120,7 +120,7 @@ class Engine:
 
     async def _one(self, mission: Mission, request: DecideRequest, watch: Stopwatch) -> list[DecideResponse]:
         if request.outcome is not None:
-            self._outcomes.apply(mission, request.outcome)
+            self._outcomes.take(mission, request.outcome)
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
         attempt = mission.observe(request, request.step)
         plan = self._plan(mission, [request.uav_id], request.step, watch.started + deadline_ms / 1e3)
@@ -149,7 +149,7 @@ class Engine:
         answers: list[DecideResponse] = []
         # All at once: the first decision may use every outcome, and none can be forgotten while others wait.
         for outcome in (uav.outcome for uav in request.uavs if uav.outcome is not None):
-            self._outcomes.apply(mission, outcome)
+            self._outcomes.take(mission, outcome)
         waiting = [uav.uav_id for uav in request.uavs]
         # Before the LLM is asked: a batch that is sent again meanwhile is the later attempt.
         attempts = {uav.uav_id: mission.observe(uav, request.step) for uav in request.uavs}

@@ -170,7 +170,6 @@ class Mission:
                 another UAV's decision, or as :meth:`Bases.complete`.
             Incomplete: the report leaves out what is not held.
             NotFound: an outcome of a decision that this mission does not know.
-            Conflict: an outcome that contradicts an earlier one.
         """
         if uav.uav_id >= self.scenario.uavs:
             raise Refused(f"{at}uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
@@ -185,7 +184,7 @@ class Mission:
             raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if uav.outcome is not None:
             name = uav.outcome.decision_id
-            self.find(uav.outcome, f"{at}outcome.")
+            self._must_know(name, f"{at}outcome.")
             if name in self._pending and (whose := self._pending[name].uav_id) != uav.uav_id:
                 raise Refused(
                     f"{at}outcome.decision_id", f"decision {name} is UAV {whose}'s, who alone knows its outcome"
@@ -223,7 +222,7 @@ class Mission:
                 f"and AICVDS_LLM_CONTEXT is {self._context}: raise it, or lower {lower} or top_k",
             )
 
-    def find(self, outcome: Outcome, at: str = "") -> Literal["pending", "applied"]:
+    def find(self, outcome: Outcome) -> Literal["pending", "applied"]:
         """Whether an outcome is yet to be applied, or was.
 
         Raises:
@@ -231,15 +230,19 @@ class Mission:
             Conflict: it was told another outcome of it before, which counts.
         """
         name = outcome.decision_id
+        self._must_know(name)
         if name in self._pending:
             return "pending"
-        if name not in self._applied:
-            raise NotFound(f"{at}decision_id", f"mission {self.mission_id} knows no decision {name} (or no longer)")
         cost, failed = self._applied[name]
         if (min(outcome.cost, self.most_cost), outcome.failed) != (cost, failed):
             told = f"cost {cost:g}{', failed' if failed else ''}"
-            raise Conflict(f"{at}cost", f"of decision {name} another outcome was told before, which counts: {told}")
+            raise Conflict("cost", f"of decision {name} another outcome was told before, which counts: {told}")
         return "applied"
+
+    def _must_know(self, decision_id: str, at: str = "") -> None:
+        if decision_id not in self._pending and decision_id not in self._applied:
+            told = f"mission {self.mission_id} knows no decision {decision_id} (or no longer)"
+            raise NotFound(f"{at}decision_id", told)
 
     def observe(self, uav: UavState, step: int) -> int:
         """Take a UAV's report: into the sensors' records, and all of it into the fleet's belief.

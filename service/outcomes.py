@@ -7,6 +7,7 @@ import logging
 import math
 import time
 from collections import deque
+from contextlib import suppress
 from typing import Literal, NamedTuple
 
 from service.gradient import Sample
@@ -14,6 +15,7 @@ from service.journal import Journal, Unkept
 from service.live.watch import Live
 from service.metrics import Metrics
 from service.mission import Mission
+from service.problems import Conflict
 from shared.wire import Outcome
 
 log = logging.getLogger(__name__)
@@ -49,7 +51,13 @@ class Outcomes:
     def apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         """Record an outcome, unless it is recorded already; raises as :meth:`Mission.find`."""
         result: Literal["applied", "duplicate"] = "duplicate"
-        if mission.find(outcome) == "pending":
+        try:
+            found = mission.find(outcome)
+        except Conflict as error:
+            self._metrics.feedback.labels("contradicted").inc()
+            log.warning("mission %s: dropped: %s", mission.mission_id, error)
+            raise
+        if found == "pending":
             result = "applied"
             if outcome.cost > mission.most_cost:
                 # Forged or mistaken: as the worst that can be, it spoils neither the modules nor the prompt.
@@ -64,6 +72,17 @@ class Outcomes:
                 self._miss()
         self._metrics.feedback.labels(result).inc()
         return result
+
+    def take(self, mission: Mission, outcome: Outcome) -> None:
+        """As :meth:`apply`, of an outcome that comes with a report: one that contradicts an earlier one is dropped.
+
+        Any key reads decision IDs and may forge the earlier one, and a UAV that tells the truth must get its decision.
+
+        Raises:
+            NotFound: the mission does not know the decision.
+        """
+        with suppress(Conflict):
+            self.apply(mission, outcome)
 
     def _begin(self, lesson: Lesson) -> None:
         """Learn two turns of the loop later: what the decision in hand asks of the LLM or the disk goes out first."""
