@@ -25,7 +25,7 @@ from service.repeats import Repeats
 from service.settings import Settings, prompt_tokens
 from service.spec import in_full, required
 from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
-from service.turns import Given, Turns
+from service.turns import STEPS_APART, Given, Turns
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.guidance import Guidance, GuidanceAnswer
@@ -166,11 +166,12 @@ class Mission:
             at: where in the request's body this UAV stands, such as ``uavs[1].``.
 
         Raises:
-            Refused: an unknown UAV or sensor, a queue past its capacity, a beacon later than the step, an outcome of
-                another UAV's decision, or as :meth:`Bases.complete`.
+            Refused: a step far past the newest one, an unknown UAV or sensor, a queue past its capacity, a beacon later
+                than the step, an outcome of another UAV's decision, or as :meth:`Bases.complete`.
             Incomplete: the report leaves out what is not held.
             NotFound: an outcome of a decision that this mission does not know.
         """
+        self._must_be_near(step)
         if uav.uav_id >= self.scenario.uavs:
             raise Refused(f"{at}uav_id", f"UAV {uav.uav_id} is unknown: this mission has {self.scenario.uavs}, from 0")
         if (highest := max(uav.sensors.id, default=0)) >= self.scenario.sensors:
@@ -238,6 +239,20 @@ class Mission:
             told = f"cost {cost:g}{', failed' if failed else ''}"
             raise Conflict("cost", f"of decision {name} another outcome was told before, which counts: {told}")
         return "applied"
+
+    def _must_be_near(self, step: int) -> None:
+        """Refuse a report from the future: what it tells is the newest there is, and what is true would be too old.
+
+        A fleet may be out of contact for as long as its scenario lasts. The first report may be of any step: an edge
+        that lost its missions hears of them in their midst, and fleets fly on past their scenario's last step.
+        """
+        newest, ahead = self.belief.newest, max(STEPS_APART, self.scenario.steps)
+        if newest is not None and step > newest + ahead:
+            raise Refused(
+                "step",
+                f"step {step} is more than {ahead} past {newest}, the newest step known of mission {self.mission_id}: "
+                "DELETE the mission if its fleet was away so long",
+            )
 
     def _must_know(self, decision_id: str, at: str = "") -> None:
         if decision_id not in self._pending and decision_id not in self._applied:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 # UAVs of one fleet may be this many steps apart.
-_STEPS = 64
+STEPS_APART = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,5 +74,5 @@ class Turns:
 
 
 def _forget_lowest(by_step: dict[int, Any]) -> None:
-    while len(by_step) > _STEPS:
+    while len(by_step) > STEPS_APART:
         del by_step[min(by_step)]

@@ -72,7 +72,7 @@ _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacit
 def _moment(mission: Mission) -> dict[str, Any]:
     """What may differ every time: counts, and by sensor what the fleet believes now."""
     belief = mission.belief
-    step = max((last.step for last in belief.uavs.values()), default=0)
+    step = belief.newest or 0
     queue = belief.queue(step)
     return {
         "step": step,

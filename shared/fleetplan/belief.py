@@ -81,6 +81,11 @@ class FleetBelief:
         return self.arrived / self.watched
 
     @property
+    def newest(self) -> int | None:
+        """The newest step that a UAV was located in, ``None`` before the first."""
+        return max((last.step for last in self.uavs.values()), default=None)
+
+    @property
     def base_variance(self) -> FloatArray:
         """Of ``base``, shape ``(J,)``: 0 of what was heard."""
         return np.where(self.heard < 0, self._drawn_variance, 0.0)

@@ -86,7 +86,7 @@ def test_a_server_that_turns_bad(name: str, report: Report, tables: Tables) -> N
         switch.fault = None
         times_opened = opened(client)
         wait_for(client, "ready")
-        again = ask(url, report, 90, DEADLINE_MS, first_step=500)
+        again = ask(url, report, 90, DEADLINE_MS, first_step=450)
         tables.add(
             TITLE,
             fault=name,

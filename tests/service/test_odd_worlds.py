@@ -31,3 +31,34 @@ def test_an_odd_world_is_flown_in(edge: Edge, report: Report, mode: str, world: 
         line = next(line for line in events.iter_lines() if line.startswith("data:"))
     shown = json.loads(line.removeprefix("data:"))
     assert None not in shown["urgency"] and None not in shown["queue"]
+
+
+def test_a_report_from_the_future_does_not_blind_a_mission(edge: Edge, report: Report) -> None:
+    client = edge()
+    # An edge that lost its missions hears of them in their midst.
+    assert client.post("/decide", json=report(step=5000)).status_code == 200
+    forged = client.post("/decide", json=report(step=1_000_000, uav_id=2))
+    assert forged.status_code == 422
+    [error] = forged.json()["errors"]
+    assert error["field"] == "step" and "5000, the newest step known" in forged.json()["detail"] + str(error)
+    honest = report(step=5001)
+    honest["sensors"]["queue"][:4] = [59.0] * 4
+    assert client.post("/decide", json=honest).status_code == 200
+    with client.stream("GET", "/missions/test/events") as events:
+        line = next(line for line in events.iter_lines() if line.startswith("data:"))
+    shown = json.loads(line.removeprefix("data:"))
+    assert shown["step"] == 5001 and shown["queue"][:4] == [59.0] * 4
+
+
+@pytest.mark.parametrize(("steps", "away"), [(30, 64), (500, 500)])
+def test_a_fleet_that_was_out_of_contact_comes_back(edge: Edge, report: Report, steps: int, away: int) -> None:
+    client = edge()
+    client.put("/missions/test", json={"scenario": {"name": "long", "steps": steps}})
+    assert client.post("/decide", json=report(step=0)).status_code == 200
+    assert client.post("/decide", json=report(step=away, uav_id=1)).status_code == 200
+    one = {key: report(step=2 * away + 1)[key] for key in ("position", "sensors")}
+    batch = {"mission_id": "test", "step": 2 * away + 1, "uavs": [{"uav_id": uav, **one} for uav in range(3)]}
+    assert client.post("/decide/batch", json=batch).status_code == 422
+    assert client.get("/missions/test").json()["decisions"] == 2
+    assert client.delete("/missions/test").status_code == 204
+    assert client.post("/decide/batch", json=batch).status_code == 200
