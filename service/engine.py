@@ -313,6 +313,8 @@ class Engine:
                 raise NoDecision("no_candidate", "no sensor is both heard and free")
             if mission.mode == "value":
                 (sensor, velocity), reason = view.by_value(mission), "mode_value"
+            elif not mission.promptable:
+                raise NoDecision("llm_unavailable", "its context does not hold the prompt")
             else:
                 try:
                     levels = mission.scenario.max_velocity + 1
@@ -352,6 +354,8 @@ class Engine:
         """
         thinking = asyncio.get_running_loop().run_in_executor(self._judging, deliberation.judge)
         word = turn.word
+        if not mission.promptable:
+            word = Word(deliberation.prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
         try:
             if word is None:
                 word = await self.asking.word(mission, deliberation.offer, deliberation.prompt, turn.deadline)

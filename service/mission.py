@@ -47,6 +47,10 @@ class Mission:
 
     Attributes:
         asked_for: the spec as it was given; ``spec`` says in full what the service's settings made of it.
+        promptable: whether the LLM's context holds its prompt, whatever it comes to say.
+
+    Args:
+        spec: of a mission that has flown already: it flies on whatever the settings are now.
 
     Raises:
         Refused: the spec names an unknown scenario, or its prompt cannot fit the LLM's context.
@@ -57,7 +61,8 @@ class Mission:
     ) -> None:
         self.mission_id = mission_id
         self.asked_for = asked_for
-        self.spec = spec = spec or in_full(asked_for, settings)
+        flown, spec = spec is not None, spec or in_full(asked_for, settings)
+        self.spec = spec
         try:
             named = spec.scenario
             self.scenario: Scenario = scenario_named(named) if isinstance(named, str) else named
@@ -74,7 +79,9 @@ class Mission:
         weights = initial_weights(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
         self.template = self._template(weights)
         self._context = settings.llm_context
-        self._check_prompt()
+        self.promptable = self.holds(1)
+        if not flown:
+            self._check_prompt()
         self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
         self.decisions = 0
         self.feedback = 0
@@ -211,7 +218,7 @@ class Mission:
     def _check_prompt(self) -> None:
         """Refuse a prompt that the LLM's context cannot hold; without an LLM nobody reads it."""
         style = self.spec.prompt
-        if self.asks and not self.holds(1):
+        if self.asks and not self.promptable:
             shown = f"{self._experience_limit} experiences"
             lower = "prompt.experiences"
             if style.demonstrations:

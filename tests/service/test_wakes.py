@@ -27,10 +27,10 @@ from service.replaying import revived
 from service.settings import Settings
 from service.store import Checkpoint, Entry, Item, Kept, Store
 from shared.wire import MissionSpec, Outcome
-from tests.running import listening
+from tests.running import listening, serving
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
 from tests.service.making import attended, uav
-from tests.service.stub_llm import misbehaving, saying, wait_for
+from tests.service.stub_llm import StubLlm, misbehaving, saying, wait_for
 
 Report = Callable[..., dict[str, Any]]
 
@@ -347,3 +347,30 @@ def test_a_traceback_shows_no_variables(form: str) -> None:
     assert "sk-secret" not in ran.stderr
     # Colours are for terminals.
     assert "\x1b" not in ran.stderr
+
+
+@pytest.mark.parametrize("mode", ["llm", "guided"])
+def test_a_mission_whose_prompt_no_longer_fits_flies_on_without_the_llm(
+    tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture, mode: str
+) -> None:
+    model = StubLlm("A")
+    with serving(model.app) as url:
+        settings = {"mode": mode, "llm_url": f"{url}/v1"}
+        spec = {"prompt": {"experiences": 100}}
+        with running(tmp_path / "m.db", **settings, llm_context=131_072) as (client, _):
+            assert client.put("/missions/test", json=spec).status_code == 200
+            before = client.post("/decide", json=report()).json()
+        caplog.clear()
+        with running(tmp_path / "m.db", **settings, llm_context=1024, experiences=0) as (client, _):
+            wait_for(client, "ready")
+            asked = len(model.bodies)
+            outcome = {"decision_id": before["decision_id"], "cost": 0.5}
+            answer = client.post("/decide", json=report(step=1, outcome=outcome))
+            assert answer.status_code == 200, answer.text
+            assert (answer.json()["source"], answer.json()["reason"]) == ("policy", "llm_unavailable")
+            assert client.get("/missions/test").json()["decisions"] == 2
+            assert len(model.bodies) == asked
+            assert client.put("/missions/new", json=spec).status_code == 422
+    assert [record.getMessage() for record in caplog.records if "AICVDS_LLM_CONTEXT" in record.getMessage()] == [
+        "mission test: its prompt may need more than AICVDS_LLM_CONTEXT (1024): it flies on without the LLM"
+    ]
