@@ -220,8 +220,8 @@ class Engine:
         else:
             text = await mission.repeats.once(key, request.model_dump_json(), body, mission.record)
             answers = made or _ANSWERS.validate_json(text)
-        self._outcomes.checkpoint(mission)
         began = time.perf_counter()
+        self._outcomes.checkpoint(mission)
         stored = await self.keeper.stored(min(_STORE_S, ends - began))
         waited = round((time.perf_counter() - began) * 1e3, 3)
         told = []

@@ -13,6 +13,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 from zlib import crc32
 
@@ -28,6 +30,8 @@ log = logging.getLogger(__name__)
 # many sensors takes longer to play again: it counts for one more every hundred of them.
 _EVENTS = 256
 _SENSORS = 100
+# With so many sensors a checkpoint takes up to a second to pack.
+_LARGE = 1000
 _MOST_AT_ONCE = 1000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
 # The longest that what nobody waits for stays unwritten.
@@ -39,6 +43,7 @@ class Track:
 
     Attributes:
         seq: its newest event's.
+        checkpointed: the newest event that a checkpoint stands for, -1 for none.
         since: what it would take to read it back, in events, since its last checkpoint.
         over: it was deleted; what still happens to it is nobody's business, and another may have its ID.
     """
@@ -46,6 +51,7 @@ class Track:
     def __init__(self, mission: Mission, seq: int, since: int) -> None:
         self.mission = mission
         self.seq = seq
+        self.checkpointed = -1
         self.since = since
         self.over = False
 
@@ -84,6 +90,7 @@ class Journal:
         self._failing = self._closing = False
         self._why = ""
         self._waiting: list[tuple[int, asyncio.Future[bool]]] = []
+        self._packing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoints")
         self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
         self._thread.start()
 
@@ -140,11 +147,19 @@ class Journal:
         While the store fails events would gather without end, so those that the checkpoint stands for leave the queue.
         It takes the place of the last of them: what comes after is written no sooner than it.
         """
-        # Packed at once: as it is, it would take the memory of a thousand small objects until it is written.
+        if track.mission.scenario.sensors >= _LARGE and _on_a_loop():
+            # Beside the decisions, one after the other; meanwhile the journal has the events that it stands for.
+            self._packing.submit(self._take, track, seq, state).add_done_callback(_tell_failure)
+        else:
+            # Packed at once: as it is, it would take the memory of a thousand small objects until it is written.
+            self._take(track, seq, state)
+
+    def _take(self, track: Track, seq: int, state: dict[str, Any]) -> None:
         taken = Checkpoint(track.mission.mission_id, seq, pack(state))
         with self._changed:
-            if track.over:
+            if track.over or seq <= track.checkpointed:
                 return
+            track.checkpointed = seq
             covered = [ticket for ticket, item in self._queue if _covered(item, taken)]
             if not covered:
                 self._add(taken)
@@ -174,6 +189,7 @@ class Journal:
 
     def close(self, within_s: float) -> bool:
         """Write what waits, once more; returns whether that has ended, and the store may be closed."""
+        self._packing.shutdown(wait=True, cancel_futures=True)
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -257,6 +273,19 @@ class Journal:
 
 def _unheard(event: Event) -> None:
     """What still happens to a deleted mission."""
+
+
+def _on_a_loop() -> bool:
+    """Whether others wait for the thread that this runs in; when the service ends, nobody does."""
+    with suppress(RuntimeError):
+        asyncio.get_running_loop()
+        return True
+    return False
+
+
+def _tell_failure(packed: Future[None]) -> None:
+    if not packed.cancelled() and (error := packed.exception()) is not None:
+        log.error("a checkpoint could not be made, the journal has its events: %r", error)
 
 
 def _weight(event: Event) -> int:

@@ -21,11 +21,13 @@ from service import outcomes
 from service.journal import Journal
 from service.metrics import Metrics
 from service.mission import Mission
+from service.packing import pack
 from service.problems import Refused, Unavailable
 from service.repeats import Repeats
 from service.replaying import revived
 from service.settings import Settings
 from service.store import Checkpoint, Entry, Item, Kept, Store
+from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome
 from tests.running import listening, serving
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
@@ -172,6 +174,65 @@ def test_a_deleted_mission_is_gone_from_memory_before_any_collection(tmp_path: P
                 time.sleep(0.05)
         finally:
             gc.enable()
+
+
+@pytest.mark.parametrize(("sensors", "thread"), [(999, "MainThread"), (1000, "checkpoints_0")])
+async def test_a_large_checkpoint_is_packed_beside_the_decisions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sensors: int, thread: str
+) -> None:
+    threads: list[str] = []
+    at_rest = threading.Event()
+
+    def slowly(value: Any) -> bytes:
+        threads.append(threading.current_thread().name)
+        at_rest.wait(10)
+        return pack(value)
+
+    store = Store(str(tmp_path / "m.db"))
+    journal = Journal(store, Metrics())
+    spec = MissionSpec(mode="value", scenario=Scenario(name="wide", sensors=sensors))
+    mission = Mission("test", spec, Settings(mode="value"))
+    journal.begin(mission)
+    mission.observe(uav(step=0), 0)
+    track = journal.due(mission, 1)
+    assert track is not None
+    if thread == "MainThread":
+        at_rest.set()
+    monkeypatch.setattr("service.journal.pack", slowly)
+    journal.checkpoint(track, track.seq, {**mission.state_dict(), "learner": mission.learner.state_dict()})
+    # What happens while it is packed is on disk at once, and is not lost when the checkpoint comes after it.
+    for step in range(1, 4):
+        mission.observe(uav(step=step), step)
+    assert await journal.stored(5)
+    at_rest.set()
+    assert await asyncio.to_thread(journal.close, 5)
+    kept = store.load("test")
+    assert kept is not None and kept.state is not None and len(kept.events) == 3
+    assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+    assert threads == [thread]
+    store.close()
+
+
+async def test_an_older_checkpoint_never_takes_the_place_of_a_newer_one(tmp_path: Path) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    journal = Journal(store, Metrics())
+    spec = MissionSpec(mode="value", scenario=Scenario(name="wide", sensors=1000))
+    mission = Mission("test", spec, Settings(mode="value"))
+    journal.begin(mission)
+    taken = []
+    for step in range(2):
+        mission.observe(uav(step=step), step)
+        track = journal.due(mission, 1)
+        assert track is not None
+        taken.append((track, track.seq, {**mission.state_dict(), "learner": mission.learner.state_dict()}))
+    # The newer one when the service ends, while the older one is being packed.
+    await asyncio.to_thread(journal.checkpoint, *taken[1])
+    journal.checkpoint(*taken[0])
+    assert await asyncio.to_thread(journal.close, 5)
+    kept = store.load("test")
+    assert kept is not None
+    assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+    store.close()
 
 
 def test_a_mission_deleted_while_it_wakes_stays_deleted(
