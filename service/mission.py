@@ -47,7 +47,7 @@ class Mission:
 
     Attributes:
         asked_for: the spec as it was given; ``spec`` says in full what the service's settings made of it.
-        promptable: whether the LLM's context holds its prompt, whatever it comes to say.
+        promptable: whether the LLM's context holds its prompt, whatever it comes to say; True where none is asked.
 
     Args:
         spec: of a mission that has flown already: it flies on whatever the settings are now.
@@ -79,7 +79,7 @@ class Mission:
         weights = initial_weights(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
         self.template = self._template(weights)
         self._context = settings.llm_context
-        self.promptable = self.holds(1)
+        self.promptable = not self.asks or self.holds(1)
         if not flown:
             self._check_prompt()
         self.memory = Experiences(self._experience_limit, self._selection, self.scenario.uavs)
@@ -218,7 +218,7 @@ class Mission:
     def _check_prompt(self) -> None:
         """Refuse a prompt that the LLM's context cannot hold; without an LLM nobody reads it."""
         style = self.spec.prompt
-        if self.asks and not self.promptable:
+        if not self.promptable:
             shown = f"{self._experience_limit} experiences"
             lower = "prompt.experiences"
             if style.demonstrations:

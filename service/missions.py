@@ -175,7 +175,7 @@ class Missions:
         except ValueError as error:
             log.error("mission %s is damaged: %s", mission_id, error)
             raise Conflict("mission_id", f"what the store has of {mission_id} is damaged: DELETE it") from None
-        if mission.asks and not mission.promptable:
+        if not mission.promptable:
             limit = self._settings.llm_context
             log.warning(
                 "mission %s: its prompt may need more than AICVDS_LLM_CONTEXT (%d): it flies on without the LLM",
