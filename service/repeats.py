@@ -11,6 +11,9 @@ from typing import Any
 
 from service.problems import Refused, Unavailable
 
+# Quotes within a text are escaped, so no text has this.
+_A_DECISION = '"decision_id":'
+
 
 @dataclass(frozen=True, slots=True)
 class Answered:
@@ -20,16 +23,22 @@ class Answered:
     digest: str
     body: str
 
+    @property
+    def decisions(self) -> int:
+        """How many decisions it tells, at least one: those of a batch are one answer."""
+        return max(1, self.body.count(_A_DECISION))
+
 
 class Repeats:
     """The newest answers by key, as JSON.
 
     Args:
-        most: how many are remembered.
+        most: how many decisions are remembered; of a single answer with more, all.
     """
 
     def __init__(self, most: int) -> None:
         self._most = most
+        self._decisions = 0
         self._answers: OrderedDict[str, Answered] = OrderedDict()
         self._underway: dict[str, tuple[str, asyncio.Future[str]]] = {}
 
@@ -79,8 +88,10 @@ class Repeats:
     def remember(self, answered: Answered) -> None:
         """Keep an answer; the oldest of too many is forgotten."""
         self._answers[answered.key] = answered
-        while len(self._answers) > self._most:
-            self._answers.popitem(last=False)
+        self._decisions += answered.decisions
+        while self._decisions > self._most and len(self._answers) > 1:
+            _, oldest = self._answers.popitem(last=False)
+            self._decisions -= oldest.decisions
 
     def state_dict(self) -> list[Any]:
         """The answers, oldest first."""
@@ -88,4 +99,6 @@ class Repeats:
 
     def load_state_dict(self, state: list[Any]) -> None:
         """As they were when the state was taken."""
-        self._answers = OrderedDict((a[0], Answered(*a)) for a in state)
+        self._answers, self._decisions = OrderedDict(), 0
+        for told in state:
+            self.remember(Answered(*told))

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from tests.service.keeping import copy_of, running
@@ -66,6 +67,27 @@ def test_only_so_many_answers_are_remembered(tmp_path: Path, report: Report) -> 
         for number in range(60):
             client.post("/decide", json=report(step=number), headers={"Idempotency-Key": f"k{number}"})
         assert len(engine.missions.awake[0].repeats._answers) == 24
+
+
+def test_a_batch_counts_as_many_answers_as_it_has(tmp_path: Path, report: Report) -> None:
+    uavs = [{k: report()[k] for k in ("position", "sensors")} | {"uav_id": uav} for uav in range(3)]
+
+    def ask(client: httpx.Client, number: int) -> str:
+        body = {"mission_id": "test", "step": 0, "uavs": uavs}
+        answer = client.post("/decide/batch", json=body, headers={"Idempotency-Key": f"k{number}"})
+        told: str = answer.json()["decisions"][0]["decision_id"]
+        return told
+
+    with running(tmp_path / "m.db") as (client, engine):
+        first = [ask(client, number) for number in range(10)]
+        assert len(engine.missions.awake[0].repeats._answers) == 8
+        # As after a kill: no checkpoint was taken.
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    for path in (tmp_path / "m.db", copied):
+        with running(path) as (client, _):
+            # The newest eight a UAV; those before are other requests by now.
+            assert [ask(client, number) for number in range(2, 10)] == first[2:]
+            assert ask(client, 0) != first[0]
 
 
 @pytest.mark.parametrize("change", [{"cost": 0.7}, {"failed": True}])
