@@ -20,7 +20,8 @@ RESERVE_S = 0.02
 class Turn:
     """One UAV's turn to be told: its attempt at this step, its time, and what has been begun for it.
 
-    ``word`` is there where the LLM has been asked about it already.
+    ``word`` is there where the LLM has been asked about it already; ``latest`` where others of its batch can wait for
+    it past its own share, of ``time.perf_counter``.
     """
 
     uav: UavState
@@ -30,11 +31,17 @@ class Turn:
     watch: Stopwatch
     plan: asyncio.Task[None] | None
     word: Word | None = None
+    latest: float = 0.0
 
     @property
     def deadline(self) -> float:
         """When to have checked and answered, of ``time.perf_counter``."""
         return self.watch.started + self.deadline_ms / 1e3 - RESERVE_S
+
+    @property
+    def last_moment(self) -> float:
+        """When to weigh no longer, and go by the policy."""
+        return max(self.deadline, self.latest)
 
 
 @dataclass(frozen=True, slots=True)

@@ -172,7 +172,9 @@ class Engine:
             deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
             plan = plan or self._plan(mission, waiting[turn:], request.step, now + share_s)
             word = words.get(uav.uav_id)
-            its = Turn(uav, request.step, attempts[uav.uav_id], deadline_ms, own, plan, word)
+            # The critic may take more than its UAV's share, as long as it leaves the others what they need.
+            latest = ends - RESERVE_S - self._own_s * (len(waiting) - turn - 1)
+            its = Turn(uav, request.step, attempts[uav.uav_id], deadline_ms, own, plan, word, latest)
             answer = await self._decide(mission, its)
             if mission.planner is None or mission.planner.action(uav.uav_id) != (answer.sensor_id, answer.velocity):
                 plan = None
@@ -360,7 +362,7 @@ class Engine:
             if word is None:
                 word = await self.asking.word(mission, deliberation.offer, deliberation.prompt, turn.deadline)
                 turn.watch.lap("llm")
-            await asyncio.wait({thinking}, timeout=max(0.0, turn.deadline - time.perf_counter()))
+            await asyncio.wait({thinking}, timeout=max(0.0, turn.last_moment - time.perf_counter()))
             judgement = thinking.result() if thinking.done() else None
         finally:
             # Nobody waits for it any more: one that is queued is not begun.

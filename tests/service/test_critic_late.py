@@ -81,3 +81,16 @@ def test_a_batch_keeps_its_deadline(edge: Edge, report: Report, stuck: Stuck) ->
     decisions = client.post("/decide/batch", json=body).json()["decisions"]
     assert [(d["source"], d.get("guided")) for d in decisions] == [("policy", None)] * 2
     assert len({d["sensor_id"] for d in decisions}) == 2
+
+
+def test_in_a_batch_the_critic_may_take_what_the_others_do_not_need(edge: Edge, report: Report, stuck: Stuck) -> None:
+    client = edge(mode="guided", llm_url=NOBODY)
+    uavs = [
+        {key: value for key, value in report(uav_id=u).items() if key not in ("mission_id", "step")} for u in (0, 1)
+    ]
+    body = {"mission_id": "test", "step": 0, "uavs": uavs, "deadline_ms": 4000}
+    letting_go = threading.Timer(2.6, stuck.go.set)
+    letting_go.start()
+    decisions = client.post("/decide/batch", json=body).json()["decisions"]
+    letting_go.join()
+    assert all(decision["guided"] for decision in decisions)
