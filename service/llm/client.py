@@ -18,6 +18,8 @@ from service.llm.bounded import BoundedConnector, allowing
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_PLACE = 256 * 1024, 8 * 1024
 _MAX_TOKENS = 10**9
+# A model's name stands in every decision's answer, log line and trace; the longest of real ones are paths.
+_MAX_NAME = 200
 # What servers answer to a field that they do not know; anything else says nothing about the field.
 _NOT_UNDERSTOOD = (400, 404, 422)
 # The most likely tokens that OpenAI and vLLM tell.
@@ -95,13 +97,20 @@ class LLMClient:
         await self._http.close()
 
     async def models(self) -> list[str]:
-        """Names of the models that the server lists; raises :class:`NoDecision`."""
+        """Names of the models that the server lists, but for those that are no text, or longer than 200 characters.
+
+        Raises:
+            NoDecision: no list, or a list with nothing but such names.
+        """
         listed = await self._call("GET", "models", None)
         try:
-            names = [model["id"] for model in listed["data"]]
-            return [name for name in names if isinstance(name, str) and name.isprintable()]
+            told = [model["id"] for model in listed["data"]]
         except (KeyError, TypeError):
             raise NoDecision("llm_error", f"{self.base_url}/models: no list of models") from None
+        names = [n for n in told if isinstance(n, str) and n.isprintable() and len(n) <= _MAX_NAME]
+        if told and not names:
+            raise NoDecision("llm_error", f"{self.base_url}/models: no model has a name that can be used")
+        return names
 
     async def complete(self, body: dict[str, Any]) -> Completion:
         """One chat completion of a whole request body; raises :class:`NoDecision`."""

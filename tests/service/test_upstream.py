@@ -162,6 +162,22 @@ def test_a_list_of_models_that_is_none(edge: Edge, report: Report, models: Any) 
         assert client.post("/decide", json=report()).status_code == 200
 
 
+@pytest.mark.parametrize(("more", "model"), [([], None), (["stub-2", "stub-3"], "stub-2")])
+def test_a_model_is_called_by_a_name_of_bounded_length(
+    edge: Edge, report: Report, caplog: pytest.LogCaptureFixture, more: list[str], model: str | None
+) -> None:
+    app = FastAPI()
+    listed = {"data": [{"id": name} for name in ["M" * 201, "\ud800", 7, *more]]}
+    app.get("/v1/models")(lambda: Response(json.dumps(listed), media_type="application/json"))
+    app.post("/v1/chat/completions")(Model("grammar").complete)
+    with serving(app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        ready = wait_for(client, "ready" if model else "unavailable")
+        assert ready["model"] == model
+        assert ("no model has a name that can be used" in caplog.text) == (model is None)
+        assert client.post("/decide", json=report()).json()["source"] == ("llm" if model else "policy")
+
+
 def test_a_timed_out_call_is_hung_up(edge: Edge, report: Report) -> None:
     """The server learns at once that nobody waits any longer, and can free its slot."""
     hung_up = []
