@@ -4,10 +4,12 @@
 
 Starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided`` at
 once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, and
-full after some 300 outcomes; the resident memory grows on after that, ever more slowly, as its highest mark does. So
-the edge is measured after 900 outcomes of every mission, some 20 minutes: the slope of the resident memory by least
-squares, with its 95% interval, and the first and last count of tasks, connections and open files. The LLM's states
-come and go by megabytes: `--guided 0` shows what is left without them. Prints it, and writes the same as JSON.
+full after some 300 outcomes. The resident memory is a highest mark, which goes up where by chance more comes together
+than ever before, ever more seldom: so the edge is first flown as fast as it can, for 900 outcomes of every mission
+(300 of those that ask the LLM), some 15 minutes. Then it is measured at the pace of the paper's world, a step of
+every mission in 10 s; ``--pace-s 0`` measures it as fast as it can. Told are the slope of the resident memory by least
+squares, with its 95% interval, the first and last count of tasks, connections and open files, and who decided in mode
+``guided``. Prints it, and writes the same as JSON. ``--guided 0`` shows the edge without the LLM's own memory.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import tempfile
 import threading
 import time
 import uuid
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,8 +40,8 @@ from simulator.client import EdgeClient
 from simulator.demo import HOST, usable_port
 
 MISSIONS, UAVS, SENSORS = 200, 3, 10
-# Outcomes after which a mission remembers no more than before, and the resident memory grows but little.
-WARM = 900
+# Outcomes of each mission before it is measured, by mode.
+WARM = {"value": 900, "guided": 300}
 SAMPLE_S = 2.0
 WORKERS = 3
 DELETED_ONE_IN = 2000
@@ -50,6 +53,8 @@ class Soak:
 
     minutes: float = 10.0
     """How long to measure, once all is warm."""
+    pace_s: float = 10.0
+    """Seconds in which every mission flies a step while it is measured; 0: as fast as it can."""
     guided: int = 2
     """Of the missions, how many are flown in mode guided, with the embedded LLM; with 0 none is loaded."""
     out: Path = Path("runs/soak.json")
@@ -63,6 +68,7 @@ class Mission:
     name: str
     mode: str
     step: int = 0
+    told: Counter[str] = field(default_factory=Counter)
     owed: dict[int, dict[str, Any]] = field(default_factory=dict)
 
 
@@ -102,15 +108,21 @@ class Worker(threading.Thread):
         super().__init__(daemon=True)
         self._url, self._missions, self._random = url, missions, random.Random(seed)
         self.over = False
-        self.decisions = 0
+        self.pace_s = 0.0
         self.error: str | None = None
 
     def run(self) -> None:
         try:
-            with httpx.Client(base_url=self._url, timeout=60) as client:
+            # Given up before the edge does, which keeps an idle connection for 5 s.
+            limits = httpx.Limits(keepalive_expiry=2.0)
+            with httpx.Client(base_url=self._url, timeout=60, limits=limits) as client:
                 while not self.over:
-                    for mission in self._missions:
+                    began = time.monotonic()
+                    for flown, mission in enumerate(self._missions, 1):
                         self._turn(client, mission)
+                        due = began + self.pace_s * flown / len(self._missions)
+                        while not self.over and (left := due - time.monotonic()) > 0:
+                            time.sleep(min(left, 1.0))
         except (httpx.HTTPError, KeyError) as error:
             if not self.over:
                 self.error = repr(error)
@@ -132,8 +144,8 @@ class Worker(threading.Thread):
         for told in answer.json()["decisions"]:
             cost = self._random.random()
             mission.owed[told["uav_id"]] = {"decision_id": told["decision_id"], "cost": cost, "failed": cost > 0.8}
+            mission.told[told["source"]] += 1
         mission.step += 1
-        self.decisions += UAVS
 
 
 def sample(url: str, process: psutil.Process, began: float) -> Sample:
@@ -173,13 +185,13 @@ def main() -> int:
         command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
         with subprocess.Popen(command, env={**os.environ, **settings}) as edge:
             try:
-                samples, decisions = _fly(url, edge.pid, missions, options, console)
+                samples = _fly(url, edge.pid, missions, options, console)
             finally:
                 edge.terminate()
-    return _tell(samples, decisions, options, console)
+    return _tell(samples, missions, options, console)
 
 
-def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Console) -> tuple[list[Sample], int]:
+def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Console) -> list[Sample]:
     with EdgeClient(url, timeout_s=30) as waiting:
         waiting.wait_ready(300)
     with httpx.Client(base_url=url, timeout=300) as client:
@@ -192,11 +204,16 @@ def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Co
         worker.start()
     process, samples = psutil.Process(pid), list[Sample]()
     with Progress(console=console) as progress:
-        warming = progress.add_task("warming up", total=WARM // UAVS)
-        while (least := min(mission.step for mission in missions)) < WARM // UAVS:
+        warming = progress.add_task("warming up", total=1.0)
+        while (least := min(UAVS * mission.step / WARM[mission.mode] for mission in missions)) < 1.0:
             progress.update(warming, completed=least)
             _check(workers)
             time.sleep(1)
+        progress.update(warming, completed=1.0)
+        for mission in missions:
+            mission.told.clear()
+        for worker in workers:
+            worker.pace_s = options.pace_s
         began = time.monotonic()
         measuring = progress.add_task("measuring", total=options.minutes * 60)
         while time.monotonic() < began + options.minutes * 60:
@@ -208,7 +225,7 @@ def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Co
         worker.over = True
     for worker in workers:
         worker.join(timeout=60)
-    return samples, sum(worker.decisions for worker in workers)
+    return samples
 
 
 def _check(workers: list[Worker]) -> None:
@@ -216,13 +233,15 @@ def _check(workers: list[Worker]) -> None:
         raise SystemExit(f"soak: {faults[0]}")
 
 
-def _tell(samples: list[Sample], decisions: int, options: Soak, console: Console) -> int:
+def _tell(samples: list[Sample], missions: list[Mission], options: Soak, console: Console) -> int:
     tenth = max(1, len(samples) // 10)
     grown, half = slope(samples)
     figures: dict[str, Any] = {
         "minutes": options.minutes,
         "missions": MISSIONS,
-        "decisions": decisions,
+        "pace_s": options.pace_s,
+        "decisions": sum(mission.told.total() for mission in missions),
+        "guided": dict(sum((mission.told for mission in missions if mission.mode == "guided"), Counter[str]())),
         "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
         "slope_mb_an_hour": [round(grown, 2), round(grown - half, 2), round(grown + half, 2)],
     }
