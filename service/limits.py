@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable
 
 import zstandard
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.problems import problem_response
@@ -91,25 +92,26 @@ class BodyLimit:
             if body is None:
                 return
             body = _DECODERS[encoding](body, self.limit)
-        except _TooLarge:
-            fault = {"field": "body", "problem": f"larger than {self.limit} bytes"}
-            response = problem_response(413, f"body: larger than {self.limit} bytes", [fault])
-            response.headers["Connection"] = "close"
-            await response(scope, receive, send)
-            return
-        except TimeoutError:
-            fault = {"field": "body", "problem": f"not here within {_BODY_S:g} s"}
-            response = problem_response(408, f"body: not here within {_BODY_S:g} s", [fault])
-            response.headers["Connection"] = "close"
-            await response(scope, receive, send)
-            return
-        except _Damaged as damaged:
-            fault = {"field": "body", "problem": str(damaged)}
-            await problem_response(400, f"body: {damaged}", [fault])(scope, receive, send)
+        except (_TooLarge, TimeoutError, _Damaged) as fault:
+            await self._refusal(fault)(scope, receive, send)
             return
         scope["headers"] = [(n, v) for n, v in scope["headers"] if n.lower() not in _REWRITTEN]
         scope["headers"].append((b"content-length", str(len(body)).encode()))
         await self.app(scope, _replay(body, receive), send)
+
+    def _refusal(self, fault: Exception) -> Response:
+        """The problem; the connection ends where the rest of the body may still come."""
+        match fault:
+            case TimeoutError():
+                status, told = 408, f"not here within {_BODY_S:g} s"
+            case _Damaged():
+                status, told = 400, str(fault)
+            case _:
+                status, told = 413, f"larger than {self.limit} bytes"
+        response = problem_response(status, f"body: {told}", [{"field": "body", "problem": told}])
+        if status != 400:
+            response.headers["Connection"] = "close"
+        return response
 
     async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
         """The body; None where the client hung up before its end."""

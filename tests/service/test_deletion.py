@@ -1,0 +1,111 @@
+"""Deleted missions: gone from the disk when that is said, from memory, and from what still happens to them."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.store import Item, Kept, Store
+from tests.running import listening
+from tests.service.keeping import copy_of, fly, running
+from tests.service.stub_llm import misbehaving, saying, wait_for
+
+Report = Callable[..., dict[str, Any]]
+
+
+def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: Path, report: Report) -> None:
+    asked = threading.Semaphore(0)
+
+    async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked.release()
+        await asyncio.sleep(0.7)
+        await saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
+
+    with (
+        listening(misbehaving(slowly)) as llm,
+        running(tmp_path / "m.db", mode="llm", llm_url=f"{llm}/v1", planner="off") as (client, _),
+        ThreadPoolExecutor(1) as pool,
+    ):
+        wait_for(client, "ready")
+        late = pool.submit(client.post, "/decide", json=report())
+        assert asked.acquire(timeout=10)
+        assert client.delete("/missions/test").status_code == 204
+        assert client.put("/missions/test", json={"mode": "policy"}).status_code == 200
+        told = client.post("/decide", json=report()).json()
+        assert late.result().status_code == 200
+        fed = client.post("/feedback", json={"mission_id": "test", "decision_id": told["decision_id"], "cost": 0.5})
+        assert (fed.status_code, told["stored"]) == (200, True)
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    with running(copied) as (client, _):
+        status = client.get("/missions/test").json()
+        assert (status["mode"], status["decisions"], status["feedback"]) == ("policy", 1, 1)
+
+
+def test_a_mission_deleted_twice_is_gone_when_that_is_said(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, go = Store.write, threading.Event()
+
+    def slowly(self: Store, items: Sequence[Item]) -> None:
+        go.wait(30)
+        write(self, items)
+
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+        monkeypatch.setattr(Store, "write", slowly)
+        # A disk that takes longer than an answer may.
+        assert [client.delete("/missions/test").status_code for _ in range(2)] == [503, 503]
+        go.set()
+        assert client.delete("/missions/test").status_code == 404
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    left = Store(str(copied))
+    assert left.missions() == []
+    left.close()
+
+
+@pytest.mark.parametrize("mode", ["value", "policy", "guided"])
+def test_a_deleted_mission_is_gone_from_memory_before_any_collection(tmp_path: Path, report: Report, mode: str) -> None:
+    with running(tmp_path / "m.db", mode=mode) as (client, engine):
+        fly(client, report, range(3))
+        deleted = weakref.ref(engine.missions.awake[0])
+        gc.disable()
+        try:
+            assert client.delete("/missions/test").status_code == 204
+            ends = time.monotonic() + 10
+            while deleted() is not None:
+                assert time.monotonic() < ends
+                time.sleep(0.05)
+        finally:
+            gc.enable()
+
+
+def test_a_mission_deleted_while_it_wakes_stays_deleted(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+    load, begun = Store.load, threading.Event()
+
+    def slowly(self: Store, mission_id: str) -> Kept | None:
+        begun.set()
+        time.sleep(0.7)
+        return load(self, mission_id)
+
+    monkeypatch.setattr(Store, "load", slowly)
+    with running(tmp_path / "m.db") as (client, _), ThreadPoolExecutor(3) as pool:
+        got = pool.submit(client.get, "/missions/test")
+        assert begun.wait(timeout=10)
+        deleted = pool.submit(client.delete, "/missions/test")
+        time.sleep(0.2)
+        decided = pool.submit(client.post, "/decide", json=report())
+        assert (got.result().status_code, deleted.result().status_code, decided.result().status_code) == (200, 204, 200)
+        assert client.get("/missions/test").json()["decisions"] == 1
