@@ -4,12 +4,12 @@
 
 Starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided`` at
 once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, and
-full after some 300 outcomes. The resident memory is a highest mark, which goes up where by chance more comes together
-than ever before, ever more seldom: so the edge is first flown as fast as it can, for 900 outcomes of every mission
-(300 of those that ask the LLM), some 15 minutes. Then it is measured at the pace of the paper's world, a step of
-every mission in 10 s; ``--pace-s 0`` measures it as fast as it can. Told are the slope of the resident memory by least
-squares, with its 95% interval, the first and last count of tasks, connections and open files, and who decided in mode
-``guided``. Prints it, and writes the same as JSON. ``--guided 0`` shows the edge without the LLM's own memory.
+full after some 300 outcomes. The resident memory goes up after that as a highest mark does, ever more seldom: so the
+edge is first flown as fast as it can, for 900 outcomes of every mission (300 of those that ask the LLM). Then it is
+measured at the pace of the paper's world, a step of every mission in 10 s; ``--pace-s 0`` measures it as fast as it
+can. Told are the slope of the resident memory by least squares, with its 95% interval, the first and last count of
+tasks, connections and open files, and who decided in mode ``guided``. Prints it, and writes the same as JSON.
+``--guided 0`` shows the edge without the LLM's own memory.
 """
 
 from __future__ import annotations

@@ -92,6 +92,10 @@ Event = Reported | Decided | Settled | Guided | Answered
 Kind = Literal["reported", "decided", "settled", "guided", "answered"]
 
 
+def unheard(event: Event) -> None:
+    """What hears of the events of a mission that nobody keeps."""
+
+
 def encode(event: Event) -> tuple[Kind, bytes]:
     """An event's kind, and the rest of it as bytes."""
     match event:

@@ -18,7 +18,7 @@ from contextlib import suppress
 from typing import Any
 from zlib import crc32
 
-from service.events import Decided, Event
+from service.events import Decided, Event, unheard
 from service.metrics import Metrics
 from service.mission import Mission
 from service.packing import pack
@@ -130,7 +130,7 @@ class Journal:
             if (track := self._tracks.pop(mission_id, None)) is not None:
                 track.over = True
                 # Mission and hearer hold each other: all of it would stay in memory until a collection finds it.
-                track.mission.record = _unheard
+                track.mission.record = unheard
             self._add(Deleted(mission_id))
 
     def due(self, mission: Mission, least: int = _EVENTS) -> Track | None:
@@ -269,10 +269,6 @@ class Journal:
         for ticket, waiting in self._waiting:
             if not waiting.done() and (ticket <= self._written or self._failing):
                 waiting.set_result(ticket <= self._written)
-
-
-def _unheard(event: Event) -> None:
-    """What still happens to a deleted mission."""
 
 
 def _on_a_loop() -> bool:

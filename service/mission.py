@@ -13,7 +13,7 @@ from service.bases import Bases, Told
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_weights
 from service.demonstrations import solved
-from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
+from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
 from service.experiences import NEAREST, Experience, Experiences
 from service.gradient import Sample
 from service.guidance import OperatorGuidance
@@ -98,7 +98,7 @@ class Mission:
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         # Mode `guided`: by the LLM's name.
         self.trust: dict[str, Trust] = {}
-        self.record: Callable[[Event], None] = _forgotten
+        self.record: Callable[[Event], None] = unheard
 
     def _template(self, weights: Weights) -> Template:
         spec = self.spec
@@ -392,7 +392,3 @@ class Mission:
             learner_loss=self.learner.last_loss,
             visits={int(s): int(self.visits[s]) for s in np.flatnonzero(self.visits >= 0)},
         )
-
-
-def _forgotten(_: Event) -> None:
-    """Nothing is kept."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from alembic.config import Config
 from sqlalchemy import create_engine, text
 
 from service.hold import StoreUnusable
@@ -56,27 +57,28 @@ def test_an_address_that_is_none_is_refused_and_no_password_is_told(url: str) ->
     assert "hunter2" not in str(refused.value)
 
 
-def test_the_schema_is_the_migrations_newest() -> None:
-    from alembic.config import Config
-    from alembic.script import ScriptDirectory
-
+def _migrations() -> Config:
     config = Config()
     config.set_main_option("script_location", "service/migrations")
     config.set_main_option("path_separator", "os")
+    return config
+
+
+def test_the_schema_is_the_migrations_newest() -> None:
+    from alembic.script import ScriptDirectory
+
+    config = _migrations()
     assert ScriptDirectory.from_config(config).get_current_head() == SCHEMA
 
 
 def test_a_store_of_an_older_version_is_brought_up_to_date_with_its_missions(tmp_path: Path, report: Report) -> None:
     from alembic import command
-    from alembic.config import Config
 
     file = tmp_path / "m.db"
     with running(file) as (client, _):
         fly(client, report, range(3))
         flown = client.get("/missions/test").json()
-    config = Config()
-    config.set_main_option("script_location", "service/migrations")
-    config.set_main_option("path_separator", "os")
+    config = _migrations()
     engine = create_engine(f"sqlite:///{file}")
     with engine.begin() as older:
         config.attributes["connection"] = older
