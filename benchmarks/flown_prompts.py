@@ -16,7 +16,7 @@ from paper_template import EXPERIENCES, Newest, PaperTemplate
 from service.candidates import GuidedTemplate, Offer
 from service.critic import Situation
 from service.guided import offered
-from service.llm.client import chat_body, label_body
+from service.llm.bodies import chat_body, label_body
 from service.mission import Mission
 from service.prompt import Prompt
 from service.settings import Settings

@@ -17,7 +17,7 @@ from service.critic import Action
 from service.guided import offered, template_of
 from service.llm.answer import NoDecision
 from service.llm.calibration import LabelReader
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.mission import Mission

@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass
 
 from service.asking import Word
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.stopwatch import Stopwatch
 from service.trust import Advice
 from shared.wire import Guided, Reason, Source, UavState

@@ -21,7 +21,7 @@ from service.guided import Deliberation
 from service.journal import Journal, Unkept
 from service.live.watch import Live
 from service.llm.answer import NoDecision, check_answer
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.mission import Mission

@@ -75,12 +75,15 @@ class Loading:
     async def _run(self) -> None:
         """Load the other, and keep it running until the server ends."""
         try:
+            # Nearly all that is made meanwhile stays: to look through it again and again takes a tenth of the time.
+            gc.disable()
             app = await asyncio.to_thread(self._load)
             async with app.router.lifespan_context(app) as state:
                 self.app, self._state = app, state or {}
                 # A million objects of torch and others stay as long as the process: no collection need look at them,
                 # which takes a tenth of a second in the midst of a decision.
                 gc.freeze()
+                gc.enable()
                 # Python collects again when what is new is a quarter of what it found last: that is little from now on.
                 gc.collect()
                 self._settled.set()
@@ -89,3 +92,5 @@ class Loading:
             self.error = error
             self._settled.set()
             self._stop()
+        finally:
+            gc.enable()

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 
 from service.events import Event, decode, encode
 from service.hold import DatabaseHold, FileHold, StoreUnusable
@@ -132,7 +132,8 @@ class Store:
         except StoreUnusable:
             self.close()
             raise
-        self._insert: Any = (sqlite if sqlite_file else postgresql).insert
+        # Each dialect has its own; SQLAlchemy has imported the one that is used.
+        self._insert: Any = import_module(f"sqlalchemy.dialects.{self._engine.dialect.name}").insert
         # Made once: what SQLAlchemy does to make a statement is a good part of what a commit takes.
         self._new_entries = self._insert(journal).on_conflict_do_nothing()
         put = self._insert(checkpoints)

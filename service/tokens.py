@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tiktoken
 
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.prompt import Prompt
 from service.settings import Settings
 from service.vocabulary import ENCODING, ensure_vocabulary

@@ -16,7 +16,7 @@ from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 
 from service.llm.answer import NoDecision, check_labels
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.llm.servers import Servers
 
 log = logging.getLogger(__name__)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 from urllib.request import getproxies, proxy_bypass
 
 import aiohttp
 import httpx
 
-from service.llm.answer import Constraint, NoDecision, constrain, constrain_labels
+from service.llm.answer import NoDecision
 from service.llm.bounded import BoundedConnector, allowing
+from service.llm.completion import Completion, NotUnderstood, Unreachable, places_of
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_PLACE = 256 * 1024, 8 * 1024
@@ -22,48 +20,6 @@ _MAX_TOKENS = 10**9
 _MAX_NAME = 200
 # What servers answer to a field that they do not know; anything else says nothing about the field.
 _NOT_UNDERSTOOD = (400, 404, 422)
-# The most likely tokens that OpenAI and vLLM tell.
-TOLD_TOKENS = 20
-_MOST_PLACES = 256
-# The temperature at which several labels are drawn one after the other.
-_COOL = 0.2
-
-
-class NotUnderstood(NoDecision):
-    """The server refused the request as it was put."""
-
-
-class Unreachable(NoDecision):
-    """Nobody listens at the address."""
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """One token of an answer, and the probabilities of the likeliest tokens in its place, blanks stripped."""
-
-    token: str
-    likeliest: dict[str, float]
-
-    def untempered(self, temperature: float) -> Place:
-        """What the probabilities would be at temperature 1: ``q^T``, renormalised."""
-        raised = {token: q**temperature for token, q in self.likeliest.items()}
-        total = sum(raised.values())
-        return Place(self.token, {token: p / total for token, p in raised.items()} if total else {})
-
-
-@dataclass(frozen=True, slots=True)
-class Completion:
-    """An answer's text and the server's ``usage``; ``None`` where it said nothing.
-
-    ``places`` are those of the text's tokens; empty where the server told no probabilities. ``model`` said it.
-    """
-
-    text: str
-    prompt_tokens: int | None
-    cached_tokens: int | None
-    completion_tokens: int | None
-    places: tuple[Place, ...] = ()
-    model: str | None = None
 
 
 class LLMClient:
@@ -129,7 +85,7 @@ class LLMClient:
         prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
         if prompt is not None and cached is not None:
             cached = min(cached, prompt)
-        return Completion(text, prompt, cached, completion, _places(answer["choices"][0]))
+        return Completion(text, prompt, cached, completion, places_of(answer["choices"][0]))
 
     async def _call(self, method: str, path: str, body: dict[str, Any] | None, most: int = _MAX_RESPONSE_BYTES) -> Any:
         content = bytearray()
@@ -161,100 +117,6 @@ class LLMClient:
             raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON") from None
 
 
-def chat_body(
-    model: str | None, system: str, user: str, constraint: Constraint, sensor_ids: list[int], velocities: int
-) -> dict[str, Any]:
-    """The request body of one decision: greedy, short, and held to the answer's form where the server can.
-
-    ``cache_prompt`` is llama.cpp's; it is sent only to a server that understood llama.cpp's ``grammar``, because
-    strict servers refuse fields they do not know.
-    """
-    body: dict[str, Any] = {
-        "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
-        "temperature": 0,
-        "max_tokens": 32 if constraint == "json_schema" else 12,
-        "stream": False,
-        **constrain(constraint, sensor_ids, velocities),
-    }
-    if model:
-        body["model"] = model
-    if constraint == "grammar":
-        body["cache_prompt"] = True
-    return body
-
-
-def label_body(
-    model: str | None,
-    system: str,
-    user: str,
-    constraint: Constraint,
-    lists: Sequence[Sequence[str]],
-    logprobs: bool = True,
-) -> dict[str, Any]:
-    """The request body for one label of each list, with the likeliest tokens' probabilities if ``logprobs``.
-
-    llama.cpp tells its probabilities from before the grammar unless asked for those after sampling; after sampling at
-    temperature 0 all but one are 0. So it samples at temperature 1 with nothing cut off: the text is then a draw, and
-    the probabilities are exactly the model's among the labels. A later label is told given those drawn before it; so of
-    several it draws at a low temperature, nearly always the likeliest, and :meth:`Place.untempered` undoes that.
-    """
-    body: dict[str, Any] = {
-        "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
-        "temperature": 0,
-        # A token a label, and one for each end of a line between them.
-        "max_tokens": 2 * len(lists) - 1,
-        "stream": False,
-        **constrain_labels(constraint, lists),
-    }
-    if model:
-        body["model"] = model
-    if constraint == "grammar":
-        body["cache_prompt"] = True
-    if logprobs:
-        body |= {"logprobs": True, "top_logprobs": TOLD_TOKENS}
-        if constraint == "grammar":
-            body |= {"post_sampling_probs": True, "samplers": ["temperature"]}
-            body["temperature"] = draw_temperature(lists)
-    return body
-
-
-def rewriting_body(
-    model: str | None,
-    instruction: str,
-    examples: Sequence[tuple[str, str]],
-    text: str,
-    held: dict[str, Any],
-    temperature: float,
-    seed: int,
-) -> dict[str, Any]:
-    """The request body for rewriting a text as the examples are, which are shown as turns of the conversation.
-
-    Args:
-        held: the fields that hold the server to the answer's form.
-    """
-    turns = [
-        {"role": role, "content": content}
-        for example in examples
-        for role, content in zip(("user", "assistant"), example, strict=True)
-    ]
-    body: dict[str, Any] = {
-        "messages": [{"role": "system", "content": instruction}, *turns, {"role": "user", "content": text}],
-        "temperature": temperature,
-        "seed": seed,
-        "max_tokens": 128,
-        "stream": False,
-        **held,
-    }
-    if model:
-        body["model"] = model
-    return body
-
-
-def draw_temperature(lists: Sequence[Sequence[str]]) -> float:
-    """At which llama.cpp draws the labels of so many lists."""
-    return 1.0 if len(lists) == 1 else _COOL
-
-
 def _proxy_to(url: str) -> dict[str, Any]:
     """How aiohttp is told of the proxy that the environment names for a URL, if it names one."""
     asked = httpx.URL(url)
@@ -268,28 +130,4 @@ def _proxy_to(url: str) -> dict[str, Any]:
         # Through a tunnel the server would see the request's own headers; without one the proxy sees no others.
         where = "proxy_headers" if asked.scheme == "https" else "headers"
         found[where] = {"Proxy-Authorization": aiohttp.encode_basic_auth(proxy.username, proxy.password)}
-    return found
-
-
-def _places(choice: Any) -> tuple[Place, ...]:
-    """The answer's places as far as they can be read: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
-    found: list[Place] = []
-    try:
-        for place in choice["logprobs"]["content"][:_MOST_PLACES]:
-            likeliest = _probabilities(place.get("top_logprobs") or place.get("top_probs") or [])
-            found.append(Place(str(place.get("token", "")), likeliest))
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        pass
-    return tuple(found) if any(place.likeliest for place in found) else ()
-
-
-def _probabilities(told: Any) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for entry in told[: 4 * TOLD_TOKENS]:
-        probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
-        # Neither holds for what is not a number.
-        known = 0.0 <= probability <= 1.0 and not math.isnan(entry.get("logprob", 0.0))
-        if isinstance(entry["token"], str) and known:
-            token = entry["token"].strip()
-            found[token] = min(1.0, found.get(token, 0.0) + float(probability))
     return found

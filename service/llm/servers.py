@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from service.llm.answer import NoDecision
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.llm.upstream import LOST, Upstream
 from service.settings import Settings
 from shared.wire import Readiness

@@ -9,21 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextvars import Context
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from service.candidates import GuidedTemplate
 from service.llm.answer import Constraint, NoDecision, check_labels
+from service.llm.bodies import chat_body, draw_temperature, label_body, rewriting_body
 from service.llm.breaker import Breaker
-from service.llm.client import (
-    Completion,
-    LLMClient,
-    NotUnderstood,
-    Unreachable,
-    chat_body,
-    draw_temperature,
-    label_body,
-    rewriting_body,
-)
+from service.llm.completion import Completion, NotUnderstood, Unreachable
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
 from service.orders import INSTRUCTION, constrain_orders
@@ -31,6 +23,9 @@ from service.prompt import Template
 from service.settings import Settings
 from shared.scenario import SCENARIOS
 from shared.wire import Readiness, Reason
+
+if TYPE_CHECKING:
+    from service.llm.client import LLMClient
 
 log = logging.getLogger(__name__)
 
@@ -280,13 +275,15 @@ class Upstream:
         settings = self._settings
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
-            self._client = LLMClient(settings.llm_url, api_key=key)
+            http = await asyncio.to_thread(_http)
+            self._client = http(settings.llm_url, api_key=key)
         elif self._client is None:
             gguf = embedded_model(settings)
             self._embedded = await asyncio.to_thread(
                 EmbeddedServer, gguf, threads=settings.embedded_threads, context=settings.llm_context
             )
-            self._client = LLMClient(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
+            http = await asyncio.to_thread(_http)
+            self._client = http(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
             if self.model is None:
@@ -352,3 +349,10 @@ class Upstream:
 
     def _probe_body(self, constraint: Constraint) -> dict[str, Any]:
         return chat_body(self.model, "Answer in words.", _PROBE_TEXT, constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)
+
+
+def _http() -> type[LLMClient]:
+    """The client, whose aiohttp takes a fifth of a second to import: the edge decides before that."""
+    from service.llm.client import LLMClient
+
+    return LLMClient

@@ -15,7 +15,7 @@ from service.asked import Asked
 from service.candidates import GuidedTemplate
 from service.critic import Situation, judge
 from service.guided import Deliberation
-from service.llm.client import Completion
+from service.llm.completion import Completion
 from service.llm.upstream import Upstream
 from service.mission import Mission
 from service.policy import decide_without_llm

@@ -17,7 +17,7 @@ from service.critic import Judgement, Situation, judge
 from service.guided import Deliberation
 from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
-from service.llm.client import Completion, Place
+from service.llm.completion import Completion, Place
 from service.mission import Mission
 from service.settings import Settings
 from service.trust import LLM
