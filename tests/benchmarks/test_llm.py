@@ -9,7 +9,7 @@ from tests.benchmarks.running import figures
 
 @pytest.mark.timeout(600)
 def test_a_round_of_every_condition(tmp_path: Path) -> None:
-    options = ("--rounds", "1", "--threads", "1", "--steps", "3", "--policy", "eof", "--limit-s", "120")
+    options = ("--rounds", "1", "--threads", "1", "--steps", "2", "--policy", "eof", "--limit-s", "120")
     found = figures("llm", *options, out=tmp_path / "llm.json")
     times = found["times"]
     for way in ("guided", "llm"):

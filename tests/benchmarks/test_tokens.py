@@ -7,7 +7,7 @@ import pytest
 from tests.benchmarks.running import figures
 
 _BLOCKS = ("o200k", "o200k_static", "o200k_experiences", "o200k_state")
-SMALLEST = ("--seeds", "1", "--steps", "6", "--asked", "1", "--policy", "eof", "--encoders", "tiny", "--repeats", "1")
+SMALLEST = ("--seeds", "1", "--steps", "4", "--asked", "1", "--policy", "eof", "--encoders", "tiny", "--repeats", "1")
 
 
 @pytest.fixture(scope="module")

@@ -155,7 +155,7 @@ def test_help_comes_without_the_heavy_imports() -> None:
 
 
 def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: Path) -> None:
-    ended = run("experiment", "llm-models", "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
+    ended = run("experiment", "llm-models", "--steps", "1", "--seeds", "1", "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
     result = result_in(tmp_path, "llm-models")
     assert list(result.schemes) == [
@@ -175,5 +175,5 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
     assert result.model == "SmolLM2-135M-Instruct.Q4_1"
     assert not any("not the LLM's" in note for note in result.notes)
     assert json.loads((tmp_path / "llm-models" / "results.json").read_text())["command"] == (
-        f"aicvds experiment llm-models --steps 2 --seeds 1 --out {tmp_path}"
+        f"aicvds experiment llm-models --steps 1 --seeds 1 --out {tmp_path}"
     )

@@ -125,7 +125,8 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report) -> No
         for step in range(3):
             states = [report(step=step, uav_id=i) for i in range(10)]
             reasons = [answer.json()["reason"] for answer in pool.map(lambda s: client.post("/decide", json=s), states)]
-            assert None in reasons and "llm_unavailable" not in reasons
+            # The LLM's word was heard, where another had the sensor that it names too.
+            assert {None, "answer_reserved"} & set(reasons) and "llm_unavailable" not in reasons
         assert client.get("/readyz").json()["llm"] == "ready"
 
 

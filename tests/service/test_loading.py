@@ -31,11 +31,12 @@ def held(make: Callable[[], FastAPI]) -> Iterator[tuple[str, Loading, threading.
         return make()
 
     loading = Loading(load, stopped.set)
-    try:
-        with serving(loading) as url:
+    with serving(loading) as url:
+        try:
             yield url, loading, may, stopped
-    finally:
-        may.set()
+        finally:
+            # The server's end waits for whoever loads.
+            may.set()
 
 
 def test_alive_is_told_and_a_decision_waits_until_it_is_loaded(report: Callable[..., dict[str, Any]]) -> None:

@@ -70,17 +70,21 @@ def test_a_second_is_asked_beside_one_that_is_silent(edge: Edge, report: Report)
         standing_by(client, 1)
         answer = client.post("/decide", json=report()).json()
         assert (answer["source"], answer["model"]) == ("llm", "second")
-        assert 100 <= answer["latency_ms"]["llm"] < 4000
+        assert answer["latency_ms"]["llm"] >= 100
 
 
 def test_the_only_server_is_asked_again_beside_itself(edge: Edge, report: Report) -> None:
+    asked_again = asyncio.Event()
+
     class Stuck(StubLlm):
         asked = 0
 
         async def respond(self, body: dict[str, Any], probed: bool) -> Response:
             self.asked += not probed and body["messages"][-1]["content"] != "0,50,-90,1,100\n"
             if self.asked == 1:
-                await asyncio.sleep(30)
+                await asked_again.wait()
+            elif self.asked == 2:
+                asked_again.set()
             return await super().respond(body, probed)
 
     stuck = Stuck("1 7")
