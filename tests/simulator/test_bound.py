@@ -104,8 +104,8 @@ def test_with_fewer_sensors_than_uavs_the_bound_is_below_every_flight(site: Site
         assert bound.lower_bound <= lost, name
 
 
-# The proofs of others, as 1 and 3, take half a minute.
-@pytest.mark.parametrize("seed", [0, 2, 4])
+# The proofs of others take half a minute.
+@pytest.mark.parametrize("seed", [0, 2])
 @pytest.mark.parametrize("site", [small(steps=6), small(steps=6, routes=ROUTES), small(steps=6, battery_j=20.0)])
 def test_no_policy_loses_less_than_the_bound(site: Site, seed: int) -> None:
     bound = clairvoyant(site, seed, workers=1)
