@@ -37,7 +37,8 @@ def scope_of(method: str, path: str) -> Scope | None:
     return "admin" if path.startswith("/missions") else "decide"
 
 
-def _is_open(method: str, path: str) -> bool:
+def is_open(method: str, path: str) -> bool:
+    """Whether no key is asked for."""
     # Nothing else is done there: a stranger's body would only be waited for.
     return method in READING and (path in _OPEN or path.startswith(_OPEN_BELOW))
 
@@ -60,7 +61,7 @@ class Guard:
         self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
 
     async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_open(scope["method"], scope["path"]):
+        if scope["type"] != "http" or is_open(scope["method"], scope["path"]):
             await self.app(scope, receive, send)
             return
         presented = _presented(scope["headers"])

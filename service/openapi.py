@@ -8,13 +8,15 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.problems import CONTENT_TYPE
+from service.guard import is_open, scope_of
+from service.problems import CONTENT_TYPE, documented
 from shared.scenario import SCENARIOS
 from shared.wire import Problem
 
 JSON = "application/json"
 Example = dict[str, Any]
 
+_KEYS = "Asked for where the edge was given keys (AICVDS_KEYS)."
 DECISION_ID = "0123456789abcdef0123456789abcdef"
 SENSORS = {
     "id": [0, 1, 2, 3],
@@ -203,15 +205,18 @@ ANSWERS: dict[tuple[str, str], Any] = {
     },
 }  # fmt: skip
 
-# Status to the field at fault and what is wrong with it.
-PROBLEMS: dict[int, tuple[str, str]] = {
+# Status to the field at fault, if it is one's, and what is wrong with it.
+PROBLEMS: dict[int, tuple[str | None, str]] = {
     400: ("body", "There was an error parsing the body"),
+    401: (None, "give a key that is known as `Authorization: Bearer KEY`"),
+    403: (None, "key fleet-1 may not do this: it lacks the scope admin"),
     404: ("mission_id", "there is no mission patrol"),
     408: ("body", "not here within 10 s"),
     409: ("mission_id", "mission patrol has another spec: DELETE it or choose another ID"),
     413: ("body", "larger than 2000000 bytes"),
     415: ("body", "Content-Encoding 'br': use gzip, zstd or none"),
     422: ("mission_id", "String should match pattern '^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$'"),
+    429: (None, "key fleet-1 may ask 600 times a minute"),
     503: ("mission_id", "the store fails: nothing was recorded, send it again"),
 }
 
@@ -224,11 +229,23 @@ def schema_of(app: FastAPI) -> dict[str, Any]:
         schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
         for unused in ("HTTPValidationError", "ValidationError"):
             schemas.pop(unused, None)
+        schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
         for path, methods in schema["paths"].items():
             for method, operation in methods.items():
+                _guard(operation, method.upper(), path)
                 _exemplify(operation, (method, path))
         app.openapi_schema = schema
     return app.openapi_schema
+
+
+def _guard(operation: dict[str, Any], method: str, path: str) -> None:
+    """What :class:`service.guard.Guard` asks for, where the edge has keys, and answers without."""
+    if is_open(method, path):
+        return
+    operation["security"] = [{"key": []}, {}]
+    statuses = (401, 403, 429) if scope_of(method, path) else (401, 429)
+    told = operation["responses"] | {str(s): response for s, response in documented(*statuses).items()}
+    operation["responses"] = dict(sorted(told.items()))
 
 
 def _exemplify(operation: dict[str, Any], route: tuple[str, str]) -> None:
@@ -248,7 +265,7 @@ def problem(status: int) -> Example:
     whole = Problem(
         title=HTTPStatus(status).phrase,
         status=status,
-        detail=f"{field}: {fault}",
-        errors=[{"field": field, "problem": fault}],
+        detail=f"{field}: {fault}" if field else fault,
+        errors=[{"field": field, "problem": fault}] if field else [],
     )
     return whole.model_dump(mode="json")

@@ -48,6 +48,20 @@ def test_every_content_has_an_example_that_its_schema_takes(method: str, path: s
             check(content["schema"], value)
 
 
+def test_what_is_asked_for_a_key_says_so() -> None:
+    refusals = {
+        f"{method} {path}": sorted({"401", "403", "429"} & DOCUMENT["paths"][path][method]["responses"].keys())
+        for method, path in OPERATIONS
+    }
+    assert refusals["get /healthz"] == refusals["get /readyz"] == []
+    # Any key may read; deciding, and making missions, takes a scope.
+    assert refusals["get /missions/{mission_id}"] == ["401", "429"]
+    assert refusals["post /decide"] == refusals["put /missions/{mission_id}"] == ["401", "403", "429"]
+    asking = {f"{method} {path}" for method, path in OPERATIONS if "security" in DOCUMENT["paths"][path][method]}
+    assert asking == {route for route, statuses in refusals.items() if statuses}
+    assert DOCUMENT["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
+
+
 def test_the_schema_refuses_what_is_no_example() -> None:
     content = DOCUMENT["paths"]["/decide"]["post"]["requestBody"]["content"]["application/json"]
     with pytest.raises(jsonschema_rs.ValidationError):
