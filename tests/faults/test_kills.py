@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -147,6 +149,13 @@ def start_s(path: Path) -> tuple[float, float]:
         return started - began, time.perf_counter() - started
 
 
+def imports_s() -> float:
+    """Seconds that this machine takes for what every start begins with."""
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "import torch, fastapi"], check=True)
+    return time.perf_counter() - began
+
+
 def test_a_start_with_a_long_journal(
     tmp_path: Path, report: Report, tables: Tables, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,6 +170,7 @@ def test_a_start_with_a_long_journal(
                     answer = client.post(f"{url}/decide", json=report(step=step, outcome=owed)).json()
                     owed = {"decision_id": answer["decision_id"], "cost": 0.1}
     missions = lengthen(tmp_path / "long.db", JOURNAL_ROWS, 239)
+    imports = min(imports_s() for _ in range(3))
     short = [start_s(tmp_path / "short.db") for _ in range(3)]
     long = [start_s(tmp_path / "long.db") for _ in range(3)]
     tables.add(
@@ -168,6 +178,7 @@ def test_a_start_with_a_long_journal(
         journal_rows=f"{missions * 239}",
         missions=missions + 1,
         start_s=f"{min(s for s, _ in long):.2f}",
+        import_of_torch_and_fastapi_alone_s=f"{imports:.2f}",
         start_with_one_mission_s=f"{min(s for s, _ in short):.2f}",
         first_mission_read_back_s=f"{min(w for _, w in long):.2f}",
     )
