@@ -1,14 +1,23 @@
-"""Heads of requests, bounded in bytes and in time: uvicorn bounds neither, and no middleware sees an unfinished one."""
+"""Connections, bounded in number, and heads of requests, in bytes and time; uvicorn bounds none of them."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import math
+import resource
 from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from shared.wire import Problem
 
+log = logging.getLogger(__name__)
+
+# At once, if the process may open so many files; those that others need are kept: the store's, and the LLM servers'.
+_MOST_CONNECTIONS, _OTHER_FILES = 4096, 256
+# How often that is told.
+_TOLD_S = 60.0
 # Request line and headers; the longest that an honest client sends is an Idempotency-Key and a trace's state.
 _MOST_BYTES = 64 * 1024
 # From a connection's being made, or a further request's first byte, to the end of its head.
@@ -25,9 +34,11 @@ class _TooLarge(Exception):
 class BoundedHeads(HttpToolsProtocol):
     """uvicorn's protocol, which answers 431 to a head past 64 KB and hangs up on one that is not sent within 30 s.
 
-    What follows a body counts as a head too: trailers, and what chunks carry beside their data.
+    It hangs up at once on a connection for which no file is left, so that those that there are, the store and the LLM
+    go on. What follows a body counts as a head too: trailers, and what chunks carry beside their data.
     """
 
+    _told_until = -math.inf
     # Since the last that was complete: a head, a piece of a body, a request.
     _unfinished = 0
     _went_on = False
@@ -36,6 +47,12 @@ class BoundedHeads(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        if len(self.connections) > most_connections():
+            transport.abort()
+            if self.loop.time() > BoundedHeads._told_until:
+                BoundedHeads._told_until = self.loop.time() + _TOLD_S
+                log.warning("%d connections: whoever comes next is hung up on", len(self.connections) - 1)
+            return
         self._hang_up = self.loop.call_later(_MOST_S, transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -95,6 +112,12 @@ class BoundedHeads(HttpToolsProtocol):
         if self._hang_up is not None:
             self._hang_up.cancel()
             self._hang_up = None
+
+
+def most_connections() -> int:
+    """How many may be open at once: 4,096, or as many as the process may open files, less 256; 16 at least."""
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return max(16, min(_MOST_CONNECTIONS, files - _OTHER_FILES))
 
 
 def _refusal(headers: list[tuple[bytes, bytes]]) -> bytes:
