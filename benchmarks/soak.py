@@ -5,7 +5,7 @@
 Starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided`` at
 once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, and
 full after some 300 outcomes. The resident memory goes up after that as a highest mark does, ever more seldom: so the
-edge is first flown as fast as it can, for 600 outcomes of every mission (200 of those that ask the LLM). Then it is
+edge is first flown as fast as it can, for 900 outcomes of every mission (300 of those that ask the LLM). Then it is
 flown at the pace of the paper's world, a step of every mission in 10 s, and measured after 4 minutes of that;
 ``--pace-s 0`` measures it as fast as it can. Told are the slope of the resident memory, by least squares over medians
 of 20 parts (an LLM's call takes 8 MB and gives them back), with its 95% interval, the first and last count of
@@ -42,7 +42,7 @@ from simulator.demo import HOST, usable_port
 
 MISSIONS, UAVS, SENSORS = 200, 3, 10
 # Outcomes of each mission before it is measured, by mode.
-WARM = {"value": 600, "guided": 200}
+WARM = {"value": 900, "guided": 300}
 # At the pace at which it is measured, before it is: what was freed when it slowed down comes into use again.
 SETTLE_S = 240.0
 SAMPLE_S = 2.0
