@@ -52,9 +52,9 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# Fewer rounds than the figures in docs/benchmarks.md are of: 14.6 minutes by the sum of its parts, on a slow day.
+# Fewer rounds than the figures in docs/benchmarks.md are of: 15:27 on a slow day, with two rounds more of the first, 20 s each.
 bench: install
-	$(BIN)/python benchmarks/startup.py --rounds 5
+	$(BIN)/python benchmarks/startup.py --rounds 3
 	$(BIN)/python benchmarks/overhead.py --rounds 5
 	$(BIN)/python benchmarks/tokens.py --seeds 3
 	$(BIN)/python benchmarks/llm.py --rounds 3
