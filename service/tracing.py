@@ -12,7 +12,7 @@ import os
 import time
 from typing import TYPE_CHECKING, Any
 
-import httpx
+from pydantic import AnyHttpUrl
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.settings import Settings
@@ -130,8 +130,8 @@ def _where(url: str | None) -> dict[str, Any]:
     """Where the only LLM server is; of several nobody knows which was asked."""
     if url is None or "," in url:
         return {}
-    parsed = httpx.URL(url)
-    return {"server.address": parsed.host, "server.port": parsed.port or (443 if parsed.scheme == "https" else 80)}
+    parsed = AnyHttpUrl(url)
+    return {"server.address": parsed.host, "server.port": parsed.port}
 
 
 def _about(answer: DecideResponse) -> dict[str, Any]:

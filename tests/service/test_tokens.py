@@ -9,7 +9,7 @@ from service.rows import FORMATS
 from service.settings import Settings
 from service.tokens import TokenCounter, price_usd
 from service.uncompressed import Uncompressed
-from service.vocabulary import VocabularyDamaged, ensure_vocabulary
+from service.vocabulary import VocabularyDamaged, encoding, ensure_vocabulary
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, PromptStyle
 from tests.service.making import attended, mission, uav
@@ -39,6 +39,32 @@ def test_a_damaged_vocabulary_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(VocabularyDamaged):
         ensure_vocabulary(tmp_path / "cache")
     assert not (tmp_path / "cache").exists()
+
+
+def test_what_an_earlier_start_packed_counts_alike_and_is_packed_anew_where_it_is_damaged(tmp_path: Path) -> None:
+    text = "3,52,98,-83,0,106\nOutput one pair, sensor_id velocity: <|endoftext|>"
+    parsed = encoding(tmp_path)
+    (packed,) = (tmp_path / "tiktoken").glob("*.msgpack")
+    whole = packed.read_bytes()
+    # It alone will do.
+    (tmp_path / "tiktoken" / "fb374d419588a4632f3f557e76b4b70aebbca790").unlink()
+    again = encoding(tmp_path)
+    assert again.encode_ordinary(text) == parsed.encode_ordinary(text)
+    assert (again.name, again.special_tokens_set) == (parsed.name, parsed.special_tokens_set)
+    for damaged in (b"", whole[:1000], whole[:-1] + b"!"):
+        packed.write_bytes(damaged)
+        assert encoding(tmp_path).encode_ordinary(text) == parsed.encode_ordinary(text)
+        assert packed.read_bytes() == whole
+
+
+def test_a_folder_that_cannot_be_written_to_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ensure_vocabulary(tmp_path)
+
+    def full(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("service.vocabulary._write", full)
+    assert len(encoding(tmp_path).encode_ordinary("hello world")) == 2
 
 
 def test_price() -> None:
