@@ -38,8 +38,6 @@ class Serve:
 
 def main(argv: list[str]) -> int:
     """Serve until SIGTERM or Ctrl-C; returns the exit code."""
-    # Nearly all that is made while it loads stays: to look through it again and again takes a tenth of the time.
-    gc.disable()
     args = tyro.cli(Serve, prog="aicvds serve", args=argv)
     if not 0 <= args.port <= 65535:
         return _refused(f"--port {args.port} is not between 0 and 65535")
@@ -54,10 +52,14 @@ def main(argv: list[str]) -> int:
         print(
             f"aicvds serve: running on http://{host}:{listener.getsockname()[1]}, loading", file=sys.stderr, flush=True
         )
+        # Nearly all that is made while it loads stays: to look through it again and again takes a tenth of the time.
+        gc.disable()
         with listener:
             return _serve(listener, args.host)
     except KeyboardInterrupt:
         return 130
+    finally:
+        gc.enable()
 
 
 def _serve(listener: socket.socket, host: str) -> int:

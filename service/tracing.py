@@ -12,7 +12,6 @@ import os
 import time
 from typing import TYPE_CHECKING, Any
 
-from pydantic import AnyHttpUrl
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.settings import Settings
@@ -130,8 +129,11 @@ def _where(url: str | None) -> dict[str, Any]:
     """Where the only LLM server is; of several nobody knows which was asked."""
     if url is None or "," in url:
         return {}
-    parsed = AnyHttpUrl(url)
-    return {"server.address": parsed.host, "server.port": parsed.port}
+    # The settings have imported it where they name a server.
+    import httpx
+
+    parsed = httpx.URL(url)
+    return {"server.address": parsed.host, "server.port": parsed.port or (443 if parsed.scheme == "https" else 80)}
 
 
 def _about(answer: DecideResponse) -> dict[str, Any]:

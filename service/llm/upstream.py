@@ -272,17 +272,15 @@ class Upstream:
 
     async def _connect(self) -> LLMClient:
         """Reach the server, learn what it obeys, and have it read the static block before a decision pays for it."""
-        settings = self._settings
+        settings, http = self._settings, await asyncio.to_thread(_http)
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
-            http = await asyncio.to_thread(_http)
             self._client = http(settings.llm_url, api_key=key)
         elif self._client is None:
             gguf = embedded_model(settings)
             self._embedded = await asyncio.to_thread(
                 EmbeddedServer, gguf, threads=settings.embedded_threads, context=settings.llm_context
             )
-            http = await asyncio.to_thread(_http)
             self._client = http(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
         async with asyncio.timeout(_PROBE_TIMEOUT_S):

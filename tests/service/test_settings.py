@@ -18,7 +18,11 @@ def test_no_quota_is_no_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["localhost:8080", "ftp://host/v1", "http:/host", "http://[::1/v1", "http://me:PASS@host/v1"]
+    "url",
+    [
+        *("localhost:8080", "ftp://host/v1", "http:/host", "http:///v1", "http://[::1/v1", "http://me:PASS@host/v1"),
+        "http://ho\tst/v1",
+    ],
 )
 def test_an_llm_url_must_be_one(url: str) -> None:
     with pytest.raises(ValidationError, match="llm_url") as caught:
