@@ -28,6 +28,8 @@ class FileHold:
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
+        # Kept from transaction to transaction: to get it from the pool, and give it back, takes as long as to commit.
+        self._connection: sa.Connection | None = None
         # By its own name: another edge may know it by a link.
         file = os.path.realpath(engine.url.database or "")
         self._lock: IO[str] = open(f"{file}.lock", "w")  # noqa: SIM115
@@ -43,12 +45,24 @@ class FileHold:
     @contextmanager
     def transaction(self) -> Iterator[sa.Connection]:
         """A transaction, committed at its end; raises ``SQLAlchemyError`` where it was not."""
-        with self._engine.begin() as db:
-            yield db
+        if self._connection is None:
+            self._connection = self._engine.connect()
+        try:
+            with self._connection.begin():
+                yield self._connection
+        except BaseException:
+            self._let_go()
+            raise
 
     def close(self) -> None:
         """Let another edge have it."""
+        self._let_go()
         self._lock.close()
+
+    def _let_go(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
 
 
 class DatabaseHold:

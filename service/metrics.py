@@ -73,6 +73,7 @@ class Metrics:
         self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
         # To find a child by its labels takes as long as to count it; there are few.
         self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
+        self._tokens = cache(self.llm_tokens.labels)
 
     def record_llm(self, statuses: Mapping[str, int], left_alone: int) -> None:
         """Where the LLM servers stand now.
@@ -98,6 +99,6 @@ class Metrics:
         if tokens.server_prompt is None:
             return
         self.tokens_saved.inc(tokens.saved)
-        self.llm_tokens.labels("prompt").inc(tokens.server_prompt)
-        self.llm_tokens.labels("cached").inc(tokens.cached or 0)
-        self.llm_tokens.labels("completion").inc(tokens.completion or 0)
+        self._tokens("prompt").inc(tokens.server_prompt)
+        self._tokens("cached").inc(tokens.cached or 0)
+        self._tokens("completion").inc(tokens.completion or 0)

@@ -134,8 +134,12 @@ class Store:
             raise
         # Each dialect has its own; SQLAlchemy has imported the one that is used.
         self._insert: Any = import_module(f"sqlalchemy.dialects.{self._engine.dialect.name}").insert
-        # Made once: what SQLAlchemy does to make a statement is a good part of what a commit takes.
-        self._new_entries = self._insert(journal).on_conflict_do_nothing()
+        # Made once: what SQLAlchemy does to make a statement is a good part of what a commit takes. This one is in
+        # nearly every commit, and given to the driver as it is.
+        names = [column.name for column in journal.columns]
+        new = self._insert(journal).on_conflict_do_nothing()
+        self._new_entries = str(new.compile(dialect=self._engine.dialect, column_keys=names))
+        self._positional = self._engine.dialect.positional
         put = self._insert(checkpoints)
         newer = {"seq": put.excluded.seq, "state": put.excluded.state}
         self._new_checkpoint = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
@@ -185,21 +189,23 @@ class Store:
         """
         if self._hold is None:
             raise StoreUnusable("it is closed")
-        entries: list[dict[str, Any]] = []
+        entries: list[Entry] = []
         with self._hold.transaction() as db:
             for item in items:
                 if isinstance(item, Entry):
-                    kind, body = encode(item.event)
-                    entries.append({"mission_id": item.mission_id, "seq": item.seq, "kind": kind, "body": body})
+                    entries.append(item)
                     continue
                 self._append(db, entries)
                 entries = []
                 self._write(db, item)
             self._append(db, entries)
 
-    def _append(self, db: sa.Connection, entries: list[dict[str, Any]]) -> None:
-        if entries:
-            db.execute(self._new_entries, entries)
+    def _append(self, db: sa.Connection, entries: list[Entry]) -> None:
+        rows = [(entry.mission_id, entry.seq, *encode(entry.event)) for entry in entries]
+        if rows:
+            names = journal.columns.keys()
+            told = rows if self._positional else [dict(zip(names, row, strict=True)) for row in rows]
+            db.exec_driver_sql(self._new_entries, told)
 
     def _write(self, db: sa.Connection, item: Made | Checkpoint | Deleted) -> None:
         match item:

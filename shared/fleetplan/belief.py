@@ -131,11 +131,16 @@ class FleetBelief:
                 last.progress_m += velocity * self._scenario.step_s
                 x, y = self._paths[uav].at(last.progress_m)
                 last.position = float(x), float(y)
-            packets = int(packets_per_step(self.distances(uav, [0], [sensor]), self._scenario)[0, 0])
-            if packets and (sensor, last.step) not in served:
+            if (sensor, last.step) not in served and (packets := self._movable(last.position, sensor)):
                 served.add((sensor, last.step))
                 self.collect(sensor, packets, last.step)
             last.step, last.told = last.step + 1, None
+
+    def _movable(self, position: Point, sensor: int) -> int:
+        """Packets that a step can move from a sensor to a UAV at this position; 0 of a sensor that nobody named."""
+        metres = np.hypot(*(position - self.places[sensor]))
+        # Most sensors are out of every reach, and what one transfer moves takes as long to reckon as what many do.
+        return int(packets_per_step(metres, self._scenario)) if metres <= self._scenario.radio_radius_m else 0
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
         """Subtract what a UAV collects in a step."""

@@ -100,6 +100,18 @@ def test_what_a_uav_was_told_to_collect_is_gone_a_step_later() -> None:
     np.testing.assert_allclose(fleet.queue(1), [55.0, 5.0])
 
 
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_nothing_is_collected_of_a_sensor_out_of_reach_or_that_nobody_has_named(sensor: int) -> None:
+    fleet = belief()
+    fleet.hear(np.array([0]), np.array([[1e5, 0.0]]), np.array([3]), np.array([50.0]), np.array([40.0]))
+    before = fleet.base.copy()
+    fleet.locate(0, 3, (1.0, 0.0))
+    fleet.tell(0, 3, sensor, 5)
+    fleet.advance(4)
+    np.testing.assert_array_equal(fleet.base, before)
+    assert fleet.visited.tolist() == [-1, -1]
+
+
 def test_two_uavs_at_one_sensor_collect_from_it_once() -> None:
     world = TWO.model_copy(update={"link_share": 0.35})
     lefts = []
