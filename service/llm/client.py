@@ -8,6 +8,7 @@ from urllib.request import getproxies, proxy_bypass
 
 import aiohttp
 import httpx
+from yarl import URL
 
 from service.llm.answer import NoDecision
 from service.llm.bounded import BoundedConnector, allowing
@@ -32,6 +33,8 @@ class LLMClient:
 
     def __init__(self, base_url: str, *, api_key: str | None = None, trust_env: bool = True) -> None:
         self.base_url = base_url
+        # aiohttp takes apart what it is given as text, at each call.
+        self._models, self._completions = (URL(f"{base_url}/{path}") for path in ("models", "chat/completions"))
         # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before it is counted.
         headers = {"Accept-Encoding": "identity", "Content-Type": "application/json"}
         if api_key:
@@ -58,7 +61,7 @@ class LLMClient:
         Raises:
             NoDecision: no list, or a list with nothing but such names.
         """
-        listed = await self._call("GET", "models", None)
+        listed = await self._call("GET", self._models, None)
         try:
             told = [model["id"] for model in listed["data"]]
         except (KeyError, TypeError):
@@ -72,7 +75,7 @@ class LLMClient:
         """One chat completion of a whole request body; raises :class:`NoDecision`."""
         # Each token may come with its place's likeliest.
         most = max(_MAX_RESPONSE_BYTES, _BYTES_A_PLACE * body.get("max_tokens", 1))
-        answer = await self._call("POST", "chat/completions", body, most)
+        answer = await self._call("POST", self._completions, body, most)
         try:
             text = answer["choices"][0]["message"]["content"]
             usage = answer.get("usage") or {}
@@ -87,14 +90,12 @@ class LLMClient:
             cached = min(cached, prompt)
         return Completion(text, prompt, cached, completion, places_of(answer["choices"][0]))
 
-    async def _call(self, method: str, path: str, body: dict[str, Any] | None, most: int = _MAX_RESPONSE_BYTES) -> Any:
+    async def _call(self, method: str, url: URL, body: dict[str, Any] | None, most: int = _MAX_RESPONSE_BYTES) -> Any:
         content = bytearray()
         sent = None if body is None else json.dumps(body, ensure_ascii=False, separators=(",", ":")).encode()
         try:
             with allowing(most):
-                asked = await self._http.request(
-                    method, f"{self.base_url}/{path}", data=sent, allow_redirects=False, **self._by
-                )
+                asked = await self._http.request(method, url, data=sent, allow_redirects=False, **self._by)
             async with asked as response:
                 if response.headers.get("Content-Encoding", "identity") != "identity":
                     raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
