@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Self
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,15 +31,60 @@ def path_loss_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     return np.asarray(free_space + p_los * scenario.los_excess_db + (1.0 - p_los) * scenario.nlos_excess_db)
 
 
+@dataclass(frozen=True)
+class Links:
+    """Transfers at horizontal distances ``(...)``, metres, of which the path loss ``(...)``, dB, is reckoned once."""
+
+    distance_m: FloatArray
+    loss_db: FloatArray
+    scenario: Scenario
+
+    @classmethod
+    def at(cls, distance_m: ArrayLike, scenario: Scenario) -> Self:
+        """Those at these distances."""
+        d = np.asarray(distance_m, dtype=np.float64)
+        return cls(d, path_loss_db(d, scenario), scenario)
+
+    def __getitem__(self, which: Any) -> Self:
+        """Some of them, by any index that an array takes."""
+        return replace(self, distance_m=self.distance_m[which], loss_db=self.loss_db[which])
+
+    @property
+    def gain_db(self) -> FloatArray:
+        """Channel gain, dB: minus the path loss."""
+        return -self.loss_db
+
+    @cached_property
+    def hold(self) -> NDArray[np.bool_]:
+        """As :func:`link_holds`."""
+        near = self.distance_m <= self.scenario.radio_radius_m
+        return np.asarray(near & (self.loss_db < self.scenario.path_loss_limit_db))
+
+    @cached_property
+    def rate_bps(self) -> FloatArray:
+        """As :func:`rate_bps`."""
+        world = self.scenario
+        power_dbm = 10.0 * np.log10(world.transmit_power_w * 1e3)
+        noise_dbm = world.noise_dbm_hz + 10.0 * np.log10(world.bandwidth_hz) + world.noise_figure_db
+        snr = 10.0 ** ((power_dbm - self.loss_db - noise_dbm) / 10.0)
+        efficiency = np.minimum(np.log2(1.0 + snr), world.spectral_cap)
+        return np.asarray(world.link_share * world.bandwidth_hz * efficiency)
+
+    @property
+    def packets(self) -> NDArray[np.int64]:
+        """As :func:`packets_per_step`."""
+        moved = np.floor(self.rate_bps * self.scenario.step_s / self.scenario.packet_bits + 1e-9)
+        return np.asarray(np.where(self.hold, moved, 0.0).astype(np.int64))
+
+
 def channel_gain_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     """Channel gain in dB: minus the path loss."""
-    return -path_loss_db(distance_m, scenario)
+    return Links.at(distance_m, scenario).gain_db
 
 
 def link_holds(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.bool_]:
     """Whether a transfer can succeed: within the radio radius and below the path-loss threshold."""
-    d = np.asarray(distance_m, dtype=np.float64)
-    return np.asarray((d <= scenario.radio_radius_m) & (path_loss_db(d, scenario) < scenario.path_loss_limit_db))
+    return Links.at(distance_m, scenario).hold
 
 
 def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
@@ -43,7 +92,7 @@ def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 
     The threshold is not applied here; see :func:`link_holds`.
     """
-    return _rate(path_loss_db(distance_m, scenario), scenario)
+    return Links.at(distance_m, scenario).rate_bps
 
 
 def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.int64]:
@@ -52,15 +101,5 @@ def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.in
     packets = np.zeros(d.shape, dtype=np.int64)
     # The path loss is what takes the time, and most of many sensors are out of every reach.
     near = d <= scenario.radio_radius_m
-    loss = path_loss_db(d[near], scenario)
-    moved = np.floor(_rate(loss, scenario) * scenario.step_s / scenario.packet_bits + 1e-9)
-    packets[near] = np.where(loss < scenario.path_loss_limit_db, moved, 0.0)
+    packets[near] = Links.at(d[near], scenario).packets
     return packets
-
-
-def _rate(loss_db: FloatArray, scenario: Scenario) -> FloatArray:
-    power_dbm = 10.0 * np.log10(scenario.transmit_power_w * 1e3)
-    noise_dbm = scenario.noise_dbm_hz + 10.0 * np.log10(scenario.bandwidth_hz) + scenario.noise_figure_db
-    snr = 10.0 ** ((power_dbm - loss_db - noise_dbm) / 10.0)
-    efficiency = np.minimum(np.log2(1.0 + snr), scenario.spectral_cap)
-    return np.asarray(scenario.link_share * scenario.bandwidth_hz * efficiency)

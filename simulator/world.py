@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
-from shared.channel import FloatArray, channel_gain_db, link_holds, packets_per_step, path_loss_db, rate_bps
+from shared.channel import FloatArray, Links, path_loss_db
 from shared.scenario import SCENARIOS, Scenario
 from shared.trajectory import Trajectory, trajectories
 from simulator.sensors import IntArray, Sensors, Streams
@@ -187,7 +187,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         self._queue, self._battery, self._gain = np.zeros((3, *shape))
         self._last_heard: IntArray = np.full(shape, -1)
         position = self.fleet.positions
-        observations = self._observe(position, self._distances(position))
+        observations = self._observe(position, self._links(position))
         nothing = np.zeros(self.scenario.uavs, dtype=np.int64)
         return observations, self._infos(nothing, nothing, nothing, nothing.astype(np.float64))
 
@@ -198,19 +198,19 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         chosen = self._checked(actions)
         step = len(self.tally)
         position = self.fleet.advance(chosen[:, 1] * self.scenario.step_s)
-        distance = self._distances(position)
-        failed, moved = self._collect(chosen[:, 0], distance)
+        links = self._links(position)
+        failed, moved = self._collect(chosen[:, 0], links)
         lost = self.sensors.arrive(step)
         collected = np.bincount(chosen[:, 0], weights=moved, minlength=self.scenario.sensors).astype(np.int64)
         tally = StepTally(step, int(failed.sum()), int(np.count_nonzero(lost)), int(lost.sum()), collected)
         self.tally.append(tally)
 
-        blamed = link_holds(distance, self.scenario) @ lost
+        blamed = links.hold @ lost
         cost = failed + blamed / self.scenario.queue_capacity
         if self.cost == "paper":
             cost = np.full(self.scenario.uavs, float(tally.events))
         over = len(self.tally) == self.scenario.steps
-        observations = self._observe(position, distance)
+        observations = self._observe(position, links)
         infos = self._infos(failed, moved, blamed, cost)
         rewards = {agent: -infos[agent]["cost"] for agent in self.agents}
         terminations = dict.fromkeys(self.agents, False)
@@ -271,35 +271,34 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             chosen[uav] = action
         return chosen
 
-    def _distances(self, position: FloatArray) -> FloatArray:
-        """Horizontal distance of every UAV to every sensor, shape ``(I, J)``, metres."""
+    def _links(self, position: FloatArray) -> Links:
+        """Of every UAV to every sensor, ``(I, J)``."""
         offset = position[:, None, :] - self.sensors.positions
-        return np.hypot(offset[..., 0], offset[..., 1])
+        return Links.at(np.hypot(offset[..., 0], offset[..., 1]), self.scenario)
 
-    def _collect(self, chosen: IntArray, distance: FloatArray) -> tuple[IntArray, IntArray]:
+    def _collect(self, chosen: IntArray, links: Links) -> tuple[IntArray, IntArray]:
         """Serve the UAVs in order; f and the packets moved, each ``(I,)``."""
-        reach = distance[np.arange(self.scenario.uavs), chosen]
-        holds = link_holds(reach, self.scenario)
-        budget, rate = packets_per_step(reach, self.scenario), rate_bps(reach, self.scenario)
+        reach = links[np.arange(self.scenario.uavs), chosen]
+        holds, budget, rate = reach.hold.tolist(), reach.packets.tolist(), reach.rate_bps.tolist()
         failed, moved = np.ones((2, self.scenario.uavs), dtype=np.int64)
         served: set[int] = set()
         for uav, sensor in enumerate(chosen.tolist()):
             packets = None
             if holds[uav] and sensor not in served:
-                packets = self.sensors.transmit(sensor, int(budget[uav]), float(rate[uav]))
+                packets = self.sensors.transmit(sensor, budget[uav], rate[uav])
             if packets is not None:
                 served.add(sensor)
                 failed[uav] = 0
             moved[uav] = packets or 0
         return failed, moved
 
-    def _observe(self, position: FloatArray, distance: FloatArray) -> dict[str, Observation]:
+    def _observe(self, position: FloatArray, links: Links) -> dict[str, Observation]:
         """Hear the beacons in range, and give every live UAV a copy of what it knows."""
         step = len(self.tally)
-        heard = distance <= self.scenario.radio_radius_m
+        heard = links.distance_m <= self.scenario.radio_radius_m
         self._queue = np.where(heard, self.sensors.queue, self._queue)
         self._battery = np.where(heard, self.sensors.battery, self._battery)
-        self._gain = np.where(heard, channel_gain_db(distance, self.scenario), self._gain)
+        self._gain = np.where(heard, links.gain_db, self._gain)
         self._last_heard = np.where(heard, step, self._last_heard)
         return {
             agent: Observation(
