@@ -6,6 +6,7 @@ memory than what they compute with.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -194,11 +195,19 @@ class Learner:
         return self._weights.velocities(z, approach)
 
     def update(self, sample: Sample, cost: float) -> float:
-        """One step on one outcome; returns the loss before it."""
+        """One step on one outcome; returns the loss before it.
+
+        Raises:
+            FloatingPointError: the gradient is not finite; nothing is learned, where weights would be lost for good.
+        """
         before = self._weights.flat
         gradient, into = _places.of(self._layout)
         gradient.zero_()
-        loss = descend(self._layout.arrays(before), sample, -cost, into=into)
+        # BLAS kernels now and then raise the flag for numbers beside those that were asked for.
+        with np.errstate(invalid="ignore"):
+            loss = descend(self._layout.arrays(before), sample, -cost, into=into)
+            if not math.isfinite(gradient.numpy() @ gradient.numpy()):
+                raise FloatingPointError("the gradient of a lesson is not finite")
         self._moments = self._moments or Moments.none(len(before))
         self._weights = Weights(self._layout, stepped(before, self._moments, gradient, self._learning_rate))
         # Who sees that it was learned sees the loss too.

@@ -96,6 +96,20 @@ def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
             assert np.array_equal(kept["adam"][index][name], value.numpy()), (index, name)
 
 
+def test_a_lesson_that_is_not_finite_changes_nothing() -> None:
+    learner = Learner(initial_weights("pretrained", "paper", 15, 0), learning_rate=1e-3)
+    learner.update(sample(), cost=0.3)
+    broken = sample(seed=1)
+    broken.features[3, 0] = np.nan
+    before = learner.state_dict()
+    with pytest.raises(FloatingPointError, match="not finite"):
+        learner.update(broken, cost=0.3)
+    after = learner.state_dict()
+    assert after["updates"] == before["updates"] == 1
+    np.testing.assert_equal(after, before)
+    assert np.isfinite(learner.update(sample(seed=2), cost=0.3))
+
+
 def test_what_was_kept_goes_on_as_if_it_had_never_stopped() -> None:
     through, first = (Learner(Modules("reach", 15, seed=1).weights(), learning_rate=5e-3) for _ in range(2))
     for seed in range(20):
