@@ -6,11 +6,12 @@ An LLM server that answers at once (``instant_llm.py``), and before it, each a p
 (a) ``bare``, a FastAPI application that only passes the same JSON on with httpx; (b) ``litellm``, LiteLLM's proxy with
 the same prompt as a chat completion, behind its one key; (c) ``edge``, ``POST /decide`` in mode ``llm`` with everything
 on: keys, attention, prompt, token counting, checks, SQLite store, metrics, and outcomes that it learns from;
-(d) ``edge, no outcomes``: the same without them. UAVs ask as fast as they are answered, 3 and 64 at once, in rounds
-that go through all of them, so that a noisy machine is noisy for all. Added latency is that at the UAV less that of
-the LLM server asked directly by the same load generator. Prints medians over rounds and their ratios with 95%
-bootstrap intervals over rounds, and writes the same as JSON. Goals: the edge adds at most 1.5 times what ``bare`` adds
-and 0.4 times what LiteLLM adds, and answers at least 0.6 and 3 times as many requests a second.
+(d) ``edge, no outcomes``: the same without them; (e) ``edge, no store``: as (c), but kept in memory only. UAVs ask as
+fast as they are answered, 3 and 64 at once, in rounds that go through all of them, so that a noisy machine is noisy for
+all. Added latency is that at the UAV less that of the LLM server asked directly by the same load generator. Prints
+medians over rounds and their ratios with 95% bootstrap intervals over rounds, and writes the same as JSON. Goals: the
+edge adds at most 1.5 times what ``bare`` adds and 0.4 times what LiteLLM adds, and answers at least 0.6 and 3 times as
+many requests a second.
 LiteLLM is installed into a virtual environment of its own under runs/ the first time; --litellm none leaves it out.
 """
 
@@ -44,6 +45,15 @@ LITELLM = "litellm[proxy]==1.106.2"
 FLEET, SENSORS = 3, 10
 QUANTITIES = ("p50", "p99", "rps")
 HERE = Path(__file__).parent
+EDGE = {
+    "AICVDS_MODE": "llm",
+    "AICVDS_PLANNER": "off",
+    "AICVDS_LOG_LEVEL": "warning",
+    # The LLM server's first word would break a hard rule now and then, and the policy's answer would be measured.
+    "AICVDS_VERIFY": "off",
+    # Of a busy machine the slowness is to be measured, not hidden by answers without the LLM.
+    "AICVDS_DEADLINE_MS": "20000",
+}
 # Each entry: of whom, at most (latency) and at least (requests a second) so many times the other's.
 GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0)}
 
@@ -185,9 +195,19 @@ def litellm_program(choice: str, console: Console) -> str | None:
     return str(program)
 
 
+def _edge(settings: dict[str, str], stack: ExitStack) -> int:
+    """The port of an edge that is started, and whose LLM is ready."""
+    port = usable_port(0)
+    serve = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+    stack.enter_context(running(serve, f"http://{HOST}:{port}/healthz", settings))
+    while httpx.get(f"http://{HOST}:{port}/readyz", timeout=60).json()["llm"] != "ready":
+        time.sleep(0.1)
+    return port
+
+
 def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
     """Start everything; the LLM server itself is the first target."""
-    llm, bare, proxy, edge = (usable_port(0) for _ in range(4))
+    llm, bare, proxy = (usable_port(0) for _ in range(3))
     python, upstream = sys.executable, f"http://{HOST}:{llm}/v1"
     stack.enter_context(running([python, str(HERE / "instant_llm.py"), "--port", str(llm)], f"{upstream}/models"))
     forwarder = [python, str(HERE / "bare_forwarder.py"), "--port", str(bare), "--upstream", upstream]
@@ -196,26 +216,15 @@ def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
     add = ["keys", "add", "load", "--file", str(keys), "--scopes", "decide", "admin", "--per-minute", "1000000"]
     made = subprocess.run([python, "-m", "shared.cli", *add], check=True, capture_output=True, text=True)
     key = made.stdout.split()[-1]
-    settings = {
-        "AICVDS_MODE": "llm",
-        "AICVDS_PLANNER": "off",
-        "AICVDS_LLM_URL": upstream,
-        "AICVDS_KEYS": str(keys),
-        "AICVDS_STORE": str(folder / "missions.db"),
-        "AICVDS_LOG_LEVEL": "warning",
-        # The LLM server's first word would break a hard rule now and then, and the policy's answer would be measured.
-        "AICVDS_VERIFY": "off",
-        # Of a busy machine the slowness is to be measured, not hidden by answers without the LLM.
-        "AICVDS_DEADLINE_MS": "20000",
-    }
-    serve = [python, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(edge)]
-    stack.enter_context(running(serve, f"http://{HOST}:{edge}/healthz", settings))
-    while httpx.get(f"http://{HOST}:{edge}/readyz").json()["llm"] != "ready":
-        time.sleep(0.1)
+    settings = {**EDGE, "AICVDS_LLM_URL": upstream, "AICVDS_KEYS": str(keys)}
+    edge, storeless = (
+        _edge({**settings, "AICVDS_STORE": store}, stack) for store in (str(folder / "missions.db"), "none")
+    )
     targets = [
         Target("bare", bare, "/decide", lambda uav: uav.report(outcomes=False)),
         Target("edge", edge, "/decide", lambda uav: uav.report(outcomes=True), key),
         Target("edge, no outcomes", edge, "/decide", lambda uav: uav.report(outcomes=False), key),
+        Target("edge, no store", storeless, "/decide", lambda uav: uav.report(outcomes=True), key),
     ]
     # What the edge asks is what LiteLLM is to pass on.
     load(targets[1], [Uav(n) for n in range(FLEET)], 1.0)
