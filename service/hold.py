@@ -28,7 +28,7 @@ class FileHold:
 
     def __init__(self, engine: sa.Engine) -> None:
         self._engine = engine
-        # Kept from transaction to transaction: to get it from the pool, and give it back, takes as long as to commit.
+        # Kept from transaction to transaction: to get it from the pool and give it back takes a quarter of a commit.
         self._connection: sa.Connection | None = None
         # By its own name: another edge may know it by a link.
         file = os.path.realpath(engine.url.database or "")
