@@ -203,7 +203,7 @@ class Learner:
         before = self._weights.flat
         gradient, into = _places.of(self._layout)
         gradient.zero_()
-        # BLAS kernels now and then raise the flag for numbers beside those that were asked for.
+        # A BLAS kernel may raise the flag though all it was asked for is finite; what counts is the gradient.
         with np.errstate(invalid="ignore"):
             loss = descend(self._layout.arrays(before), sample, -cost, into=into)
             if not math.isfinite(gradient.numpy() @ gradient.numpy()):
