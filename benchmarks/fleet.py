@@ -210,12 +210,17 @@ def main(args: Fleet) -> int:
     return 0
 
 
+def _resident(edge: psutil.Process) -> int:
+    """Bytes, with the process that writes its store."""
+    return sum(each.memory_info().rss for each in (edge, *edge.children()))
+
+
 def _measure(args: Fleet, port: int, edge: psutil.Process, console: Console) -> dict[str, Any]:
     radios = [Radio(port, seed) for seed in range(args.connections)]
     warm = _made(radios[0], "warm-up")
     at_once(radios[:1], [lambda radio: radio.decide(warm, True)] * 60)
     rates, missions = dict[str, dict[str, float]](), list[Flown]()
-    empty = edge.memory_info().rss
+    empty = _resident(edge)
     with Progress(console=console) as progress:
         task = progress.add_task("flying", total=len(args.missions) + 3)
         for number in args.missions:
@@ -226,12 +231,12 @@ def _measure(args: Fleet, port: int, edge: psutil.Process, console: Console) -> 
         progress.advance(task)
         memory = {"missions": float(len(missions)), "decisions_each": float(args.each)}
         _fill(radios, missions, args.each)
-        memory["kb_a_mission"] = (edge.memory_info().rss - empty) / len(missions) / 1e3
+        memory["kb_a_mission"] = (_resident(edge) - empty) / len(missions) / 1e3
         progress.advance(task)
-        before, veterans = edge.memory_info().rss, missions[-args.veterans :]
+        before, veterans = _resident(edge), missions[-args.veterans :]
         _fill(radios, veterans, args.lifetime)
         memory |= {"veterans": float(len(veterans)), "lifetime": float(args.lifetime)}
-        grown = (edge.memory_info().rss - before) / len(veterans) / 1e3
+        grown = (_resident(edge) - before) / len(veterans) / 1e3
         memory["kb_a_veteran"] = memory["kb_a_mission"] + grown
         progress.advance(task)
     return {"rates": rates, "learning": learning, "memory": {k: round(v, 1) for k, v in memory.items()}}

@@ -157,7 +157,8 @@ def sample(url: str, process: psutil.Process, began: float) -> Sample:
     tasks = next(float(line.split()[1]) for line in lines if line.startswith("aicvds_tasks "))
     return Sample(
         at_s=time.monotonic() - began,
-        resident_mb=process.memory_info().rss / 1e6,
+        # With the process that writes its store.
+        resident_mb=sum(each.memory_info().rss for each in (process, *process.children())) / 1e6,
         tasks=tasks,
         connections=len(process.net_connections("tcp")),
         files=process.num_fds(),

@@ -96,14 +96,11 @@ class Engine:
             whether the store may be closed: False while a write that was given up still waits for it.
         """
         self._outcomes.finish()
-        return await asyncio.to_thread(self._keep)
-
-    def _keep(self) -> bool:
         for threads in (self._planning, self._judging):
-            threads.shutdown(wait=True, cancel_futures=True)
+            await asyncio.to_thread(threads.shutdown, cancel_futures=True)
         self.missions.close()
-        self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
-        return self.keeper.close(_LAST_COMMIT_S)
+        await self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
+        return await self.keeper.close(_LAST_COMMIT_S)
 
     async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
         """One UAV's decision, within its deadline whatever the LLM does; raises ``Refused`` for bad input.

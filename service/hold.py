@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import IO
@@ -12,6 +13,8 @@ import sqlalchemy as sa
 
 # Any number that no other program of the same database takes.
 _ADVISORY_LOCK = 0x41494356
+# How long a SQLite file is asked for that another process has, and how often.
+_LAST_COMMIT_S, _RETRY_S = 1.0, 0.02
 
 
 class StoreUnusable(Exception):
@@ -19,50 +22,36 @@ class StoreUnusable(Exception):
 
 
 class FileHold:
-    """Has a SQLite file as long as this process lives, however it ends.
+    """Has a SQLite file as long as this process lives, however it ends, and the one that writes for it.
+
+    Attributes:
+        file: its own name: another edge may know it by a link.
+        descriptor: of the lock. Who has it too keeps the file as long.
 
     Raises:
         StoreUnusable: another edge has it.
         OSError: there can be no lock file beside it.
     """
 
-    def __init__(self, engine: sa.Engine) -> None:
-        self._engine = engine
-        # Kept from transaction to transaction: to get it from the pool and give it back takes a quarter of a commit.
-        self._connection: sa.Connection | None = None
-        # By its own name: another edge may know it by a link.
-        file = os.path.realpath(engine.url.database or "")
-        self._lock: IO[str] = open(f"{file}.lock", "w")  # noqa: SIM115
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._lock.close()
-            raise StoreUnusable(f"another edge uses {file}") from None
-
-    def begin_term(self) -> None:
-        """A lock that cannot be lost needs none."""
-
-    @contextmanager
-    def transaction(self) -> Iterator[sa.Connection]:
-        """A transaction, committed at its end; raises ``SQLAlchemyError`` where it was not."""
-        if self._connection is None:
-            self._connection = self._engine.connect()
-        try:
-            with self._connection.begin():
-                yield self._connection
-        except BaseException:
-            self._let_go()
-            raise
+    def __init__(self, file: str) -> None:
+        self.file = os.path.realpath(file)
+        self._lock: IO[str] = open(f"{self.file}.lock", "w")  # noqa: SIM115
+        self.descriptor = self._lock.fileno()
+        # One that was killed may still have its last commit to end.
+        ends = time.monotonic() + _LAST_COMMIT_S
+        while True:
+            try:
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() >= ends:
+                    self._lock.close()
+                    raise StoreUnusable(f"another edge uses {self.file}") from None
+            time.sleep(_RETRY_S)
 
     def close(self) -> None:
         """Let another edge have it."""
-        self._let_go()
         self._lock.close()
-
-    def _let_go(self) -> None:
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
 
 
 class DatabaseHold:

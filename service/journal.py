@@ -1,7 +1,7 @@
 """The journal: what changes missions is on disk before it is acknowledged, many changes to a commit.
 
-One thread writes, when somebody waits for it, so that what a decision changes is one commit. What comes while it
-commits gathers for the next, so that under load a commit, and its fsync, serves many answers. Where the store fails,
+It is written when somebody waits for it, so that what a decision changes is one commit. What comes while that is
+written gathers for the next, so that under load a commit, and its fsync, serves many answers. Where the store fails,
 nothing that waits is lost: it is tried again, and meanwhile decisions go on while what must be on disk is refused.
 """
 
@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 from zlib import crc32
 
+from service.changes import Change, Checkpoint, Deleted, Entry, Made
 from service.events import Decided, Event, unheard
 from service.metrics import Metrics
 from service.mission import Mission
 from service.packing import pack
-from service.store import Checkpoint, Deleted, Entry, Item, Made, Store, cause
+from service.store import Store, cause
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,6 @@ class Track:
 
     Attributes:
         seq: its newest event's.
-        checkpointed: the newest event that a checkpoint stands for, -1 for none.
         since: what it would take to read it back, in events, since its last checkpoint.
         over: it was deleted; what still happens to it is nobody's business, and another may have its ID.
     """
@@ -51,7 +50,6 @@ class Track:
     def __init__(self, mission: Mission, seq: int, since: int) -> None:
         self.mission = mission
         self.seq = seq
-        self.checkpointed = -1
         self.since = since
         self.over = False
 
@@ -71,28 +69,33 @@ class Unkept:
         """Nobody waits for what nobody keeps."""
         return True
 
-    def close(self, within_s: float) -> bool:
+    async def close(self, within_s: float) -> bool:
         """Nobody writes."""
         return True
 
 
 class Journal:
-    """Writes to a store. Called from the event loop, or when that has ended."""
+    """Writes to a store; on the event loop."""
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
-        self._store = store
+        self._writer = store.writer()
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
         self._tracks: dict[str, Track] = {}
-        self._queue: deque[tuple[int, Item]] = deque()
-        self._changed = threading.Condition()
-        self._added = self._wanted = self._written = 0
-        self._failing = self._closing = False
+        self._queue: deque[tuple[int, Change]] = deque()
+        self._added = self._written = 0
+        # What is being written, since when, and whether it is the last attempt.
+        self._batch: list[tuple[int, Change]] = []
+        self._begun, self._last = 0.0, False
+        # When it is written without being waited for, or tried again.
+        self._later: asyncio.TimerHandle | None = None
+        self._pause_s = _FIRST_PAUSE_S
+        self._failing = False
         self._why = ""
         self._waiting: list[tuple[int, asyncio.Future[bool]]] = []
+        self._over: asyncio.Future[None] | None = None
         self._packing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoints")
-        self._thread = threading.Thread(target=self._write, name="journal", daemon=True)
-        self._thread.start()
+        self._packed: set[asyncio.Future[bytes]] = set()
 
     @property
     def failing(self) -> bool:
@@ -101,8 +104,7 @@ class Journal:
 
     def begin(self, mission: Mission) -> None:
         """A mission is made, and its events are heard from now on."""
-        with self._changed:
-            self._add(Made(mission.mission_id, mission.asked_for, mission.spec))
+        self._add(Made(mission.mission_id, mission.asked_for, mission.spec))
         # Missions that begin together, and fly alike, are not to be checkpointed all at once.
         self._follow(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS)
 
@@ -115,23 +117,21 @@ class Journal:
         self._tracks[mission.mission_id] = track
 
         def record(event: Event) -> None:
-            with self._changed:
-                if track.over:
-                    return
-                track.seq += 1
-                track.since += _weight(event)
-                self._add(Entry(mission.mission_id, track.seq, event))
+            if track.over:
+                return
+            track.seq += 1
+            track.since += _weight(event)
+            self._add(Entry(mission.mission_id, track.seq, event))
 
         mission.record = record
 
     def end(self, mission_id: str) -> None:
         """A mission is deleted."""
-        with self._changed:
-            if (track := self._tracks.pop(mission_id, None)) is not None:
-                track.over = True
-                # Mission and hearer hold each other: all of it would stay in memory until a collection finds it.
-                track.mission.record = unheard
-            self._add(Deleted(mission_id))
+        if (track := self._tracks.pop(mission_id, None)) is not None:
+            track.over = True
+            # Mission and hearer hold each other: all of it would stay in memory until a collection finds it.
+            track.mission.record = unheard
+        self._add(Deleted(mission_id))
 
     def due(self, mission: Mission, least: int = _EVENTS) -> Track | None:
         """The mission's track, where it has so many events since its last checkpoint; they are counted anew then."""
@@ -141,31 +141,20 @@ class Journal:
         track.since = 0
         return track
 
-    def checkpoint(self, track: Track, seq: int, state: dict[str, Any]) -> None:
-        """Keep a mission's state after event ``seq`` in place of the events until then.
+    def checkpoint(self, track: Track, state: dict[str, Any]) -> None:
+        """Keep a mission's state as it is now in place of the events until now.
 
         While the store fails events would gather without end, so those that the checkpoint stands for leave the queue.
         It takes the place of the last of them: what comes after is written no sooner than it.
         """
-        if track.mission.scenario.sensors >= _LARGE and _on_a_loop():
+        if track.mission.scenario.sensors >= _LARGE:
             # Beside the decisions, one after the other; meanwhile the journal has the events that it stands for.
-            self._packing.submit(self._take, track, seq, state).add_done_callback(_tell_failure)
+            packing = self._loop.run_in_executor(self._packing, pack, state)
+            self._packed.add(packing)
+            packing.add_done_callback(partial(self._take_packed, track, track.seq))
         else:
             # Packed at once: as it is, it would take the memory of a thousand small objects until it is written.
-            self._take(track, seq, state)
-
-    def _take(self, track: Track, seq: int, state: dict[str, Any]) -> None:
-        taken = Checkpoint(track.mission.mission_id, seq, pack(state))
-        with self._changed:
-            if track.over or seq <= track.checkpointed:
-                return
-            track.checkpointed = seq
-            covered = [ticket for ticket, item in self._queue if _covered(item, taken)]
-            if not covered:
-                self._add(taken)
-                return
-            kept = [(ticket, item) for ticket, item in self._queue if not _covered(item, taken)]
-            self._queue = deque(sorted([*kept, (covered[-1], taken)], key=lambda entry: entry[0]))
+            self._take(track, track.seq, pack(state))
 
     async def stored(self, within_s: float) -> bool:
         """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
@@ -173,74 +162,123 @@ class Journal:
             return True
         if self._failing:
             return False
-        mine = self._added, self._loop.create_future()
+        written: asyncio.Future[bool] = self._loop.create_future()
+        mine = self._added, written
         self._waiting.append(mine)
-        with self._changed:
-            self._wanted = self._added
-            self._changed.notify()
+        self._write()
         try:
             async with asyncio.timeout(max(0.0, within_s)):
-                return bool(await mine[1])
+                return await written
         except TimeoutError:
             return False
         finally:
             if mine in self._waiting:
                 self._waiting.remove(mine)
 
-    def close(self, within_s: float) -> bool:
+    async def close(self, within_s: float) -> bool:
         """Write what waits, once more; returns whether that has ended, and the store may be closed."""
-        self._packing.shutdown(wait=True, cancel_futures=True)
-        with self._changed:
-            self._closing = True
-            self._changed.notify()
-        self._thread.join(within_s)
-        return not self._thread.is_alive()
+        ends = self._loop.time() + within_s
+        if self._packed:
+            await asyncio.wait(self._packed, timeout=within_s)
+        self._packing.shutdown(wait=False, cancel_futures=True)
+        over = self._over = self._loop.create_future()
+        if not self._batch:
+            self._go_on()
+        try:
+            async with asyncio.timeout_at(ends):
+                await over
+        except TimeoutError:
+            return False
+        self._writer.close()
+        return True
 
-    def _add(self, item: Item) -> None:
-        """The caller holds the lock."""
+    def _take_packed(self, track: Track, seq: int, packing: asyncio.Future[bytes]) -> None:
+        self._packed.discard(packing)
+        if packing.cancelled():
+            return
+        if (error := packing.exception()) is not None:
+            log.error("a checkpoint could not be made, the journal has its events: %r", error)
+            return
+        self._take(track, seq, packing.result())
+
+    def _take(self, track: Track, seq: int, packed: bytes) -> None:
+        if track.over:
+            return
+        taken = Checkpoint(track.mission.mission_id, seq, packed)
+        covered = [ticket for ticket, change in self._queue if _covered(change, taken)]
+        if not covered:
+            self._add(taken)
+            return
+        kept = [(ticket, change) for ticket, change in self._queue if not _covered(change, taken)]
+        self._queue = deque(sorted([*kept, (covered[-1], taken)], key=lambda entry: entry[0]))
+
+    def _add(self, change: Change) -> None:
         self._added += 1
-        self._queue.append((self._added, item))
+        self._queue.append((self._added, change))
+        if self._later is None and not self._batch:
+            self._later = self._loop.call_later(_LINGER_S, self._write)
 
     def _write(self) -> None:
-        pause_s = _FIRST_PAUSE_S
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._wanted > self._written or self._closing, timeout=_LINGER_S)
-                if not self._queue and self._closing:
-                    return
-                if not self._queue:
-                    continue
-                batch = [self._queue[i] for i in range(min(len(self._queue), _MOST_AT_ONCE))]
-            begun = time.perf_counter()
-            try:
-                self._store.write([item for _, item in batch])
-            except Exception as error:
-                self._fail(error)
-                with self._changed:
-                    if self._closing or self._changed.wait_for(lambda: self._closing, timeout=pause_s):
-                        # Once more: the last attempt.
-                        self._give_up()
-                        return
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-                continue
-            pause_s = _FIRST_PAUSE_S
-            self._metrics.store_seconds.observe(time.perf_counter() - begun)
-            self._done(batch)
+        """Write what waits, unless some is being written: what is left follows when that has ended."""
+        if self._batch or not self._queue:
+            return
+        self._stop_waiting()
+        self._batch = [self._queue[i] for i in range(min(len(self._queue), _MOST_AT_ONCE))]
+        self._begun, self._last = time.perf_counter(), self._over is not None
+        try:
+            self._writer.write([change for _, change in self._batch], self._ended)
+        except Exception as error:
+            self._loop.call_soon(self._ended, error)
 
-    def _done(self, batch: list[tuple[int, Item]]) -> None:
-        last = batch[-1][0]
-        with self._changed:
-            # A checkpoint may have come into their midst meanwhile.
-            done = {id(item) for _, item in batch}
-            while self._queue and id(self._queue[0][1]) in done:
-                self._queue.popleft()
-            if self._queue and self._queue[0][0] <= last:
-                self._queue = deque(entry for entry in self._queue if id(entry[1]) not in done)
+    def _ended(self, error: Exception | None) -> None:
+        if error is None:
+            self._metrics.store_seconds.observe(time.perf_counter() - self._begun)
+            self._done()
+        else:
+            self._fail(error)
+        self._batch = []
+        for ticket, waiting in self._waiting:
+            if not waiting.done() and (ticket <= self._written or self._failing):
+                waiting.set_result(ticket <= self._written)
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """What comes after an attempt, or at the end."""
+        if self._over is not None and (not self._queue or (self._failing and self._last)):
+            if self._queue:
+                log.error(
+                    "the store failed to the end: %d changes are not on disk, no outcome among them was acknowledged",
+                    len(self._queue),
+                )
+            if not self._over.done():
+                self._over.set_result(None)
+        elif self._over is not None:
+            self._write()
+        elif self._failing:
+            self._later = self._loop.call_later(self._pause_s, self._write)
+            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        elif any(not waiting.done() for _, waiting in self._waiting):
+            self._write()
+        elif self._queue:
+            self._later = self._loop.call_later(_LINGER_S, self._write)
+
+    def _stop_waiting(self) -> None:
+        if self._later is not None:
+            self._later.cancel()
+            self._later = None
+
+    def _done(self) -> None:
+        last = self._batch[-1][0]
+        # A checkpoint may have come into their midst meanwhile.
+        done = {id(change) for _, change in self._batch}
+        while self._queue and id(self._queue[0][1]) in done:
+            self._queue.popleft()
+        if self._queue and self._queue[0][0] <= last:
+            self._queue = deque(entry for entry in self._queue if id(entry[1]) not in done)
         if self._failing:
             log.warning("the store works again")
-        self._failing = False
+        self._failing, self._pause_s = False, _FIRST_PAUSE_S
         self._written = max(self._written, last)
-        self._tell()
 
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()
@@ -249,39 +287,6 @@ class Journal:
         if not self._failing or why != self._why:
             log.error("the store fails, what waits is tried again: %s", why)
         self._failing, self._why = True, why
-        self._tell()
-
-    def _give_up(self) -> None:
-        try:
-            self._store.write([item for _, item in self._queue])
-            self._queue.clear()
-        except Exception:
-            log.error(
-                "the store failed to the end: %d changes are not on disk, no outcome among them was acknowledged",
-                len(self._queue),
-            )
-
-    def _tell(self) -> None:
-        if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._settle)
-
-    def _settle(self) -> None:
-        for ticket, waiting in self._waiting:
-            if not waiting.done() and (ticket <= self._written or self._failing):
-                waiting.set_result(ticket <= self._written)
-
-
-def _on_a_loop() -> bool:
-    """Whether others wait for the thread that this runs in; when the service ends, nobody does."""
-    with suppress(RuntimeError):
-        asyncio.get_running_loop()
-        return True
-    return False
-
-
-def _tell_failure(packed: Future[None]) -> None:
-    if not packed.cancelled() and (error := packed.exception()) is not None:
-        log.error("a checkpoint could not be made, the journal has its events: %r", error)
 
 
 def _weight(event: Event) -> int:
@@ -291,5 +296,5 @@ def _weight(event: Event) -> int:
     return 1
 
 
-def _covered(item: Item, by: Checkpoint) -> bool:
-    return isinstance(item, Entry | Checkpoint) and item.mission_id == by.mission_id and item.seq <= by.seq
+def _covered(change: Change, by: Checkpoint) -> bool:
+    return isinstance(change, Entry | Checkpoint) and change.mission_id == by.mission_id and change.seq <= by.seq

@@ -124,20 +124,22 @@ class Outcomes:
                 self._learn(lesson)
             else:
                 self._waiting.append(lesson)
-        self._keeper.checkpoint(track, track.seq, {**mission.state_dict(), "learner": mission.learner.state_dict()})
+        self._keeper.checkpoint(track, {**mission.state_dict(), "learner": mission.learner.state_dict()})
 
     def finish(self) -> None:
-        """Learn what waits, now; on the event loop, before :meth:`close` leaves it."""
+        """Learn what waits, now."""
         while self._waiting:
             self._learn(self._waiting.popleft())
 
-    def close(self, missions: list[Mission], within_s: float) -> None:
+    async def close(self, missions: list[Mission], within_s: float) -> None:
         """Checkpoint every mission, as far as there is time; the journal has the rest."""
         ends = time.monotonic() + within_s
         for mission in missions:
             if time.monotonic() >= ends:
                 break
             self.checkpoint(mission, 1)
+            # Who still asks, and the journal, go on between.
+            await asyncio.sleep(0)
 
     def _learn(self, lesson: Lesson) -> None:
         if (loss := learn(*lesson)) is not None:

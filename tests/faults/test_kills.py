@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -22,6 +24,7 @@ from tests.e2e.processes import serving_edge
 from tests.faults.fleet import UAVS, Report
 from tests.faults.table import Tables
 from tests.running import serving
+from tests.service.keeping import writers
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(600)]
 
@@ -99,7 +102,11 @@ def test_kills_under_load(tmp_path: Path, report: Report, tables: Tables) -> Non
                     uav.join(timeout=20)
                 break
             time.sleep(chance.uniform(0.2, 1.2))
-            process.kill()
+            # Every other time the process that writes goes too, before the edge or after it.
+            doomed = [process.pid, *(writer.pid for writer in writers(process.pid) if kill % 2)]
+            chance.shuffle(doomed)
+            for pid in doomed:
+                os.kill(pid, signal.SIGKILL)
             process.wait()
             for uav in fleet:
                 assert uav.error is None

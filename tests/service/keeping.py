@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 
 from service.app import create_app
+from service.changes import Change
 from service.engine import Engine
 from service.mission import Mission
 from service.settings import Settings
 from service.store import Store
+from service.writers import Writer
 from tests.running import serving
 
 Body = dict[str, Any]
@@ -76,6 +80,21 @@ def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
         time.sleep(0.01)
     assert mission.learner.updates == updates
     return mission
+
+
+def writers(pid: int) -> list[psutil.Process]:
+    """The processes that write stores for this one."""
+    children = psutil.Process(pid).children()
+    return [child for child in children if any("sqlite_writer" in word for word in child.cmdline())]
+
+
+async def written(writer: Writer, changes: Sequence[Change]) -> None:
+    """Write, wait until that has ended, and raise what it failed by."""
+    ended = asyncio.get_running_loop().create_future()
+    writer.write(changes, ended.set_result)
+    async with asyncio.timeout(60):
+        if (error := await ended) is not None:
+            raise error
 
 
 def locked(path: Path) -> sqlite3.Connection:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import os
 import threading
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from service.store import Item, Kept, Store
+from service.store import Kept, Store
 from tests.running import listening
-from tests.service.keeping import copy_of, fly, running
+from tests.service.keeping import copy_of, fly, running, writers
 from tests.service.stub_llm import misbehaving, saying, wait_for
 
 Report = Callable[..., dict[str, Any]]
@@ -50,21 +51,14 @@ def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: 
         assert (status["mode"], status["decisions"], status["feedback"]) == ("policy", 1, 1)
 
 
-def test_a_mission_deleted_twice_is_gone_when_that_is_said(
-    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write, go = Store.write, threading.Event()
-
-    def slowly(self: Store, items: Sequence[Item]) -> None:
-        go.wait(30)
-        write(self, items)
-
+def test_a_mission_deleted_twice_is_gone_when_that_is_said(tmp_path: Path, report: Report) -> None:
     with running(tmp_path / "m.db") as (client, _):
         fly(client, report, range(2))
-        monkeypatch.setattr(Store, "write", slowly)
-        # A disk that takes longer than an answer may.
+        # As a disk that takes longer than an answer may.
+        (writer,) = writers(os.getpid())
+        writer.suspend()
         assert [client.delete("/missions/test").status_code for _ in range(2)] == [503, 503]
-        go.set()
+        writer.resume()
         assert client.delete("/missions/test").status_code == 404
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
     left = Store(str(copied))

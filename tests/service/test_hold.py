@@ -14,10 +14,11 @@ import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 
+from service.changes import Deleted
 from service.hold import StoreUnusable
-from service.store import Deleted, Store
+from service.store import Store
 from tests.e2e.processes import serving_edge
-from tests.service.keeping import fly, running
+from tests.service.keeping import fly, running, written
 
 Report = Callable[..., dict[str, Any]]
 
@@ -95,24 +96,26 @@ def _locking(url: str, table: str) -> Iterator[None]:
     other.dispose()
 
 
-def test_an_edge_that_was_followed_stays_out_and_lets_a_third_in(
+async def test_an_edge_that_was_followed_stays_out_and_lets_a_third_in(
     postgres: str,
 ) -> None:
     nothing = [Deleted("nobody")]
     first = Store(postgres)
+    writer = first.writer()
     _break_holds(postgres)
     Store(postgres).close()
     with pytest.raises(OperationalError, match="terminating connection|closed the connection"):
-        first.write(nothing)
+        await written(writer, nothing)
     with _locking(postgres, "terms"), pytest.raises(OperationalError, match="lock timeout"):
-        first.write(nothing)
+        await written(writer, nothing)
     for _ in range(2):
         with pytest.raises(StoreUnusable, match="another edge has had it since"):
-            first.write(nothing)
+            await written(writer, nothing)
     third = Store(postgres)
     with pytest.raises(StoreUnusable, match="another edge uses"):
-        first.write(nothing)
+        await written(writer, nothing)
     third.close()
+    writer.close()
     first.close()
 
 

@@ -12,7 +12,8 @@ from alembic.config import Config
 from sqlalchemy import create_engine, text
 
 from service.hold import StoreUnusable
-from service.store import SCHEMA, Store
+from service.schema import SCHEMA
+from service.store import Store
 from tests.service.keeping import fly, running
 
 Body = dict[str, Any]

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy.exc import OperationalError
 
 from service import outcomes
+from service.changes import Change, Checkpoint, Entry
 from service.journal import Journal
 from service.metrics import Metrics
 from service.mission import Mission
@@ -24,7 +24,8 @@ from service.problems import Refused, Unavailable
 from service.repeats import Repeats
 from service.replaying import revived
 from service.settings import Settings
-from service.store import Checkpoint, Entry, Item, Kept, Store
+from service.store import Kept, Store
+from service.writers import Done, WriteFailed, Writer
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome
 from tests.running import serving
@@ -35,19 +36,34 @@ from tests.service.stub_llm import StubLlm, wait_for
 Report = Callable[..., dict[str, Any]]
 
 
-class Moody(Store):
-    """A store that fails when it is told to, and says what it wrote."""
+class Moody:
+    """A writer that fails when it is told to, and says what it wrote."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(str(path))
+    def __init__(self, well: Writer) -> None:
+        self._writer = well
+        self.failures: list[Exception] = []
         self.well = True
-        self.written: list[Item] = []
+        self.written: list[Change] = []
 
-    def write(self, items: Sequence[Item]) -> None:
+    def write(self, changes: Sequence[Change], done: Done) -> None:
+        if self.failures:
+            raise self.failures.pop(0)
         if not self.well:
-            raise OperationalError("disk full", None, Exception("disk full"))
-        super().write(items)
-        self.written.extend(items)
+            asyncio.get_running_loop().call_soon(done, WriteFailed("disk full"))
+            return
+        self.written.extend(changes)
+        self._writer.write(changes, done)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class MoodyStore(Store):
+    """A store with such a writer."""
+
+    def writer(self) -> Moody:
+        self.moody = Moody(super().writer())
+        return self.moody
 
 
 async def until(done: Callable[[], bool]) -> None:
@@ -58,53 +74,46 @@ async def until(done: Callable[[], bool]) -> None:
 
 
 async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_path: Path) -> None:
-    store = Moody(tmp_path / "m.db")
+    store = MoodyStore(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
+    writer = store.moody
     mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
     journal.begin(mission)
     for step in range(3):
         mission.observe(uav(step=step), step)
     assert await journal.stored(5)
-    store.well = False
+    writer.well = False
     for step in range(3, 10):
         mission.observe(uav(step=step), step)
     await until(lambda: journal.failing)
     track = journal.due(mission, 1)
     assert track is not None
-    seq, told = track.seq, mission.state_dict()
+    journal.checkpoint(track, {**mission.state_dict(), "learner": mission.learner.state_dict()})
     for step in range(10, 13):
         mission.observe(uav(step=step), step)
-    journal.checkpoint(track, seq, {**told, "learner": mission.learner.state_dict()})
-    store.well = True
+    writer.well = True
     await until(lambda: not journal.failing and not journal._queue)
-    tail = store.written[4:]
+    tail = writer.written[4:]
     assert [item.seq for item in tail if isinstance(item, Checkpoint | Entry)] == [10, 11, 12, 13]
     assert isinstance(tail[0], Checkpoint)
     kept = store.load("test")
     assert kept is not None
     assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
-    journal.close(5)
+    assert await journal.close(5)
     store.close()
 
 
-async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = Store(str(tmp_path / "m.db"))
+async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path) -> None:
+    store = MoodyStore(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
-    write, failures = store.write, iter([MemoryError(), OSError("no such device")])
-
-    def moody(items: Sequence[Item]) -> None:
-        if (failure := next(failures, None)) is not None:
-            raise failure
-        write(items)
-
-    monkeypatch.setattr(store, "write", moody)
+    store.moody.failures = [MemoryError(), OSError("no such device")]
     mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
     journal.begin(mission)
     assert not await journal.stored(5)
     await until(lambda: not journal.failing)
     assert await journal.stored(5)
     assert store.missions() == ["test"]
-    journal.close(5)
+    assert await journal.close(5)
     store.close()
 
 
@@ -131,39 +140,17 @@ async def test_a_large_checkpoint_is_packed_beside_the_decisions(
     if thread == "MainThread":
         at_rest.set()
     monkeypatch.setattr("service.journal.pack", slowly)
-    journal.checkpoint(track, track.seq, {**mission.state_dict(), "learner": mission.learner.state_dict()})
+    journal.checkpoint(track, {**mission.state_dict(), "learner": mission.learner.state_dict()})
     # What happens while it is packed is on disk at once, and is not lost when the checkpoint comes after it.
     for step in range(1, 4):
         mission.observe(uav(step=step), step)
     assert await journal.stored(5)
     at_rest.set()
-    assert await asyncio.to_thread(journal.close, 5)
+    assert await journal.close(5)
     kept = store.load("test")
     assert kept is not None and kept.state is not None and len(kept.events) == 3
     assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
     assert threads == [thread]
-    store.close()
-
-
-async def test_an_older_checkpoint_never_takes_the_place_of_a_newer_one(tmp_path: Path) -> None:
-    store = Store(str(tmp_path / "m.db"))
-    journal = Journal(store, Metrics())
-    spec = MissionSpec(mode="value", scenario=Scenario(name="wide", sensors=1000))
-    mission = Mission("test", spec, Settings(mode="value"))
-    journal.begin(mission)
-    taken = []
-    for step in range(2):
-        mission.observe(uav(step=step), step)
-        track = journal.due(mission, 1)
-        assert track is not None
-        taken.append((track, track.seq, {**mission.state_dict(), "learner": mission.learner.state_dict()}))
-    # The newer one when the service ends, while the older one is being packed.
-    await asyncio.to_thread(journal.checkpoint, *taken[1])
-    journal.checkpoint(*taken[0])
-    assert await asyncio.to_thread(journal.close, 5)
-    kept = store.load("test")
-    assert kept is not None
-    assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
     store.close()
 
 
