@@ -190,14 +190,20 @@ class Engine:
         mission = await self.missions.get(request.mission_id)
         self.missions.refuse_if_failing("decision_id")
         result = self._outcomes.apply(mission, request)
-        self._outcomes.checkpoint(mission)
-        await self.kept("decision_id")
+        try:
+            await self.kept("decision_id")
+        finally:
+            self._checkpoint_later(mission)
         return FeedbackResponse(decision_id=request.decision_id, result=result)
 
     async def kept(self, field: str) -> None:
         """Wait until all that happened so far is on disk; raises ``Unavailable`` where it is not in time."""
         if not await self.keeper.stored(_STORE_S):
             raise Unavailable(field, "not on disk yet: send it again to be sure")
+
+    def _checkpoint_later(self, mission: Mission) -> None:
+        """Where one is due, when this turn of the loop has sent the answer."""
+        asyncio.get_running_loop().call_soon(self._outcomes.checkpoint, mission)
 
     async def _once(
         self,
@@ -220,8 +226,8 @@ class Engine:
             text = await mission.repeats.once(key, request.model_dump_json(), body, mission.record)
             answers = made or _ANSWERS.validate_json(text)
         began = time.perf_counter()
-        self._outcomes.checkpoint(mission)
         stored = await self.keeper.stored(min(_STORE_S, ends - began))
+        self._checkpoint_later(mission)
         waited = round((time.perf_counter() - began) * 1e3, 3)
         told = []
         for answer in answers:

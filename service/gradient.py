@@ -48,6 +48,8 @@ class Parameters(NamedTuple):
     out_bias: Array
 
 
+# A BLAS kernel may raise the flag though all it was asked for is finite; whether the gradient is, the caller sees.
+@np.errstate(invalid="ignore")
 def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters) -> float:
     """The loss ``(s_j - r)^2 + (u_v - r)^2`` of :meth:`Modules.loss`, and its gradient.
 

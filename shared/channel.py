@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -80,6 +80,12 @@ class Links:
 def channel_gain_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     """Channel gain in dB: minus the path loss."""
     return Links.at(distance_m, scenario).gain_db
+
+
+@lru_cache
+def best_gain_db(scenario: Scenario) -> float:
+    """Channel gain right above a sensor, dB."""
+    return float(channel_gain_db(0.0, scenario))
 
 
 def link_holds(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.bool_]:

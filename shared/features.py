@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, channel_gain_db
+from shared.channel import FloatArray, best_gain_db, channel_gain_db
 from shared.fleetplan import FleetBelief
 from shared.reach import Reach, distances_ahead
 from shared.scenario import Point, Scenario
@@ -61,7 +61,7 @@ class State:
         Preset ``paper``, d = 5: ``[b/E0, q/W, h normalised, delta/T, U]``. Preset ``reach``, d = 12: these and
         :meth:`Reach.sensor_features`.
         """
-        best = float(channel_gain_db(0.0, scenario))
+        best = best_gain_db(scenario)
         worst = -scenario.path_loss_limit_db
         columns = (
             self.battery / scenario.battery_j,

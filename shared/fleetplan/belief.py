@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray, packets_per_step
+from shared.channel import FloatArray, Links, packets_per_step
 from shared.scenario import Point, Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
@@ -140,7 +140,7 @@ class FleetBelief:
         """Packets that a step can move from a sensor to a UAV at this position; 0 of a sensor that nobody named."""
         metres = np.hypot(*(position - self.places[sensor]))
         # Most sensors are out of every reach, and what one transfer moves takes as long to reckon as what many do.
-        return int(packets_per_step(metres, self._scenario)) if metres <= self._scenario.radio_radius_m else 0
+        return int(Links.at(metres, self._scenario).packets) if metres <= self._scenario.radio_radius_m else 0
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
         """Subtract what a UAV collects in a step."""
