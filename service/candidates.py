@@ -17,7 +17,7 @@ import numpy as np
 
 from service.critic import Action
 from service.prompt import Prompt, Template, note_block
-from service.rows import Cells, Csv, cells
+from service.rows import FORMATS, Cells, cells
 from service.uncompressed import Uncompressed
 from shared.channel import FloatArray
 from shared.features import State
@@ -171,12 +171,12 @@ class Offer:
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
         text = []
-        for place, row in enumerate(shown[: template.rows]):
+        kept = shown[: template.rows]
+        for place, (row, known) in enumerate(zip(kept, cells(state, kept), strict=True)):
             speeds = velocities(reach, row, template.paces)
             letters = ascii_uppercase[place * template.paces :][: template.paces]
             for letter, velocity in zip(letters, speeds, strict=True):
                 labels[letter] = actions.setdefault((int(state.ids[row]), velocity), len(actions))
-            known = cells(state, row)
             text.append(f"{letters[0]}{known['queue']},{known['age']},{_span(speeds)}\n")
         return cls(list(actions), labels, "".join(text))
 
@@ -219,7 +219,7 @@ def velocities(reach: Reach, row: int, count: int) -> list[int]:
 
 
 def _whole(state: State) -> Uncompressed:
-    return Uncompressed(state, Csv().row)
+    return Uncompressed(state, FORMATS["csv"].row)
 
 
 def _list(uav: int, rows: str) -> str:

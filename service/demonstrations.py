@@ -92,7 +92,7 @@ def solved(spec: MissionSpec, features: Features, scenario: Scenario, weights: W
         if spec.prompt.order == "shuffled":
             rows = np.random.default_rng([spec.seed, number]).permutation(rows)
         if demonstration.sensor_id in state.ids[rows] and demonstration.velocity <= scenario.max_velocity:
-            shown = [cells(state, int(row)) for row in rows]
+            shown = cells(state, rows)
             found.append(Solved(shown, demonstration.sensor_id, demonstration.velocity))
         if len(found) == spec.prompt.demonstrations:
             break

@@ -129,7 +129,7 @@ class Template:
         return Prompt(
             static=self.static,
             experiences=(header if experiences else "") + "".join(experiences),
-            state=last + self._table([cells(state, row) for row in kept_rows]),
+            state=last + self._table(cells(state, kept_rows)),
             uncompressed=Uncompressed(state, self._format.row, last + self._format.header(full_columns(state))),
         )
 

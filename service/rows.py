@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from shared.features import State
@@ -42,12 +43,14 @@ def meanings(features: Features) -> str:
     return " ".join(f"{name}: {meaning}." for name, meaning in _meanings(features).items())
 
 
-def cells(state: State, row: int) -> dict[str, str]:
-    """One sensor of those kept.
+def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[str, str]]:
+    """The sensors kept, in this order.
 
     No battery: a sensor that cannot send is masked before, so that the LLM need not judge it.
     """
-    return {name: str(round(float(column[row]))) for name, column in _columns_of(state).items()}
+    columns, which = _columns_of(state), np.asarray(rows, dtype=np.int64)
+    texts = [[str(round(number)) for number in column[which].tolist()] for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*texts, strict=True)]
 
 
 def full_columns(state: State) -> dict[str, NDArray[Any]]:

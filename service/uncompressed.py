@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,21 +62,31 @@ class Uncompressed:
             if not longer.any():
                 break
             digits += longer & ~unknown
-        kinds = (np.where(unknown, 2, numbers < 0) * 3 ** np.arange(len(names))).sum(axis=1)
+        kinds = np.where(unknown, 2, numbers < 0) @ 3 ** np.arange(len(names))
         total = count(self.head) if self.head else 0
-        listed = kinds.tolist()
-        example = {kind: row for row, kind in enumerate(listed)}
-        for kind, often in Counter(listed).items():
-            row = example[kind]
-            cells = {}
-            for name, number, gone in zip(names, numbers[row].tolist(), unknown[row].tolist(), strict=True):
-                cells[name] = UNKNOWN if gone else f"-{_ANY}" if number < 0 else _ANY
-            total += often * (count(self.write(cells)) - int((~unknown[row]).sum()))
+        for kind, often in Counter(kinds.tolist()).items():
+            text, known = _example(self.write, names, kind)
+            total += often * (count(text) - known)
         return total + int(digits.sum())
 
-    def _numbers(self) -> tuple[list[str], NDArray[np.int64], NDArray[np.bool_]]:
+    def _numbers(self) -> tuple[tuple[str, ...], NDArray[np.int64], NDArray[np.bool_]]:
         """The columns' names, their whole numbers ``(J, C)``, and which of these only a beacon could have told."""
         columns = full_columns(self.state)
         told = np.array([name in ALWAYS_KNOWN for name in columns])
         numbers = np.rint(np.array(list(columns.values())).T).astype(np.int64)
-        return list(columns), numbers, ~self.state.heard[:, None] & ~told
+        return tuple(columns), numbers, ~self.state.heard[:, None] & ~told
+
+
+@lru_cache(maxsize=256)
+def _example(write: Callable[[Cells], str], names: tuple[str, ...], kind: int) -> tuple[str, int]:
+    """A row, and how many of its numbers are known.
+
+    Args:
+        kind: of each number a digit to the base 3, the first's last: 0, or 1 for a negative one, or 2 for an unknown.
+    """
+    cells, known = {}, 0
+    for name in names:
+        kind, sign = divmod(kind, 3)
+        cells[name] = (_ANY, f"-{_ANY}", UNKNOWN)[sign]
+        known += sign < 2
+    return write(cells), known

@@ -131,6 +131,6 @@ class View:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            seen=mission.template.unknown(sensor_id) if row is None else cells(self.state, row),
+            seen=mission.template.unknown(sensor_id) if row is None else cells(self.state, [row])[0],
             sample=sample,
         )
