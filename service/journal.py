@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import islice
 from typing import Any
 from zlib import crc32
 
@@ -32,7 +33,8 @@ _EVENTS = 256
 _SENSORS = 100
 # With so many sensors a checkpoint takes up to a second to pack.
 _LARGE = 1000
-_MOST_AT_ONCE = 1000
+# Changes to a commit, and bytes of checkpoints: networks of 10,000 sensors have megabytes each.
+_MOST_AT_ONCE, _MOST_BYTES = 1000, 16_000_000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
 # The longest that what nobody waits for stays unwritten.
 _LINGER_S = 0.25
@@ -220,10 +222,16 @@ class Journal:
 
     def _write(self) -> None:
         """Write what waits, unless some is being written: what is left follows when that has ended."""
-        if self._batch or not self._queue:
+        over = self._over is not None and self._over.done()
+        if self._batch or not self._queue or over:
             return
         self._stop_waiting()
-        self._batch = [self._queue[i] for i in range(min(len(self._queue), _MOST_AT_ONCE))]
+        packed = 0
+        for entry in islice(self._queue, _MOST_AT_ONCE):
+            self._batch.append(entry)
+            packed += len(entry[1].state) if isinstance(entry[1], Checkpoint) else 0
+            if packed > _MOST_BYTES:
+                break
         self._begun, self._last = time.perf_counter(), self._over is not None
         try:
             self._writer.write([change for _, change in self._batch], self._ended)

@@ -177,7 +177,7 @@ class ProcessWriter:
             return
         why = msgpack.unpackb(self._incoming[LENGTH.size : end])
         del self._incoming[:end]
-        self._frame = b""
+        self._frame, self._outgoing = b"", memoryview(b"")
         self._tell(None if why is None else WriteFailed(why))
 
     def _ended(self) -> None:

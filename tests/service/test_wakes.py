@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import subprocess
 import sys
 import threading
@@ -29,7 +30,7 @@ from service.writers import Done, WriteFailed, Writer
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome
 from tests.running import serving
-from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
+from tests.service.keeping import copy_of, fly, locked, running, same, settled, state, writers
 from tests.service.making import attended, uav
 from tests.service.stub_llm import StubLlm, wait_for
 
@@ -114,6 +115,47 @@ async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path) -> No
     assert await journal.stored(5)
     assert store.missions() == ["test"]
     assert await journal.close(5)
+    store.close()
+
+
+async def test_a_journal_that_is_closed_writes_no_more_and_starts_nothing(tmp_path: Path) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    journal = Journal(store, Metrics())
+    mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
+    journal.begin(mission)
+    assert await journal.close(5)
+    mission.observe(uav(step=0), 0)
+    assert not await journal.stored(0.2)
+    assert writers(os.getpid()) == []
+    kept = store.load("test")
+    assert kept is not None and kept.events == []
+    store.close()
+
+
+async def test_large_checkpoints_are_written_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.journal._MOST_BYTES", 50_000)
+    store = MoodyStore(str(tmp_path / "m.db"))
+    journal = Journal(store, Metrics())
+    most: list[int] = []
+    write = store.moody.write
+
+    def counted(changes: Sequence[Change], done: Done) -> None:
+        most.append(sum(isinstance(change, Checkpoint) for change in changes))
+        write(changes, done)
+
+    monkeypatch.setattr(store.moody, "write", counted)
+    for number in range(9):
+        mission = Mission(f"m{number}", MissionSpec(mode="value"), Settings(mode="value"))
+        journal.begin(mission)
+        mission.observe(uav(step=0), 0)
+        track = journal.due(mission, 1)
+        assert track is not None
+        state = {**mission.state_dict(), "learner": mission.learner.state_dict(), "more": b"x" * 20_000}
+        journal.checkpoint(track, state)
+    assert await journal.stored(5)
+    assert await journal.close(5)
+    assert sum(most) == 9
+    assert max(most) <= 3
     store.close()
 
 
