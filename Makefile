@@ -1,4 +1,4 @@
-# make install | demo | test | check | docs | bench | faults | fuzz | soak | compose | release | clean
+# make install | demo | test | test-long | check | docs | bench | faults | fuzz | soak | compose | release | clean
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
 # selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
@@ -11,13 +11,14 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
-.PHONY: help install demo test check docs bench faults fuzz soak compose release clean
+.PHONY: help install demo test test-long check docs bench faults fuzz soak compose release clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make install   a virtual environment in .venv with everything, and the embedded model"
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
-	@echo "make test      install, run the tests"
+	@echo "make test      install, run the tests: 5 minutes on 2 cores"
+	@echo "make test-long the tests that train, experiment, fly and measure for long"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      build the documentation into site/, to be read without a network"
 	@echo "make bench     how fast the edge and its LLM are, side by side with others: runs/*.json"
@@ -39,8 +40,13 @@ install: .venv/installed
 demo: install
 	$(BIN)/aicvds demo --out runs/demo
 
+PYTEST = $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
 test: install
-	$(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+test-long: install
+	$(PYTEST) -m long
 
 check: install
 	$(BIN)/ruff check .
