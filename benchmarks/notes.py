@@ -25,6 +25,7 @@ from service.compiler import understood
 from service.llm.answer import NoDecision
 from service.llm.servers import Servers
 from service.orders import BadOrders, number_of, read, shown
+from service.prompting.warm_up import warm_up
 from service.settings import Settings
 from shared.guidance import Guidance, Impossible
 from shared.scenario import SCENARIOS
@@ -57,7 +58,7 @@ class Understood:
 
 async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
     """The LLM's name and what was made of each note."""
-    upstream = Servers(Settings(mode="llm"))
+    upstream = Servers(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
     while upstream.status == "loading":
         await asyncio.sleep(0.2)

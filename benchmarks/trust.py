@@ -26,7 +26,6 @@ from rich.progress import track
 from service.app import create_app
 from service.asking import Asking, Word, by_action
 from service.candidates import Offer
-from service.critic import Action
 from service.engine import Engine
 from service.llm.servers import Servers
 from service.metrics import Metrics
@@ -66,7 +65,7 @@ class Echo(Asking):
 
     def __init__(self, llm: Servers, metrics: Metrics) -> None:
         super().__init__(llm, metrics, most=64)
-        self.answer: Action = (0, 0)
+        self.answer: tuple[int, int] = (0, 0)
 
     async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
         """Nearly sure of the velocity nearest to the answer's for its sensor; of the first letter without it."""

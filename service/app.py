@@ -21,6 +21,7 @@ from service.live import routes as live_routes
 from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.openapi import schema_of
+from service.prompting.warm_up import warm_up
 from service.routes import router
 from service.settings import Settings
 from service.store import Store
@@ -53,7 +54,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
         torch.set_num_threads(1)
         metrics = Metrics()
-        llm = Servers(settings, metrics.llm_breaker_opened.inc)
+        llm = Servers(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from service.candidates import Offer
-from service.critic import Action
 from service.guided import offered, template_of
 from service.llm.answer import NoDecision
 from service.llm.calibration import LabelReader
@@ -23,6 +22,7 @@ from service.metrics import Metrics
 from service.mission import Mission
 from service.prompt import Prompt
 from service.view import View
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Reason
 

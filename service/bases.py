@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from service.problems import Incomplete, Refused
+from service.errors import Incomplete, Refused
 from shared.channel import FloatArray
 from shared.wire import SensorColumns, UavState
 

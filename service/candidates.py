@@ -15,10 +15,10 @@ from typing import Self
 
 import numpy as np
 
-from service.critic import Action
 from service.prompt import Prompt, Template, note_block
 from service.rows import FORMATS, Cells, cells
 from service.uncompressed import Uncompressed
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State
 from shared.reach import Reach, distances_ahead
@@ -176,14 +176,14 @@ class Offer:
             speeds = velocities(reach, row, template.paces)
             letters = ascii_uppercase[place * template.paces :][: template.paces]
             for letter, velocity in zip(letters, speeds, strict=True):
-                labels[letter] = actions.setdefault((int(state.ids[row]), velocity), len(actions))
+                labels[letter] = actions.setdefault(Action(int(state.ids[row]), velocity), len(actions))
             text.append(f"{letters[0]}{known['queue']},{known['age']},{_span(speeds)}\n")
         return cls(list(actions), labels, "".join(text))
 
     def flown_as(self, velocity: Callable[[int, int], int]) -> Offer:
         """With other velocities, told by sensor and velocity; labels may come to name the same action."""
         actions: dict[Action, int] = {}
-        places = [actions.setdefault((s, velocity(s, v)), len(actions)) for s, v in self.actions]
+        places = [actions.setdefault(Action(s, velocity(s, v)), len(actions)) for s, v in self.actions]
         return Offer(list(actions), {label: places[i] for label, i in self.labels.items()}, self.rows)
 
     def with_actions(self, added: Sequence[Action]) -> Offer:

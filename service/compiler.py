@@ -14,11 +14,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from typing import Protocol
 
+from service.guidance import OperatorGuidance
 from service.llm.answer import NoDecision
 from service.llm.servers import Servers
-from service.mission import Mission
-from service.orders import BadOrders, read, shown
+from service.llm.upstream import Rewriting
+from service.orders import INSTRUCTION, BadOrders, constrain_orders, read, shown
 from shared.guidance import Guidance, Impossible
 from shared.scenario import Scenario
 
@@ -33,6 +35,22 @@ _TIMEOUT_S = 300.0
 _POLL_S = 0.2
 
 
+class NoteOwner(Protocol):
+    """A mission, as far as its operator's note goes."""
+
+    mission_id: str
+    scenario: Scenario
+    guidance: OperatorGuidance
+
+    def understand(self, guidance: Guidance, model: str | None) -> None:
+        """An LLM made this of the note."""
+        ...
+
+    def misunderstand(self, why: str, model: str | None) -> None:
+        """Nothing could be made of the note."""
+        ...
+
+
 class Compiler:
     """Compiles the notes of a service's missions, one after another."""
 
@@ -41,7 +59,7 @@ class Compiler:
         self._turn = asyncio.Lock()
         self._tasks: dict[int, asyncio.Task[None]] = {}
 
-    def compile(self, mission: Mission) -> None:
+    def compile(self, mission: NoteOwner) -> None:
         """Begin, unless the mission has no note or its note is compiled or being compiled."""
         key = id(mission.guidance)
         if mission.guidance.status != "compiling" or key in self._tasks:
@@ -57,7 +75,7 @@ class Compiler:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _compile(self, mission: Mission) -> None:
+    async def _compile(self, mission: NoteOwner) -> None:
         note = mission.guidance.note or ""
         try:
             async with asyncio.timeout(_TIMEOUT_S), self._turn:
@@ -91,13 +109,13 @@ async def understood(note: str, scenario: Scenario, llm: Servers) -> Guidance:
         Impossible: the same, where the first one asks for what the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
-    examples = shown(note)
+    wanted = Rewriting(INSTRUCTION, shown(note), note, lambda constraint: constrain_orders(constraint, note))
     faults: list[BadOrders | Impossible] = []
     begun = time.monotonic()
     for attempt in range(_ATTEMPTS):
         temperature = _TEMPERATURE if attempt else 0.0
         async with asyncio.timeout(_ANSWER_S):
-            text = await llm.ask_orders(note, examples, temperature=temperature, seed=attempt)
+            text = await llm.rewrite(wanted, temperature=temperature, seed=attempt)
         try:
             guidance = read(text, note)
             guidance.check(scenario)

@@ -18,14 +18,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
 from shared.reach import VELOCITY_BONUS
 from shared.scenario import Scenario
 from shared.urgency import urgency
-
-Action = tuple[int, int]
 
 # Losses past it do not count: where look-ahead leaves the UAVs is arbitrary. With four more steps in which nobody
 # comes, as the planner has them, the critic faulted a planner's action by 1.3 packets a decision and random ones by

@@ -16,6 +16,7 @@ from service import logs
 from service.asking import Asking, Word
 from service.choice import RESERVE_S, Choice, Turn
 from service.compiler import Compiler
+from service.errors import Unavailable
 from service.events import Counsel
 from service.guided import Deliberation
 from service.journal import Journal, Unkept
@@ -28,7 +29,6 @@ from service.mission import Mission
 from service.missions import Missions
 from service.outcomes import Outcomes
 from service.policy import decide_without_llm
-from service.problems import Unavailable
 from service.prompt import Prompt
 from service.settings import Settings, usable_cores
 from service.stopwatch import Stopwatch
@@ -38,6 +38,7 @@ from service.tracing import Traces
 from service.trust import LLM
 from service.verifier import verify
 from service.view import View
+from shared.actions import Action
 from shared.wire import (
     BatchRequest,
     DecideRequest,
@@ -88,6 +89,11 @@ class Engine:
         self.live = Live()
         self._outcomes = Outcomes(metrics, self.keeper, self.live)
         self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
+
+    def hurry(self) -> None:
+        """Closing time: who waits for the LLM does so for a few seconds more, and pages are told no more."""
+        self.asking.hurry()
+        self.live.close()
 
     async def close(self) -> bool:
         """Finish the lessons and the plan in hand, drop the plans that are queued, and write what is to be kept.
@@ -340,7 +346,7 @@ class Engine:
             self._metrics.llm_requests.labels(reason or "ok").inc()
         return Choice(sensor, velocity, reason, completion, completion.model if completion else None)
 
-    def _by_policy(self, mission: Mission, view: View) -> tuple[int, int]:
+    def _by_policy(self, mission: Mission, view: View) -> Action:
         """The plan's, or one step of look-ahead where there is no plan."""
         reserved = mission.reserved(view.step, view.uav_id)
         planned = mission.planner.action(view.uav_id, reserved) if mission.planner is not None else None
@@ -350,7 +356,7 @@ class Engine:
         if sensor in reserved:
             # Every sensor reported is taken: one that was not reported is worth a try, a taken one is not.
             sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
-        return sensor, velocity
+        return Action(sensor, velocity)
 
     async def _weigh(self, mission: Mission, view: View, deliberation: Deliberation, turn: Turn) -> Choice:
         """Mode ``guided``: the LLM's word weighed with the others' and with the critic, which thinks while it is asked.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from service.problems import Conflict, Refused
+from service.errors import Conflict, Refused
 from shared.guidance import NO_GUIDANCE, Guidance, GuidanceAnswer, GuidanceState, GuidanceStatus, Impossible
 from shared.scenario import Scenario
 

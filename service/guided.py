@@ -24,12 +24,13 @@ from typing import Self
 import numpy as np
 
 from service.candidates import GuidedTemplate, Offer
-from service.critic import Action, Judgement, Situation, judge
+from service.critic import Judgement, Situation, judge
 from service.experts import EXPERTS, SMOOTHING
 from service.mission import Mission
 from service.prompt import Prompt
 from service.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.view import View
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Guided, Weighed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -13,13 +14,13 @@ from service.bases import Bases, Told
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_weights
 from service.demonstrations import solved
+from service.errors import Conflict, NotFound, Refused
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
 from service.experiences import NEAREST, Experience, Experiences
 from service.gradient import Sample
 from service.guidance import OperatorGuidance
 from service.learner import Learner, Weights
 from service.planner import Planner, can_plan
-from service.problems import Conflict, NotFound, Refused
 from service.prompt import Template, note_block
 from service.repeats import Repeats
 from service.settings import Settings, prompt_tokens
@@ -33,6 +34,8 @@ from shared.missions import MissionStatus
 from shared.records import Records, take_report
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Belief, Features, MissionSpec, Mode, Outcome, Selection, UavState
+
+log = logging.getLogger(__name__)
 
 # An outcome comes with the UAV's next request, so a few steps of a fleet are plenty; what is older is forgotten.
 _PENDING_PER_UAV = 8
@@ -333,6 +336,14 @@ class Mission:
         for trust in self.trust.values():
             trust.settle(outcome.decision_id, outcome.cost)
         return sample
+
+    def learn(self, sample: Sample, cost: float) -> float | None:
+        """One lesson, and the loss before it; one that fails is told and left out: None."""
+        try:
+            return self.learner.update(sample, cost)
+        except Exception:
+            log.exception("mission %s: the learner failed on an outcome; decisions go on", self.mission_id)
+            return None
 
     def state_dict(self) -> dict[str, Any]:
         """All of it but the modules and their optimizer, as copies: another thread may write it down."""

@@ -10,10 +10,10 @@ from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.errors import Conflict, NotFound, Unavailable
 from service.journal import Journal, Unkept
 from service.metrics import Metrics
 from service.mission import Mission
-from service.problems import Conflict, NotFound, Unavailable
 from service.replaying import revived
 from service.settings import Settings
 from service.store import Store

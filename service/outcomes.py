@@ -10,12 +10,12 @@ from collections import deque
 from contextlib import suppress
 from typing import Literal, NamedTuple
 
+from service.errors import Conflict
 from service.gradient import Sample
 from service.journal import Journal, Unkept
 from service.live.watch import Live
 from service.metrics import Metrics
 from service.mission import Mission
-from service.problems import Conflict
 from shared.wire import Outcome
 
 log = logging.getLogger(__name__)
@@ -142,15 +142,6 @@ class Outcomes:
             await asyncio.sleep(0)
 
     def _learn(self, lesson: Lesson) -> None:
-        if (loss := learn(*lesson)) is not None:
+        if (loss := lesson.mission.learn(lesson.sample, lesson.cost)) is not None:
             self._metrics.learner_loss.set(loss)
             self._metrics.learner_update_loss.observe(loss)
-
-
-def learn(mission: Mission, sample: Sample, cost: float) -> float | None:
-    """One lesson, and the loss before it; one that fails is told and left out: None."""
-    try:
-        return mission.learner.update(sample, cost)
-    except Exception:
-        log.exception("mission %s: the learner failed on an outcome; decisions go on", mission.mission_id)
-        return None

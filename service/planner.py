@@ -8,6 +8,7 @@ from collections.abc import Collection
 from concurrent.futures import Executor
 from importlib.util import find_spec
 
+from shared.actions import Action
 from shared.fleetplan import FleetBelief, RecedingHorizon
 from shared.guidance import Guidance
 from shared.scenario import Scenario
@@ -67,7 +68,7 @@ class Planner:
                 return
             self._horizon.adopt(draft, best)
 
-    def action(self, uav: int, taken: Collection[int] = ()) -> tuple[int, int] | None:
+    def action(self, uav: int, taken: Collection[int] = ()) -> Action | None:
         """What the plan has a UAV do now: sensor and velocity.
 
         None without a plan of this step, where nothing is in reach, or where the sensor was given away meanwhile.
@@ -77,8 +78,8 @@ class Planner:
         if here is None or here.step != self._horizon.step or actions is None or not len(actions):
             return None
         sensor, velocity = actions[0].tolist()
-        return None if sensor < 0 or sensor in taken else (int(sensor), int(velocity))
+        return None if sensor < 0 or sensor in taken else Action(int(sensor), int(velocity))
 
-    def course(self) -> dict[int, list[tuple[int, int]]]:
+    def course(self) -> dict[int, list[Action]]:
         """The whole plan from this step on: by UAV, (sensor, velocity) a step; sensor -1 where nothing is in reach."""
-        return {uav: [(int(s), int(v)) for s, v in plan.tolist()] for uav, plan in self._horizon.plans.items()}
+        return {uav: [Action(int(s), int(v)) for s, v in plan.tolist()] for uav, plan in self._horizon.plans.items()}

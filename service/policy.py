@@ -7,6 +7,7 @@ from collections.abc import Collection
 import numpy as np
 
 from service.asked import Asked
+from shared.actions import Action
 from shared.features import State
 from shared.reach import Reach, distances_ahead
 from shared.scenario import Scenario
@@ -14,7 +15,7 @@ from shared.scenario import Scenario
 
 def decide_without_llm(
     state: State, uav: int, scenario: Scenario, reserved: Collection[int], asked: Asked | None = None
-) -> tuple[int, int]:
+) -> Action:
     """One step of look-ahead over every velocity and every sensor heard, free and with a battery.
 
     Maximises ``U_j min(q_j, packets movable from the new position) + 0.5 v``; a sensor out of reach from there is
@@ -36,4 +37,4 @@ def decide_without_llm(
     worth = reach.worth if asked is None else reach.worth + asked.worth
     worth = np.where(free, worth - 1e-9 * distance, -np.inf)
     level, row = np.unravel_index(int(worth.argmax()), worth.shape)
-    return int(state.ids[row]), int(level)
+    return Action(int(state.ids[row]), int(level))

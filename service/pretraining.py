@@ -15,9 +15,9 @@ from torch.nn import functional
 from service.checkpoint import initial_weights, save
 from service.examples import Batch, Choices, Example, replay
 from service.learner import Modules
-from service.pretrain import Pretrain
 from service.recall import recall, references, velocity_agreement, velocity_error
 from service.reward import Reward
+from service.training.options import Pretrain
 from shared.rollouts import read_rollouts
 
 

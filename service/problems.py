@@ -12,7 +12,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
-from shared.wire import INCOMPLETE, Problem
+from service.errors import Refused, Unavailable
+from shared.wire import Problem
 
 log = logging.getLogger(__name__)
 
@@ -24,42 +25,6 @@ CONTENT_TYPE = "application/problem+json"
 _MOST_NAME = 80
 # When to ask again what cannot be served now.
 _RETRY_S = 1
-
-
-class Refused(Exception):
-    """A request that cannot be served as it is; nothing was recorded for it."""
-
-    status = HTTPStatus.UNPROCESSABLE_ENTITY
-    type = "about:blank"
-
-    def __init__(self, field: str, detail: str) -> None:
-        super().__init__(f"{field}: {detail}")
-        self.field = field
-        self.detail = detail
-
-
-class NotFound(Refused):
-    """The request names something that the edge does not know."""
-
-    status = HTTPStatus.NOT_FOUND
-
-
-class Conflict(Refused):
-    """The request contradicts what is there."""
-
-    status = HTTPStatus.CONFLICT
-
-
-class Incomplete(Conflict):
-    """The request leaves out what the edge does not hold: to be sent again in full."""
-
-    type = INCOMPLETE
-
-
-class Unavailable(Refused):
-    """The request is right, and the edge cannot serve it now, or not for sure: to be sent again."""
-
-    status = HTTPStatus.SERVICE_UNAVAILABLE
 
 
 def problem_response(

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
-from service.problems import Refused, Unavailable
+from service.errors import Refused, Unavailable
 
 # Quotes within a text are escaped, so no text has this.
 _A_DECISION = '"decision_id":'

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from service.events import Decided, Event, Guided, Reported, Settled
 from service.mission import Mission
-from service.outcomes import learn
 from service.repeats import Answered
 from service.settings import Settings
 from service.store import Kept
@@ -37,7 +36,7 @@ def _play(mission: Mission, event: Event) -> None:
         case Settled(outcome, taught):
             sample = mission.apply(outcome, taught=taught)
             if sample is not None and taught:
-                learn(mission, sample, outcome.cost)
+                mission.learn(sample, outcome.cost)
         case Guided(state):
             mission.reinstate(state)
         case Answered():

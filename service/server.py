@@ -54,8 +54,7 @@ class Server(uvicorn.Server):
         """Answer who has connected, hurrying whoever waits for the LLM; then keep what is to be kept."""
         self._loading.give_up()
         if self._loading.app is not None:
-            self._loading.app.state.engine.asking.hurry()
-            self._loading.app.state.engine.live.close()
+            self._loading.app.state.engine.hurry()
         await self._close_the_door(sockets or [])
         await super().shutdown(sockets)
         # What uvicorn does after this is to say goodbye, and to raise the signal again.

@@ -13,11 +13,12 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.changes import Statements
-from service.events import Event, decode
+from service.events import Event
 from service.hold import DatabaseHold, FileHold, StoreUnusable
 from service.packing import unpack
 from service.schema import SCHEMA, checkpoints, journal, missions, terms
 from service.sqlite_writer import BUSY_MS, PRAGMAS
+from service.storage.event_codec import decode
 from service.writers import ProcessWriter, ThreadWriter, Writer
 from shared.wire import MissionSpec
 

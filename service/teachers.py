@@ -13,6 +13,7 @@ from service.mission import Mission
 from service.policy import decide_without_llm
 from service.settings import Settings
 from service.view import View
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State
 from shared.rollouts import Header, RolloutStep
@@ -21,20 +22,18 @@ from shared.wire import MissionSpec, Outcome, UavState
 
 # Given a recorded decision, the state as the edge saw it, the scenario and the sensors that are taken: a sensor and a
 # velocity, or None where it has no answer.
-Teacher = Callable[[RolloutStep, State, Scenario, Collection[int]], tuple[int, int] | None]
+Teacher = Callable[[RolloutStep, State, Scenario, Collection[int]], Action | None]
 
 
-def _look_ahead(
-    step: RolloutStep, state: State, scenario: Scenario, reserved: Collection[int]
-) -> tuple[int, int] | None:
+def _look_ahead(step: RolloutStep, state: State, scenario: Scenario, reserved: Collection[int]) -> Action | None:
     return decide_without_llm(state, step.request.uav_id, scenario, reserved)
 
 
 def _recorded(
     name: str, step: RolloutStep, state: State, scenario: Scenario, reserved: Collection[int]
-) -> tuple[int, int] | None:
+) -> Action | None:
     reference = step.reference
-    return (reference.sensor_id, reference.velocity) if reference and reference.teacher == name else None
+    return Action(reference.sensor_id, reference.velocity) if reference and reference.teacher == name else None
 
 
 TEACHERS: dict[str, Teacher] = {
@@ -76,7 +75,7 @@ def _collects(state: State, sensor_id: int, velocity: int) -> bool:
     return bool(state.admissible[row] and state.reach.packets[velocity, row] >= 1)
 
 
-def _demonstration(mission: Mission, uav: UavState, step: int, answer: tuple[int, int]) -> Demonstration:
+def _demonstration(mission: Mission, uav: UavState, step: int, answer: Action) -> Demonstration:
     columns = uav.sensors.model_dump()
     rounded = {name: [_rounded(value) for value in values] for name, values in columns.items()}
     report = {"uav_id": uav.uav_id, "position": [_rounded(x) for x in uav.position]}

@@ -16,6 +16,7 @@ from service.events import Pending
 from service.gradient import Sample
 from service.mission import Mission
 from service.rows import cells
+from shared.actions import Action
 from shared.features import State, augment
 from shared.wire import Candidate, UavState
 
@@ -94,7 +95,7 @@ class View:
             return []
         return mission.memory.nearest(self._features[[self._admissible.index(row) for row in self.rows]])
 
-    def by_value(self, mission: Mission) -> tuple[int, int]:
+    def by_value(self, mission: Mission) -> Action:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]
         approach = self.state.approach(row, mission.scenario)
@@ -102,7 +103,7 @@ class View:
         level = int(values.argmax())
         if self.asked is not None:
             level = self.asked.nearest(row, level)
-        return int(self.state.ids[row]), level
+        return Action(int(self.state.ids[row]), level)
 
     def values(self, mission: Mission) -> dict[int, NDArray[np.float32]]:
         """What the modules think of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v."""

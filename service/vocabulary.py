@@ -10,9 +10,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import tiktoken
-
-from service.packing import pack, unpack
 
 ENCODING = "o200k_base"
 # The name under which tiktoken caches the vocabulary (the SHA-1 of its address), and what it must hold.
@@ -53,7 +52,7 @@ def encoding(cache_dir: Path) -> tiktoken.Encoding:
         from tiktoken_ext.openai_public import o200k_base  # type: ignore[import-untyped]
 
         parts = o200k_base()
-        content = pack(parts)
+        content: bytes = msgpack.packb(parts)
         # A folder that cannot be written to costs time at the next start, no more.
         with suppress(OSError):
             _write(packed, hashlib.sha256(content).digest() + content)
@@ -68,7 +67,7 @@ def _unpacked(path: Path) -> dict[str, Any] | None:
         return None
     if hashlib.sha256(told[32:]).digest() != told[:32]:
         return None
-    parts: dict[str, Any] = unpack(told[32:])
+    parts: dict[str, Any] = msgpack.unpackb(told[32:], strict_map_key=False)
     return parts
 
 

@@ -14,9 +14,10 @@ from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
 from starlette.types import Message, Scope, Send
 
+from service.errors import NotFound
 from service.guard import STILL_KNOWN
 from service.live.watch import Live
-from service.problems import NotFound, documented
+from service.problems import documented
 from service.routes import TheEngine
 from shared.missions import DecisionPrompt, MissionLine, MissionList
 from shared.wire import DecisionId, MissionId, Reason

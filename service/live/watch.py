@@ -14,10 +14,10 @@ from collections import deque
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 
+from service.errors import Unavailable
 from service.live import picture
 from service.live.history import History
 from service.mission import Mission
-from service.problems import Unavailable
 from service.prompt import Prompt
 from shared.wire import DecideResponse, Outcome, UavState
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Sequence
 from typing import Any, Literal
 
+from shared.actions import Action
 from shared.wire import Reason
 
 Constraint = Literal["grammar", "structured_outputs", "json_schema", "none"]
@@ -83,7 +84,7 @@ def json_schema(sensor_ids: list[int], velocities: list[int]) -> dict[str, Any]:
     return {"type": "json_schema", "json_schema": {"name": "decision", "strict": True, "schema": schema}}
 
 
-def check_answer(text: str, sensor_ids: Collection[int], velocities: int) -> tuple[int, int]:
+def check_answer(text: str, sensor_ids: Collection[int], velocities: int) -> Action:
     """Sensor ID and velocity, from plain text or the JSON object of :func:`json_schema`.
 
     Raises:
@@ -94,7 +95,7 @@ def check_answer(text: str, sensor_ids: Collection[int], velocities: int) -> tup
         raise NoDecision("answer_sensor", repr(text[:80]))
     if not 0 <= velocity < velocities:
         raise NoDecision("answer_velocity", repr(text[:80]))
-    return sensor, velocity
+    return Action(sensor, velocity)
 
 
 def _two_integers(text: str) -> tuple[int, int]:

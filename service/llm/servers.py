@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from service.llm.answer import NoDecision
 from service.llm.completion import Completion
-from service.llm.upstream import LOST, Upstream
+from service.llm.upstream import LOST, Rewriting, Upstream, WarmUp
 from service.settings import Settings
 from shared.wire import Readiness
 
@@ -24,8 +24,8 @@ Ask = Callable[[Upstream], Coroutine[Any, Any, Completion]]
 class Servers:
     """The LLM servers of one edge, as one; ``on_open`` hears when one's circuit breaker opens."""
 
-    def __init__(self, settings: Settings, on_open: Callable[[], None] = lambda: None) -> None:
-        self._each = [Upstream(one, on_open) for one in settings.each_server()]
+    def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
+        self._each = [Upstream(one, warm_up, on_open) for one in settings.each_server()]
         self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None
 
     @property
@@ -95,9 +95,9 @@ class Servers:
         """As :meth:`Upstream.ask_labels`."""
         return await self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
 
-    async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
-        """As :meth:`Upstream.ask_orders`, of the present one."""
-        return await self.present.ask_orders(note, examples, temperature=temperature, seed=seed)
+    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
+        """As :meth:`Upstream.rewrite`, of the present one."""
+        return await self.present.rewrite(wanted, temperature=temperature, seed=seed)
 
     async def _first(self, ask: Ask, uavs: int = 1) -> Completion:
         """The first answer of those that are well, asked one after another; the first failure where there is none."""

@@ -11,17 +11,13 @@ from contextvars import Context
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from service.candidates import GuidedTemplate
 from service.llm.answer import Constraint, NoDecision, check_labels
 from service.llm.bodies import chat_body, draw_temperature, label_body, rewriting_body
 from service.llm.breaker import Breaker
 from service.llm.completion import Completion, NotUnderstood, Unreachable
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
-from service.orders import INSTRUCTION, constrain_orders
-from service.prompt import Template
 from service.settings import Settings
-from shared.scenario import SCENARIOS
 from shared.wire import Readiness, Reason
 
 if TYPE_CHECKING:
@@ -53,6 +49,31 @@ class _Status:
     left_alone: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class Rewriting:
+    """A text to be rewritten, after worked examples of texts and what became of them.
+
+    ``constrain`` gives the request fields that hold a server to the form of the answer, by what it obeys.
+    """
+
+    instruction: str
+    examples: Sequence[tuple[str, str]]
+    text: str
+    constrain: Callable[[Constraint], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUp:
+    """A first question, so that the server has read the static block before a decision pays for it.
+
+    ``labels`` are what it is answered by; None where it is answered by a sensor and a velocity.
+    """
+
+    static: str
+    user: str
+    labels: list[str] | None
+
+
 class Upstream:
     """Brings the LLM up in the background and keeps trying while a remote one is down.
 
@@ -61,8 +82,9 @@ class Upstream:
     again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.breaker`; ``on_open`` hears of it.
     """
 
-    def __init__(self, settings: Settings, on_open: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
         self._settings = settings
+        self._warm_up = warm_up
         self._on_open = on_open
         self._breaker = Breaker()
         self._answered_at = self._counted_at = -math.inf
@@ -144,17 +166,17 @@ class Upstream:
             return answer
         return replace(answer, places=tuple(place.untempered(temperature) for place in answer.places))
 
-    async def ask_orders(self, note: str, examples: Sequence[tuple[str, str]], *, temperature: float, seed: int) -> str:
-        """An operator's note as orders that it allows, where the server can be held to them.
+    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
+        """A text rewritten as told, in a form that the server is held to where it can be.
 
         The embedded model has one slot: a decision that asks it meanwhile goes first, a few times.
 
         Raises:
-            BadOrders: the note has nothing to ask about.
+            ValueError: ``wanted.constrain`` finds nothing to ask about.
             NoDecision: no answer, with the reason.
         """
-        held = constrain_orders(self.constraint, note)
-        body = rewriting_body(self.model, INSTRUCTION, examples, note, held, temperature, seed)
+        held = wanted.constrain(self.constraint)
+        body = rewriting_body(self.model, wanted.instruction, wanted.examples, wanted.text, held, temperature, seed)
         for _ in range(_STEPS_BACK if self._embedded is not None else 0):
             await self._silence()
             self._beside = asyncio.create_task(self._ask(body), name="ask-beside")
@@ -297,14 +319,10 @@ class Upstream:
         return self._client
 
     def _first_body(self) -> dict[str, Any]:
-        """A question under the static block of a mission that nobody has set otherwise."""
-        settings, paper = self._settings, SCENARIOS["paper"]
-        if settings.mode == "guided":
-            guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
-            text = guided.content_free()[0]
-            return label_body(self.model, guided.static, text, self.constraint, [guided.labels], self.logprobs)
-        template = Template(paper, experiences=settings.experiences)
-        return chat_body(self.model, template.static, "0,50,-90,1,100\n", self.constraint, [0], 15)
+        first = self._warm_up
+        if first.labels is None:
+            return chat_body(self.model, first.static, first.user, self.constraint, [0], 15)
+        return label_body(self.model, first.static, first.user, self.constraint, [first.labels], self.logprobs)
 
     async def _probe(self, client: LLMClient) -> Constraint:
         """The first way of constraining that the server really obeys: it may ignore an unknown field silently."""

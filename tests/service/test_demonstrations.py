@@ -7,9 +7,10 @@ import pytest
 
 from service.demonstrate import main
 from service.demonstrations import packaged
+from service.errors import Refused
 from service.policy import decide_without_llm
-from service.problems import Refused
 from service.teachers import TEACHERS, farthest_first, likeness, solutions
+from shared.actions import Action
 from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS, Scenario
@@ -126,10 +127,10 @@ def test_a_demonstration_shows_the_reference_that_was_recorded() -> None:
 def test_any_teacher_may_solve_them() -> None:
     asked: list[tuple[int, int]] = []
 
-    def fullest(step: RolloutStep, state: State, scenario: Scenario, reserved: object) -> tuple[int, int]:
+    def fullest(step: RolloutStep, state: State, scenario: Scenario, reserved: object) -> Action:
         row = int(np.argmax(np.where(state.admissible, state.queue, -1)))
         asked.append((step.request.uav_id, scenario.sensors))
-        return int(state.ids[row]), 3
+        return Action(int(state.ids[row]), 3)
 
     found = list(solutions(HEADER, explore(PAPER, 0), fullest))
     assert 0 < len(found) <= len(asked) <= 90

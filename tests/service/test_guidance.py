@@ -16,11 +16,13 @@ from service.candidates import GuidedTemplate
 from service.critic import Situation, judge
 from service.guided import Deliberation
 from service.llm.completion import Completion
-from service.llm.upstream import Upstream
+from service.llm.upstream import Rewriting, Upstream, WarmUp
 from service.mission import Mission
+from service.orders import INSTRUCTION, constrain_orders
 from service.policy import decide_without_llm
 from service.prompt import Template
 from service.settings import Settings
+from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import MissionSpec
 from tests.running import serving
@@ -33,6 +35,7 @@ Edge = Callable[..., httpx.Client]
 
 NOTE = "Suspected leak at sensor 3: visit it every third step."
 ORDERS = "visit sensor 3 every 3 steps"
+REWRITING = Rewriting(INSTRUCTION, [], NOTE, lambda constraint: constrain_orders(constraint, NOTE))
 # Numbers of its own: 3 occurs twice in the note that it is given with.
 OWN = {"sensors": [{"sensor_id": 1, "weight": 4.0, "visit_every": 2}], "max_velocity": 5, "forbidden_velocities": [0]}
 
@@ -294,7 +297,7 @@ def test_the_critic_counts_what_the_operator_asks(asked: dict[str, Any]) -> None
     made.observe(uav(queue=[55.0, 59.0]), 0)
 
     def lost(guidance: Guidance) -> NDArray[np.float64]:
-        return judge(Situation.of(made.belief, PAPER, 0, 0, guidance=guidance), [(0, 0), (1, 0)]).lost
+        return judge(Situation.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
 
     before, after = lost(Guidance()), lost(Guidance(sensors=[SensorWish.model_validate({"sensor_id": 0, **asked})]))
     assert before[0] > before[1] and after[0] < after[1]
@@ -320,7 +323,7 @@ def test_an_overdue_sensor_out_of_reach_is_not_waited_for() -> None:
 
 async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.llm.upstream._SILENCE_S", 0.0)
-    upstream = Upstream(Settings(mode="llm"))
+    upstream = Upstream(Settings(mode="llm"), WarmUp("", "", None))
     running: list[str] = []
     finished: list[str] = []
 
@@ -333,7 +336,7 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
 
     upstream._ask = ask  # type: ignore[method-assign]
     upstream._embedded = object()  # type: ignore[assignment]
-    note = asyncio.create_task(upstream.ask_orders(NOTE, [], temperature=0.0, seed=0))
+    note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     await asyncio.sleep(0.01)
     await upstream.ask("static", "user", [0], 15)
     assert finished == ["decision"]
@@ -343,7 +346,7 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
 
 async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.llm.upstream._SILENCE_S", 0.0)
-    upstream = Upstream(Settings(mode="llm"))
+    upstream = Upstream(Settings(mode="llm"), WarmUp("", "", None))
     given_up = 0
 
     async def ask(body: dict[str, Any]) -> Completion:
@@ -358,7 +361,7 @@ async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.Mon
 
     upstream._ask = ask  # type: ignore[method-assign]
     upstream._embedded = object()  # type: ignore[assignment]
-    note = asyncio.create_task(upstream.ask_orders(NOTE, [], temperature=0.0, seed=0))
+    note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     while not note.done():
         await asyncio.sleep(0.005)
         await upstream.ask("static", "user", [0], 15)

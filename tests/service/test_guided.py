@@ -22,6 +22,7 @@ from service.mission import Mission
 from service.settings import Settings
 from service.trust import LLM
 from service.view import View
+from shared.actions import Action
 from shared.reach import Reach
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
@@ -160,7 +161,7 @@ def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None
     state.sensors.y[0] = float(start[1])
     mission.observe(state, 0)
     situation = Situation.of(mission.belief, PAPER, 0, 0)
-    judged = judge(situation, [(0, 0), (1, 0)])
+    judged = judge(situation, [Action(0, 0), Action(1, 0)])
     assert judged.lost[1] > judged.lost[0] + 1
     # Sensor 1 was never reported: nothing can be collected from it.
     assert judged.cost[1] >= 1.0 > judged.cost[0]
@@ -174,13 +175,14 @@ def test_a_plan_is_judged_by_its_own_continuation_and_never_below_look_ahead() -
     state.sensors.y[:] = places[:, 1].tolist()
     mission.observe(state, 0)
 
-    def lost(course: list[tuple[int, int]] | None) -> float:
+    def lost(course: list[Action] | None) -> float:
         plan = None if course is None else {0: course}
-        return float(judge(Situation.of(mission.belief, PAPER, 0, 0, course=plan), [(0, 0)]).lost[0])
+        return float(judge(Situation.of(mission.belief, PAPER, 0, 0, course=plan), [Action(0, 0)]).lost[0])
 
-    dwells = [(0, 0), (2, 0), (0, 0), (2, 0), (2, 14), (0, 14), (0, 7), (2, 14)]
+    pairs = [(0, 0), (2, 0), (0, 0), (2, 0), (2, 14), (0, 14), (0, 7), (2, 14)]
+    dwells = [Action(*pair) for pair in pairs]
     assert lost(dwells) < lost(None) - 1.0
-    assert lost([(0, 0)] * 8) == lost(None)
+    assert lost([Action(0, 0)] * 8) == lost(None)
 
 
 def test_a_sensor_never_heard_may_hold_anything_that_the_world_draws() -> None:
@@ -191,7 +193,7 @@ def test_a_sensor_never_heard_may_hold_anything_that_the_world_draws() -> None:
     assert situation.unknown.tolist() == [False, True]
 
 
-def planned(mission: Mission, view: View) -> tuple[int, int]:
+def planned(mission: Mission, view: View) -> Action:
     """Let the mission's planner plan."""
     assert mission.planner is not None
     with ThreadPoolExecutor(1) as beside:

@@ -16,7 +16,7 @@ import httpx
 import psutil
 import pytest
 
-from service.events import Settled, decode, encode
+from service.events import Settled
 from service.keys import editing
 from service.live.history import History
 from service.live.routes import STATIC
@@ -24,6 +24,7 @@ from service.live.watch import MOST_LISTENERS
 from service.packing import pack
 from service.prompt import Prompt
 from service.rows import FORMATS
+from service.storage.event_codec import decode, encode
 from service.uncompressed import Uncompressed
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge

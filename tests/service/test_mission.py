@@ -1,7 +1,7 @@
 import pytest
 
+from service.errors import Conflict, NotFound
 from service.mission import Mission
-from service.problems import Conflict, NotFound
 from shared.wire import Outcome
 from tests.service.making import attended, mission, uav
 

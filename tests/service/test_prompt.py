@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 import pytest
 
-from service.problems import Refused
+from service.errors import Refused
 from service.prompt import Prompt, Template
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, Outcome, PromptStyle

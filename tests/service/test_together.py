@@ -21,6 +21,7 @@ from service.prompt import Prompt
 from service.rows import FORMATS
 from service.uncompressed import Uncompressed
 from service.view import View
+from shared.actions import Action
 from tests.running import serving
 from tests.service.making import PAPER, attended, mission, uav
 from tests.service.stub_llm import PROBE, StubLlm, said, wait_for
@@ -212,11 +213,13 @@ def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
 def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     """A velocity forbidden meanwhile counts as the nearest that is offered; of sensors given away nothing is left."""
     prompt = Prompt("", "", "", Uncompressed(attended(mission(), uav()).state, FORMATS["csv"].row))
-    word = Word(prompt, {(1, 9): 0.3, (1, 2): 0.1, (4, 7): 0.6}, None, None, calibrated=False, model=None)
-    told = word.of([(1, 3), (1, 7), (2, 7)])
-    assert told is not None
-    assert told.tolist() == pytest.approx([0.25, 0.75, 0.0])
-    assert word.of([(2, 7), (3, 7)]) is None
+    word = Word(
+        prompt, {Action(1, 9): 0.3, Action(1, 2): 0.1, Action(4, 7): 0.6}, None, None, calibrated=False, model=None
+    )
+    left = word.of([Action(1, 3), Action(1, 7), Action(2, 7)])
+    assert left is not None
+    assert left.tolist() == pytest.approx([0.25, 0.75, 0.0])
+    assert word.of([Action(2, 7), Action(3, 7)]) is None
 
 
 def test_what_all_asked_for_is_told_as_given_away(edge: Edge, report: Report) -> None:

@@ -17,11 +17,11 @@ import pytest
 
 from service import outcomes
 from service.changes import Change, Checkpoint, Entry
+from service.errors import Refused, Unavailable
 from service.journal import Journal
 from service.metrics import Metrics
 from service.mission import Mission
 from service.packing import pack
-from service.problems import Refused, Unavailable
 from service.repeats import Repeats
 from service.replaying import revived
 from service.settings import Settings
@@ -289,7 +289,7 @@ def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeyp
         raise RuntimeError("not today")
 
     monkeypatch.setattr(mission.learner, "update", broken)
-    outcomes.learn(mission, sample, 0.5)
+    assert mission.learn(sample, 0.5) is None
 
 
 async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again() -> None:

@@ -1,0 +1,19 @@
+"""The first question to an LLM server, under the static block that a mission has unless its maker says otherwise."""
+
+from __future__ import annotations
+
+from service.candidates import GuidedTemplate
+from service.llm.upstream import WarmUp
+from service.prompt import Template
+from service.settings import Settings
+from shared.scenario import SCENARIOS
+
+
+def warm_up(settings: Settings) -> WarmUp:
+    """The question in the service's mode."""
+    paper = SCENARIOS["paper"]
+    if settings.mode == "guided":
+        guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
+        return WarmUp(guided.static, guided.content_free()[0], guided.labels)
+    template = Template(paper, experiences=settings.experiences)
+    return WarmUp(template.static, "0,50,-90,1,100\n", None)
