@@ -14,12 +14,14 @@ from typing import Any
 from paper_template import EXPERIENCES, Newest, PaperTemplate
 
 from service.candidates import GuidedTemplate, Offer
+from service.config.settings import (
+    Settings,
+)
 from service.critic import Situation
 from service.guided import offered
 from service.llm.bodies import chat_body, label_body
 from service.mission import Mission
 from service.prompt import Prompt
-from service.settings import Settings
 from service.view import View
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle

@@ -10,10 +10,12 @@ from typing import Any, Self
 
 import httpx
 
+from service.config.settings import (
+    Settings,
+)
 from service.llm.embedded import EmbeddedServer
 from service.model import embedded_model
 from service.prompt import Prompt
-from service.settings import Settings
 
 # Of a call that may take longer, only that it took so long is known.
 LIMIT_S = 120.0

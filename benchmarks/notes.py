@@ -22,11 +22,13 @@ from rich.console import Console
 from rich.table import Table
 
 from service.compiler import understood
+from service.config.settings import (
+    Settings,
+)
 from service.llm.answer import NoDecision
 from service.llm.servers import Servers
 from service.orders import BadOrders, number_of, read, shown
 from service.prompting.warm_up import warm_up
-from service.settings import Settings
 from shared.guidance import Guidance, Impossible
 from shared.scenario import SCENARIOS
 

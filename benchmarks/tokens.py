@@ -34,9 +34,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from service.config.settings import (
+    Settings,
+)
 from service.critic import judge
 from service.llm.answer import NoDecision, check_answer
-from service.settings import Settings
 from service.tokens import TokenCounter
 from shared.actions import Action
 from shared.scenario import Scenario, scenario_named

@@ -26,12 +26,14 @@ from rich.progress import track
 from service.app import create_app
 from service.asking import Asking, Word, by_action
 from service.candidates import Offer
+from service.config.settings import (
+    Settings,
+)
 from service.engine import Engine
 from service.llm.servers import Servers
 from service.metrics import Metrics
 from service.mission import Mission
 from service.prompt import Prompt
-from service.settings import Settings
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient

@@ -12,6 +12,9 @@ import torch
 from fastapi import FastAPI
 
 from service import problems
+from service.config.settings import (
+    Settings,
+)
 from service.engine import Engine
 from service.guard import Guard
 from service.headers import CarefulHeaders
@@ -23,7 +26,6 @@ from service.metrics import Metrics
 from service.openapi import schema_of
 from service.prompting.warm_up import warm_up
 from service.routes import router
-from service.settings import Settings
 from service.store import Store
 from service.tokens import TokenCounter
 from service.tracing import Traced, Traces, provider_from_environment

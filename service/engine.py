@@ -16,6 +16,12 @@ from service import logs
 from service.asking import Asking, Word
 from service.choice import RESERVE_S, Choice, Turn
 from service.compiler import Compiler
+from service.config.cores import (
+    usable_cores,
+)
+from service.config.settings import (
+    Settings,
+)
 from service.errors import Unavailable
 from service.events import Counsel
 from service.guided import Deliberation
@@ -30,7 +36,6 @@ from service.missions import Missions
 from service.outcomes import Outcomes
 from service.policy import decide_without_llm
 from service.prompt import Prompt
-from service.settings import Settings, usable_cores
 from service.stopwatch import Stopwatch
 from service.store import Store
 from service.tokens import TokenCounter, with_usage

@@ -11,11 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from service.config.settings import (
+    Settings,
+)
 from service.gradient import Sample
 from service.mission import Mission
 from service.policy import decide_without_llm
 from service.reward import Reward, Speed
-from service.settings import Settings
 from service.view import View
 from shared.features import State
 from shared.reach import Reach, distances_ahead

@@ -13,6 +13,12 @@ from service.applied import Applied
 from service.bases import Bases, Told
 from service.candidates import GuidedTemplate
 from service.checkpoint import initial_weights
+from service.config.prompt_budget import (
+    prompt_tokens,
+)
+from service.config.settings import (
+    Settings,
+)
 from service.demonstrations import solved
 from service.errors import Conflict, NotFound, Refused
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
@@ -23,7 +29,6 @@ from service.learner import Learner, Weights
 from service.planner import Planner, can_plan
 from service.prompt import Template, note_block
 from service.repeats import Repeats
-from service.settings import Settings, prompt_tokens
 from service.spec import in_full, required
 from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.turns import STEPS_APART, Given, Turns

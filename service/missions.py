@@ -10,12 +10,14 @@ from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.config.settings import (
+    Settings,
+)
 from service.errors import Conflict, NotFound, Unavailable
 from service.journal import Journal, Unkept
 from service.metrics import Metrics
 from service.mission import Mission
 from service.replaying import revived
-from service.settings import Settings
 from service.store import Store
 from shared.wire import BatchRequest, DecideRequest, MissionSpec
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from service.config.settings import (
+    Settings,
+)
 from service.events import Decided, Event, Guided, Reported, Settled
 from service.mission import Mission
 from service.repeats import Answered
-from service.settings import Settings
 from service.store import Kept
 
 

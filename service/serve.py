@@ -16,7 +16,9 @@ from pydantic import ValidationError
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from service.settings import Settings
+    from service.config.settings import (
+        Settings,
+    )
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,10 @@ def main(argv: list[str]) -> int:
 
 def _serve(listener: socket.socket, host: str) -> int:
     from service.allocator import hand_back_memory
-    from service.settings import Settings, unknown_variables
+    from service.config.settings import (
+        Settings,
+        unknown_variables,
+    )
 
     hand_back_memory()
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from service.settings import Settings
+from service.config.settings import (
+    Settings,
+)
 from shared.wire import MissionSpec
 
 T = TypeVar("T")

@@ -8,10 +8,12 @@ from itertools import groupby
 
 import numpy as np
 
+from service.config.settings import (
+    Settings,
+)
 from service.demonstrations import Demonstration
 from service.mission import Mission
 from service.policy import decide_without_llm
-from service.settings import Settings
 from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray

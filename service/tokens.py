@@ -5,9 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from service.config.settings import (
+    Settings,
+)
 from service.llm.completion import Completion
 from service.prompt import Prompt
-from service.settings import Settings
 from service.vocabulary import ENCODING, encoding
 from shared.wire import Tokens
 

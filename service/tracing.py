@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.settings import Settings
+from service.config.settings import (
+    Settings,
+)
 from shared.wire import DecideResponse
 
 if TYPE_CHECKING:

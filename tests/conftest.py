@@ -14,7 +14,9 @@ import httpx
 import pytest
 
 from service.app import create_app
-from service.settings import Settings
+from service.config.settings import (
+    Settings,
+)
 from service.store import Store
 from tests.running import serving
 

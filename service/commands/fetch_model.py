@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from service.config.settings import (
+    Settings,
+)
 from service.model import GGUF_NAME, PACKAGE, FetchFailed, fetch_model
-from service.settings import Settings
 
 _HELP = """usage: aicvds model fetch
 

@@ -12,10 +12,12 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
+from service.config.settings import (
+    Settings,
+)
 from service.llm.answer import NoDecision
 from service.llm.completion import Completion
 from service.llm.upstream import LOST, Rewriting, Upstream, WarmUp
-from service.settings import Settings
 from shared.wire import Readiness
 
 Ask = Callable[[Upstream], Coroutine[Any, Any, Completion]]

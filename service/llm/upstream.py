@@ -11,13 +11,15 @@ from contextvars import Context
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+from service.config.settings import (
+    Settings,
+)
 from service.llm.answer import Constraint, NoDecision, check_labels
 from service.llm.bodies import chat_body, draw_temperature, label_body, rewriting_body
 from service.llm.breaker import Breaker
 from service.llm.completion import Completion, NotUnderstood, Unreachable
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.model import ModelMissing, embedded_model
-from service.settings import Settings
 from shared.wire import Readiness, Reason
 
 if TYPE_CHECKING:

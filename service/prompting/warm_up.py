@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from service.candidates import GuidedTemplate
+from service.config.settings import (
+    Settings,
+)
 from service.llm.upstream import WarmUp
 from service.prompt import Template
-from service.settings import Settings
 from shared.scenario import SCENARIOS
 
 

@@ -17,8 +17,10 @@ import httpx
 import pytest
 
 from service.app import create_app
+from service.config.settings import (
+    Settings,
+)
 from service.journal import Journal
-from service.settings import Settings
 from service.store import Store
 from tests.e2e.processes import serving_edge
 from tests.faults.fleet import UAVS, Report

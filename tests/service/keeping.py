@@ -17,9 +17,11 @@ import psutil
 
 from service.app import create_app
 from service.changes import Change
+from service.config.settings import (
+    Settings,
+)
 from service.engine import Engine
 from service.mission import Mission
-from service.settings import Settings
 from service.store import Store
 from service.writers import Writer
 from tests.running import serving

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from service.config.settings import (
+    Settings,
+)
 from service.mission import Mission
-from service.settings import Settings
 from service.view import View
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, SensorColumns, UavState

@@ -8,9 +8,11 @@ from typing import Any
 import httpx
 import pytest
 
+from service.config.cores import (
+    usable_cores,
+)
 from service.critic import Judgement
 from service.guided import Deliberation
-from service.settings import usable_cores
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, wait_for
 

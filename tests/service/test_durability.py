@@ -16,8 +16,10 @@ import httpx
 import pytest
 
 from service import journal
+from service.config.settings import (
+    Settings,
+)
 from service.replaying import revived
-from service.settings import Settings
 from service.store import Store
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
 

@@ -9,7 +9,12 @@ import httpx
 import pytest
 
 from service.app import create_app
-from service.settings import Settings, usable_cores
+from service.config.cores import (
+    usable_cores,
+)
+from service.config.settings import (
+    Settings,
+)
 from tests.running import serving
 from tests.service.stub_llm import wait_for
 

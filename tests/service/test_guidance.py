@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 from service.asked import Asked
 from service.candidates import GuidedTemplate
+from service.config.settings import (
+    Settings,
+)
 from service.critic import Situation, judge
 from service.guided import Deliberation
 from service.llm.completion import Completion
@@ -21,7 +24,6 @@ from service.mission import Mission
 from service.orders import INSTRUCTION, constrain_orders
 from service.policy import decide_without_llm
 from service.prompt import Template
-from service.settings import Settings
 from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import MissionSpec

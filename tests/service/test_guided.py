@@ -13,13 +13,15 @@ import pytest
 from fastapi.responses import Response
 
 from service.candidates import GuidedTemplate, velocities
+from service.config.settings import (
+    Settings,
+)
 from service.critic import Judgement, Situation, judge
 from service.guided import Deliberation
 from service.llm.answer import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
 from service.mission import Mission
-from service.settings import Settings
 from service.trust import LLM
 from service.view import View
 from shared.actions import Action

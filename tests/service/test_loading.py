@@ -16,8 +16,10 @@ import pytest
 from fastapi import FastAPI
 
 from service.app import create_app
+from service.config.settings import (
+    Settings,
+)
 from service.loading import Loading
-from service.settings import Settings
 from tests.running import serving
 
 
@@ -105,7 +107,7 @@ def test_nothing_slow_is_imported_before_the_first_answer() -> None:
         [
             sys.executable,
             "-c",
-            "import sys, uvicorn, service.serve, service.settings, service.logs, service.loading\n"
+            "import sys, uvicorn, service.serve, service.config.settings, service.logs, service.loading\n"
             f"print([name for name in {slow} if name in sys.modules])",
         ],
         capture_output=True,

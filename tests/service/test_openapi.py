@@ -10,8 +10,10 @@ import jsonschema_rs
 import pytest
 
 from service.app import create_app
+from service.config.settings import (
+    Settings,
+)
 from service.openapi import ANSWERS, DECISION_ID, REQUESTS
-from service.settings import Settings
 from tests.e2e.processes import serving_edge
 
 DOCUMENT = create_app(Settings(mode="value")).openapi()

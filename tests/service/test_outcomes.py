@@ -10,13 +10,15 @@ from typing import Any
 
 import httpx
 
+from service.config.settings import (
+    Settings,
+)
 from service.engine import Engine
 from service.journal import Unkept
 from service.live.watch import Live
 from service.metrics import Metrics
 from service.mission import Mission
 from service.outcomes import Outcomes
-from service.settings import Settings
 from shared.wire import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state
 from tests.service.making import attended, uav

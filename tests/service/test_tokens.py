@@ -5,8 +5,10 @@ from typing import get_args
 
 import pytest
 
+from service.config.settings import (
+    Settings,
+)
 from service.rows import FORMATS
-from service.settings import Settings
 from service.tokens import TokenCounter, price_usd
 from service.uncompressed import Uncompressed
 from service.vocabulary import VocabularyDamaged, encoding, ensure_vocabulary

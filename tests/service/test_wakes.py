@@ -17,6 +17,9 @@ import pytest
 
 from service import outcomes
 from service.changes import Change, Checkpoint, Entry
+from service.config.settings import (
+    Settings,
+)
 from service.errors import Refused, Unavailable
 from service.journal import Journal
 from service.metrics import Metrics
@@ -24,7 +27,6 @@ from service.mission import Mission
 from service.packing import pack
 from service.repeats import Repeats
 from service.replaying import revived
-from service.settings import Settings
 from service.store import Kept, Store
 from service.writers import Done, WriteFailed, Writer
 from shared.scenario import Scenario

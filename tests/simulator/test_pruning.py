@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from service.attention import top_k
+from service.config.settings import (
+    Settings,
+)
 from service.mission import Mission
 from service.onboard import attention_of
-from service.settings import Settings
 from shared.features import FEATURES
 from shared.missions import MissionAttention
 from shared.scenario import SCENARIOS

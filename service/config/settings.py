@@ -9,30 +9,9 @@ from typing import Literal, Self
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from shared.wire import Features, Mode, Selection
-
-# Upper bounds in the embedded model's tokens, which has one for each digit: of the static block, and of a row or an
-# experience in each format.
-_STATIC_TOKENS = 400
-_ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56}
-# The two more columns of feature preset `reach`.
-_REACH_TOKENS = 16
-
-
-def prompt_tokens(
-    row_format: Literal["csv", "json", "markdown"],
-    rows: int,
-    experiences: int,
-    features: Features = "paper",
-    demonstrations: str = "",
-) -> int:
-    """Upper bound of a prompt's length in the embedded model's tokens.
-
-    Args:
-        demonstrations: their text, whose characters are all ASCII: no tokenizer makes more tokens of it.
-    """
-    row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
-    return _STATIC_TOKENS + row * (rows + experiences) + len(demonstrations)
+from service.config.cores import usable_cores
+from service.config.prompt_budget import prompt_tokens
+from shared.wire import Mode, Selection
 
 
 def _default_cache() -> Path:
@@ -42,20 +21,6 @@ def _default_cache() -> Path:
 def _default_store() -> str:
     home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
     return str(home / "aicvds" / "missions.db")
-
-
-def usable_cores(cpu_max: Path = Path("/sys/fs/cgroup/cpu.max")) -> int:
-    """Cores that this process may use: in a container fewer than the machine has, by affinity or by quota.
-
-    Args:
-        cpu_max: cgroup v2's quota, ``max 100000`` or microseconds allowed and of how many.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    try:
-        quota, period = cpu_max.read_text().split()
-        return max(1, min(cores, int(quota) // int(period)))
-    except (OSError, ValueError):
-        return cores
 
 
 # Read by `aicvds simulate` and docker-compose.yml, often from the same .env file.
