@@ -31,8 +31,10 @@ from service.config.settings import (
 )
 from service.engine import Engine
 from service.llm.servers import Servers
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from service.prompt import Prompt
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode

@@ -22,13 +22,19 @@ from service.keys import Keys
 from service.limits import BodyLimit, Crowd
 from service.live import routes as live_routes
 from service.llm.servers import Servers
-from service.metrics import Metrics
+from service.observability.metrics import (
+    Metrics,
+)
+from service.observability.tracing import (
+    Traced,
+    Traces,
+    provider_from_environment,
+)
 from service.openapi import schema_of
 from service.prompting.warm_up import warm_up
 from service.routes import router
 from service.store import Store
 from service.tokens import TokenCounter
-from service.tracing import Traced, Traces, provider_from_environment
 
 
 class State(TypedDict):

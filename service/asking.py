@@ -18,8 +18,10 @@ from service.llm.answer import NoDecision
 from service.llm.calibration import LabelReader
 from service.llm.completion import Completion
 from service.llm.servers import Servers
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from service.prompt import Prompt
 from service.view import View
 from shared.actions import Action

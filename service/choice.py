@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from service.asking import Word
 from service.llm.completion import Completion
-from service.stopwatch import Stopwatch
+from service.observability.stopwatch import (
+    Stopwatch,
+)
 from service.trust import Advice
 from shared.wire import Guided, Reason, Source, UavState
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 from pydantic import TypeAdapter
 
-from service import logs
 from service.asking import Asking, Word
 from service.choice import RESERVE_S, Choice, Turn
 from service.compiler import Compiler
@@ -30,16 +29,25 @@ from service.live.watch import Live
 from service.llm.answer import NoDecision, check_answer
 from service.llm.completion import Completion
 from service.llm.servers import Servers
-from service.metrics import Metrics
 from service.mission import Mission
 from service.missions import Missions
+from service.observability import (
+    logs,
+)
+from service.observability.metrics import (
+    Metrics,
+)
+from service.observability.stopwatch import (
+    Stopwatch,
+)
+from service.observability.tracing import (
+    Traces,
+)
 from service.outcomes import Outcomes
 from service.policy import decide_without_llm
 from service.prompt import Prompt
-from service.stopwatch import Stopwatch
 from service.store import Store
 from service.tokens import TokenCounter, with_usage
-from service.tracing import Traces
 from service.trust import LLM
 from service.verifier import verify
 from service.view import View

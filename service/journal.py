@@ -20,8 +20,10 @@ from zlib import crc32
 
 from service.changes import Change, Checkpoint, Deleted, Entry, Made
 from service.events import Decided, Event, unheard
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from service.packing import pack
 from service.store import Store, cause
 

@@ -15,8 +15,10 @@ from service.config.settings import (
 )
 from service.errors import Conflict, NotFound, Unavailable
 from service.journal import Journal, Unkept
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from service.replaying import revived
 from service.store import Store
 from shared.wire import BatchRequest, DecideRequest, MissionSpec

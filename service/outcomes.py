@@ -14,8 +14,10 @@ from service.errors import Conflict
 from service.gradient import Sample
 from service.journal import Journal, Unkept
 from service.live.watch import Live
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from shared.wire import Outcome
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,9 @@ from service import onboard
 from service.engine import Engine
 from service.guard import may_make_missions
 from service.llm.servers import Servers
-from service.metrics import Metrics
+from service.observability.metrics import (
+    Metrics,
+)
 from service.problems import documented
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionAttention, MissionStatus

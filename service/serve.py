@@ -89,7 +89,9 @@ def _serve(listener: socket.socket, host: str) -> int:
             "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
 
-    from service import logs
+    from service.observability import (
+        logs,
+    )
     from service.server import Server
 
     logs.configure(settings.log_level, settings.log_format)

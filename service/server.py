@@ -9,9 +9,11 @@ from collections.abc import Callable
 import uvicorn
 from starlette.applications import Starlette
 
-from service import logs
 from service.heads import BoundedHeads
 from service.loading import Loading
+from service.observability import (
+    logs,
+)
 
 # The longest that a request takes from its connection's being accepted to its first bytes, when the service ends.
 _ARRIVING_S = 0.25

@@ -16,8 +16,10 @@ from service.config.settings import (
 from service.engine import Engine
 from service.journal import Unkept
 from service.live.watch import Live
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from service.outcomes import Outcomes
 from shared.wire import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state

@@ -22,8 +22,10 @@ from service.config.settings import (
 )
 from service.errors import Refused, Unavailable
 from service.journal import Journal
-from service.metrics import Metrics
 from service.mission import Mission
+from service.observability.metrics import (
+    Metrics,
+)
 from service.packing import pack
 from service.repeats import Repeats
 from service.replaying import revived
