@@ -19,7 +19,10 @@ from service.config.settings import (
 )
 from service.critic import Situation
 from service.guided import offered
-from service.llm.bodies import chat_body, label_body
+from service.llm.request_bodies import (
+    chat_body,
+    label_body,
+)
 from service.mission import Mission
 from service.prompt import Prompt
 from service.view import View

@@ -14,7 +14,9 @@ from service.config.settings import (
     Settings,
 )
 from service.llm.embedded import EmbeddedServer
-from service.model import embedded_model
+from service.llm.model_file import (
+    embedded_model,
+)
 from service.prompt import Prompt
 
 # Of a call that may take longer, only that it took so long is known.

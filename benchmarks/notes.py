@@ -25,8 +25,12 @@ from service.compiler import understood
 from service.config.settings import (
     Settings,
 )
-from service.llm.answer import NoDecision
-from service.llm.servers import Servers
+from service.llm.answer_format import (
+    NoDecision,
+)
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.orders import BadOrders, number_of, read, shown
 from service.prompting.warm_up import warm_up
 from shared.guidance import Guidance, Impossible
@@ -60,7 +64,7 @@ class Understood:
 
 async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
     """The LLM's name and what was made of each note."""
-    upstream = Servers(settings := Settings(mode="llm"), warm_up(settings))
+    upstream = ServerPool(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
     while upstream.status == "loading":
         await asyncio.sleep(0.2)

@@ -38,7 +38,10 @@ from service.config.settings import (
     Settings,
 )
 from service.critic import judge
-from service.llm.answer import NoDecision, check_answer
+from service.llm.answer_format import (
+    NoDecision,
+    check_answer,
+)
 from service.tokens import TokenCounter
 from shared.actions import Action
 from shared.scenario import Scenario, scenario_named

@@ -30,7 +30,9 @@ from service.config.settings import (
     Settings,
 )
 from service.engine import Engine
-from service.llm.servers import Servers
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.mission import Mission
 from service.observability.metrics import (
     Metrics,
@@ -67,7 +69,7 @@ class Trusted:
 class Echo(Asking):
     """Asks nobody: its word is for ``answer``, or the nearest to it that is offered."""
 
-    def __init__(self, llm: Servers, metrics: Metrics) -> None:
+    def __init__(self, llm: ServerPool, metrics: Metrics) -> None:
         super().__init__(llm, metrics, most=64)
         self.answer: tuple[int, int] = (0, 0)
 

@@ -21,7 +21,9 @@ from service.headers import CarefulHeaders
 from service.keys import Keys
 from service.limits import BodyLimit, Crowd
 from service.live import routes as live_routes
-from service.llm.servers import Servers
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.observability.metrics import (
     Metrics,
 )
@@ -41,7 +43,7 @@ class State(TypedDict):
     """What every request finds in ``request.state``."""
 
     engine: Engine
-    llm: Servers
+    llm: ServerPool
     metrics: Metrics
 
 
@@ -62,7 +64,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
         torch.set_num_threads(1)
         metrics = Metrics()
-        llm = Servers(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
+        llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine

@@ -14,10 +14,14 @@ import numpy as np
 
 from service.candidates import Offer
 from service.guided import offered, template_of
-from service.llm.answer import NoDecision
+from service.llm.answer_format import (
+    NoDecision,
+)
 from service.llm.calibration import LabelReader
 from service.llm.completion import Completion
-from service.llm.servers import Servers
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.mission import Mission
 from service.observability.metrics import (
     Metrics,
@@ -68,7 +72,7 @@ class Word:
 class Asking:
     """Asks one LLM for every mission of a service, ``most`` decisions at once."""
 
-    def __init__(self, llm: Servers, metrics: Metrics, most: int) -> None:
+    def __init__(self, llm: ServerPool, metrics: Metrics, most: int) -> None:
         self._llm = llm
         self._most = most
         self._metrics = metrics

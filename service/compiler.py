@@ -17,9 +17,15 @@ import time
 from typing import Protocol
 
 from service.guidance import OperatorGuidance
-from service.llm.answer import NoDecision
-from service.llm.servers import Servers
-from service.llm.upstream import Rewriting
+from service.llm.answer_format import (
+    NoDecision,
+)
+from service.llm.server import (
+    Rewriting,
+)
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.orders import INSTRUCTION, BadOrders, constrain_orders, read, shown
 from shared.guidance import Guidance, Impossible
 from shared.scenario import Scenario
@@ -54,7 +60,7 @@ class NoteOwner(Protocol):
 class Compiler:
     """Compiles the notes of a service's missions, one after another."""
 
-    def __init__(self, llm: Servers) -> None:
+    def __init__(self, llm: ServerPool) -> None:
         self._llm = llm
         self._turn = asyncio.Lock()
         self._tasks: dict[int, asyncio.Task[None]] = {}
@@ -101,7 +107,7 @@ class Compiler:
             raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")
 
 
-async def understood(note: str, scenario: Scenario, llm: Servers) -> Guidance:
+async def understood(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:
     """The first of a few answers that stands up to every check.
 
     Raises:

@@ -26,9 +26,14 @@ from service.events import Counsel
 from service.guided import Deliberation
 from service.journal import Journal, Unkept
 from service.live.watch import Live
-from service.llm.answer import NoDecision, check_answer
+from service.llm.answer_format import (
+    NoDecision,
+    check_answer,
+)
 from service.llm.completion import Completion
-from service.llm.servers import Servers
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.mission import Mission
 from service.missions import Missions
 from service.observability import (
@@ -81,7 +86,7 @@ class Engine:
     def __init__(
         self,
         settings: Settings,
-        llm: Servers,
+        llm: ServerPool,
         counter: TokenCounter,
         metrics: Metrics,
         traces: Traces,

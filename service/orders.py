@@ -18,7 +18,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from service.llm.answer import Constraint
+from service.llm.answer_format import (
+    Constraint,
+)
 from service.order_examples import EXAMPLES
 from shared.guidance import Guidance, SensorWish
 

@@ -11,7 +11,9 @@ from prometheus_client import generate_latest
 from service import onboard
 from service.engine import Engine
 from service.guard import may_make_missions
-from service.llm.servers import Servers
+from service.llm.server_pool import (
+    ServerPool,
+)
 from service.observability.metrics import (
     Metrics,
 )
@@ -146,7 +148,7 @@ async def healthz() -> dict[str, str]:
 @router.get("/readyz", tags=["operation"])
 async def readyz(request: Request) -> Readiness:
     """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``."""
-    llm: Servers = request.state.llm
+    llm: ServerPool = request.state.llm
     return llm.readiness()
 
 
@@ -155,6 +157,6 @@ async def metrics(request: Request) -> Response:
     """Prometheus metrics."""
     owned: Metrics = request.state.metrics
     owned.tasks.set(len(asyncio.all_tasks()))
-    llm: Servers = request.state.llm
+    llm: ServerPool = request.state.llm
     owned.record_llm(llm.statuses, llm.left_alone)
     return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

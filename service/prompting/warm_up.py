@@ -6,7 +6,9 @@ from service.candidates import GuidedTemplate
 from service.config.settings import (
     Settings,
 )
-from service.llm.upstream import WarmUp
+from service.llm.server import (
+    WarmUp,
+)
 from service.prompt import Template
 from shared.scenario import SCENARIOS
 

@@ -19,7 +19,11 @@ from service.config.settings import (
 from service.critic import Situation, judge
 from service.guided import Deliberation
 from service.llm.completion import Completion
-from service.llm.upstream import Rewriting, Upstream, WarmUp
+from service.llm.server import (
+    LlmServer,
+    Rewriting,
+    WarmUp,
+)
 from service.mission import Mission
 from service.orders import INSTRUCTION, constrain_orders
 from service.policy import decide_without_llm
@@ -324,8 +328,8 @@ def test_an_overdue_sensor_out_of_reach_is_not_waited_for() -> None:
 
 
 async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.upstream._SILENCE_S", 0.0)
-    upstream = Upstream(Settings(mode="llm"), WarmUp("", "", None))
+    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     running: list[str] = []
     finished: list[str] = []
 
@@ -347,8 +351,8 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
 
 
 async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.upstream._SILENCE_S", 0.0)
-    upstream = Upstream(Settings(mode="llm"), WarmUp("", "", None))
+    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     given_up = 0
 
     async def ask(body: dict[str, Any]) -> Completion:

@@ -18,7 +18,9 @@ from service.config.settings import (
 )
 from service.critic import Judgement, Situation, judge
 from service.guided import Deliberation
-from service.llm.answer import NoDecision
+from service.llm.answer_format import (
+    NoDecision,
+)
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
 from service.mission import Mission

@@ -15,7 +15,9 @@ from fastapi.responses import JSONResponse, Response
 
 from service.asking import Asking, Word
 from service.candidates import GuidedTemplate
-from service.llm.answer import constrain_labels
+from service.llm.answer_format import (
+    constrain_labels,
+)
 from service.mission import Mission
 from service.prompt import Prompt
 from service.rows import FORMATS
@@ -201,7 +203,7 @@ def test_a_batch_that_was_sent_again_meanwhile_does_not_count(edge: Edge, report
 def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.upstream._TOGETHER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("service.llm.server._TOGETHER_TIMEOUT_S", 0.2)
     chorus = Chorus(hangs_on="Say hello.")
     with serving(chorus.app) as url:
         client = edge(mode="guided", llm_url=f"{url}/v1")

@@ -8,7 +8,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.llm.answer import NoDecision
+from service.llm.answer_format import (
+    NoDecision,
+)
 from service.mission import Mission
 from service.verifier import verify
 from service.view import View

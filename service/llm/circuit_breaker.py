@@ -3,7 +3,7 @@
 Closed, calls go through. After three failures in a row it opens, and no decision is kept waiting. After a pause the LLM
 is probed beside the decisions, so that no UAV pays for the attempt; where the probe is answered it is half open: calls
 go through again, and the first failure opens it for twice as long, the first answer closes it. What counts as a failure
-is for :mod:`service.llm.upstream` to say.
+is for :mod:`service.llm.server` to say.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ _FAILURES = 3
 _PAUSE_S, _LONGEST_PAUSE_S = 5.0, 60.0
 
 
-class Breaker:
+class CircuitBreaker:
     """Counts the failures of one LLM."""
 
     def __init__(self) -> None:

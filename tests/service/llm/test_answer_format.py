@@ -1,6 +1,10 @@
 import pytest
 
-from service.llm.answer import NoDecision, check_answer, constrain
+from service.llm.answer_format import (
+    NoDecision,
+    check_answer,
+    constrain,
+)
 
 
 @pytest.mark.parametrize(

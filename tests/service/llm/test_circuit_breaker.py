@@ -12,7 +12,9 @@ import httpx
 import pytest
 from fastapi.responses import JSONResponse, Response
 
-from service.llm.breaker import Breaker
+from service.llm.circuit_breaker import (
+    CircuitBreaker,
+)
 from tests.running import listening, serving
 from tests.service.making import PAPER
 from tests.service.stub_llm import StubLlm, misbehaving, said, saying, silent, wait_for
@@ -24,7 +26,7 @@ ANSWER = saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')
 
 
 def test_three_failures_open_it_and_one_more_for_longer_until_an_answer_closes_it() -> None:
-    breaker = Breaker()
+    breaker = CircuitBreaker()
     assert [breaker.failed() for _ in range(3)] == [False, False, True]
     assert breaker.pause_s == 5
     assert [breaker.failed() for _ in range(5)] == [True] * 5
@@ -39,7 +41,7 @@ def test_three_failures_open_it_and_one_more_for_longer_until_an_answer_closes_i
 def test_a_server_that_hangs_keeps_three_waiting_and_is_asked_again_when_it_is_well(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.breaker._PAUSE_S", 2.0)
+    monkeypatch.setattr("service.llm.circuit_breaker._PAUSE_S", 2.0)
     hangs = True
 
     async def fault(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -133,7 +135,7 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report) -> No
 def test_a_note_sent_while_it_is_open_is_compiled_when_it_is_well(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.breaker._PAUSE_S", 3.0)
+    monkeypatch.setattr("service.llm.circuit_breaker._PAUSE_S", 3.0)
 
     class Ill(StubLlm):
         async def respond(self, body: dict[str, Any], probed: bool) -> Response:

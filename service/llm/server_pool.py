@@ -15,23 +15,30 @@ from typing import Any, Literal
 from service.config.settings import (
     Settings,
 )
-from service.llm.answer import NoDecision
+from service.llm.answer_format import (
+    NoDecision,
+)
 from service.llm.completion import Completion
-from service.llm.upstream import LOST, Rewriting, Upstream, WarmUp
+from service.llm.server import (
+    LOST,
+    LlmServer,
+    Rewriting,
+    WarmUp,
+)
 from shared.wire import Readiness
 
-Ask = Callable[[Upstream], Coroutine[Any, Any, Completion]]
+Ask = Callable[[LlmServer], Coroutine[Any, Any, Completion]]
 
 
-class Servers:
+class ServerPool:
     """The LLM servers of one edge, as one; ``on_open`` hears when one's circuit breaker opens."""
 
     def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
-        self._each = [Upstream(one, warm_up, on_open) for one in settings.each_server()]
+        self._each = [LlmServer(one, warm_up, on_open) for one in settings.each_server()]
         self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None
 
     @property
-    def present(self) -> Upstream:
+    def present(self) -> LlmServer:
         """The one that is asked now: the first that is ready, or the first of all."""
         return next((server for server in self._each if server.status == "ready"), self._each[0])
 
@@ -90,15 +97,15 @@ class Servers:
         await asyncio.gather(*(server.close() for server in self._each))
 
     async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
-        """As :meth:`Upstream.ask`."""
+        """As :meth:`LlmServer.ask`."""
         return await self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
 
     async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
-        """As :meth:`Upstream.ask_labels`."""
+        """As :meth:`LlmServer.ask_labels`."""
         return await self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
-        """As :meth:`Upstream.rewrite`, of the present one."""
+        """As :meth:`LlmServer.rewrite`, of the present one."""
         return await self.present.rewrite(wanted, temperature=temperature, seed=seed)
 
     async def _first(self, ask: Ask, uavs: int = 1) -> Completion:
@@ -110,7 +117,7 @@ class Servers:
             waiting.append(waiting[0])
         if len(waiting) == 1:
             return replace(await ask(waiting[0]), model=waiting[0].model)
-        running: dict[asyncio.Task[Completion], Upstream] = {}
+        running: dict[asyncio.Task[Completion], LlmServer] = {}
         failure: NoDecision | None = None
         later: list[asyncio.Task[Completion]] = []
         try:
@@ -136,6 +143,6 @@ class Servers:
         raise failure or NoDecision("llm_unavailable", "there is no server")
 
     @staticmethod
-    def _begin(ask: Ask, waiting: deque[Upstream], running: dict[asyncio.Task[Completion], Upstream]) -> None:
+    def _begin(ask: Ask, waiting: deque[LlmServer], running: dict[asyncio.Task[Completion], LlmServer]) -> None:
         server = waiting.popleft()
         running[asyncio.create_task(ask(server), name="ask-llm")] = server

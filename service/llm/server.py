@@ -14,12 +14,26 @@ from typing import TYPE_CHECKING, Any, Literal
 from service.config.settings import (
     Settings,
 )
-from service.llm.answer import Constraint, NoDecision, check_labels
-from service.llm.bodies import chat_body, draw_temperature, label_body, rewriting_body
-from service.llm.breaker import Breaker
+from service.llm.answer_format import (
+    Constraint,
+    NoDecision,
+    check_labels,
+)
+from service.llm.circuit_breaker import (
+    CircuitBreaker,
+)
 from service.llm.completion import Completion, NotUnderstood, Unreachable
 from service.llm.embedded import EmbeddedServer, LoadFailed
-from service.model import ModelMissing, embedded_model
+from service.llm.model_file import (
+    ModelMissing,
+    embedded_model,
+)
+from service.llm.request_bodies import (
+    chat_body,
+    draw_temperature,
+    label_body,
+    rewriting_body,
+)
 from shared.wire import Readiness, Reason
 
 if TYPE_CHECKING:
@@ -76,19 +90,19 @@ class WarmUp:
     labels: list[str] | None
 
 
-class Upstream:
+class LlmServer:
     """Brings the LLM up in the background and keeps trying while a remote one is down.
 
     ``/healthz`` and decisions by the policy go on meanwhile. States: ``loading``, ``ready``, ``unavailable``
     (with the reason in ``detail``), and ``off`` where the service was told to do without. A server that fails again and
-    again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.breaker`; ``on_open`` hears of it.
+    again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.circuit_breaker`; ``on_open`` hears of it.
     """
 
     def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
         self._settings = settings
         self._warm_up = warm_up
         self._on_open = on_open
-        self._breaker = Breaker()
+        self._breaker = CircuitBreaker()
         self._answered_at = self._counted_at = -math.inf
         self._waited_s = 0.0
         self._status = _Status("off" if settings.mode in ("value", "policy") else "loading")
