@@ -6,11 +6,13 @@ import asyncio
 from dataclasses import dataclass
 
 from service.asking import Word
+from service.learning.trust import (
+    Advice,
+)
 from service.llm.completion import Completion
 from service.observability.stopwatch import (
     Stopwatch,
 )
-from service.trust import Advice
 from shared.wire import Guided, Reason, Source, UavState
 
 _SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}

@@ -13,8 +13,12 @@ from importlib.resources import files
 
 import numpy as np
 
-from service.attention import top_k
-from service.learner import Weights
+from service.learning.attention import (
+    top_k,
+)
+from service.learning.parameters import (
+    Weights,
+)
 from service.rows import Cells, cells
 from shared.features import State, augment
 from shared.scenario import Scenario

@@ -25,6 +25,9 @@ from service.errors import Unavailable
 from service.events import Counsel
 from service.guided import Deliberation
 from service.journal import Journal, Unkept
+from service.learning.trust import (
+    LLM,
+)
 from service.live.watch import Live
 from service.llm.answer_format import (
     NoDecision,
@@ -53,7 +56,6 @@ from service.policy import decide_without_llm
 from service.prompt import Prompt
 from service.store import Store
 from service.tokens import TokenCounter, with_usage
-from service.trust import LLM
 from service.verifier import verify
 from service.view import View
 from shared.actions import Action

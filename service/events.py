@@ -6,10 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.gradient import Sample
+from service.learning.sample import (
+    Sample,
+)
+from service.learning.trust import (
+    Advice,
+)
 from service.repeats import Answered
 from service.rows import Cells
-from service.trust import Advice
 from shared.wire import Outcome, UavState
 
 

@@ -14,7 +14,9 @@ from torch import Tensor
 from service.config.settings import (
     Settings,
 )
-from service.gradient import Sample
+from service.learning.sample import (
+    Sample,
+)
 from service.mission import Mission
 from service.policy import decide_without_llm
 from service.reward import Reward, Speed

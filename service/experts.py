@@ -8,9 +8,11 @@ from typing import Protocol
 import numpy as np
 from scipy.special import softmax
 
+from service.learning.trust import (
+    PLANNER,
+)
 from service.mission import Mission
 from service.policy import decide_without_llm
-from service.trust import PLANNER
 from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray

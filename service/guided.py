@@ -12,7 +12,7 @@ adviser is overruled where the critic sees a disaster, even before trust has lea
 counts for more than the critic's small differences. The best is taken rather than a draw: losses are estimated for
 every candidate, so that exploring would teach nothing, and cost packets.
 
-The weights and what they guarantee are in :mod:`service.trust`; the critic in :mod:`service.critic`.
+The weights and what they guarantee are in :mod:`service.learning.trust`; the critic in :mod:`service.critic`.
 """
 
 from __future__ import annotations
@@ -26,9 +26,16 @@ import numpy as np
 from service.candidates import GuidedTemplate, Offer
 from service.critic import Judgement, Situation, judge
 from service.experts import EXPERTS, SMOOTHING
+from service.learning.trust import (
+    CAP,
+    LLM,
+    PLANNER,
+    RATE,
+    Advice,
+    Trust,
+)
 from service.mission import Mission
 from service.prompt import Prompt
-from service.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from service.applied import Applied
 from service.bases import Bases, Told
 from service.candidates import GuidedTemplate
-from service.checkpoint import initial_weights
 from service.config.prompt_budget import (
     prompt_tokens,
 )
@@ -23,14 +22,28 @@ from service.demonstrations import solved
 from service.errors import Conflict, NotFound, Refused
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
 from service.experiences import NEAREST, Experience, Experiences
-from service.gradient import Sample
 from service.guidance import OperatorGuidance
-from service.learner import Learner, Weights
+from service.learning.initial_weights import (
+    initial_weights,
+)
+from service.learning.learner import (
+    Learner,
+)
+from service.learning.parameters import (
+    Weights,
+)
+from service.learning.sample import (
+    Sample,
+)
+from service.learning.trust import (
+    PRIOR,
+    PRIOR_UNPLANNED,
+    Trust,
+)
 from service.planner import Planner, can_plan
 from service.prompt import Template, note_block
 from service.repeats import Repeats
 from service.spec import in_full, required
-from service.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.turns import STEPS_APART, Given, Turns
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief

@@ -11,8 +11,10 @@ from contextlib import suppress
 from typing import Literal, NamedTuple
 
 from service.errors import Conflict
-from service.gradient import Sample
 from service.journal import Journal, Unkept
+from service.learning.sample import (
+    Sample,
+)
 from service.live.watch import Live
 from service.mission import Mission
 from service.observability.metrics import (

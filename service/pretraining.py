@@ -12,9 +12,14 @@ from rich.table import Table
 from torch import Tensor
 from torch.nn import functional
 
-from service.checkpoint import initial_weights, save
 from service.examples import Batch, Choices, Example, replay
-from service.learner import Modules
+from service.learning.initial_weights import (
+    initial_weights,
+    save,
+)
+from service.learning.modules import (
+    Modules,
+)
 from service.recall import recall, references, velocity_agreement, velocity_error
 from service.reward import Reward
 from service.training.options import Pretrain

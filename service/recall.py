@@ -6,9 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.attention import top_k
 from service.examples import Example, Taught
-from service.learner import Weights
+from service.learning.attention import (
+    top_k,
+)
+from service.learning.parameters import (
+    Weights,
+)
 
 
 def references(examples: Sequence[Example]) -> dict[str, list[Taught]]:

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from service.asked import Asked
-from service.attention import top_k
 from service.events import Pending
-from service.gradient import Sample
+from service.learning.attention import (
+    top_k,
+)
+from service.learning.sample import (
+    Sample,
+)
 from service.mission import Mission
 from service.rows import cells
 from shared.actions import Action

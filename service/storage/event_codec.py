@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
+from service.learning.trust import (
+    Advice,
+)
 from service.packing import pack, unpack
 from service.repeats import Answered
-from service.trust import Advice
 from shared.wire import Outcome, UavState
 
 # Requests carry more; the outcome that comes with a report is an event of its own, and how it was sent is past.

@@ -5,10 +5,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from service import checkpoint as checkpoints
-from service.checkpoint import initial_modules, initial_weights, save
 from service.examples import Batch, Example, replay
-from service.learner import Modules
+from service.learning import (
+    initial_weights as checkpoints,
+)
+from service.learning.initial_weights import (
+    initial_modules,
+    initial_weights,
+    save,
+)
+from service.learning.modules import (
+    Modules,
+)
 from service.pretraining import losses
 from service.recall import recall, references
 from service.reward import Reward

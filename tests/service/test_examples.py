@@ -9,8 +9,12 @@ import pytest
 import torch
 
 from service.examples import Batch, Example, Taught, replay
-from service.gradient import Sample
-from service.learner import Modules
+from service.learning.modules import (
+    Modules,
+)
+from service.learning.sample import (
+    Sample,
+)
 from service.pretraining import losses
 from service.recall import recall, references, velocity_agreement, velocity_error
 from service.reward import Reward, fleet_cost

@@ -18,13 +18,15 @@ from service.config.settings import (
 )
 from service.critic import Judgement, Situation, judge
 from service.guided import Deliberation
+from service.learning.trust import (
+    LLM,
+)
 from service.llm.answer_format import (
     NoDecision,
 )
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
 from service.mission import Mission
-from service.trust import LLM
 from service.view import View
 from shared.actions import Action
 from shared.reach import Reach

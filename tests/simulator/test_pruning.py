@@ -12,9 +12,11 @@ import httpx
 import numpy as np
 import pytest
 
-from service.attention import top_k
 from service.config.settings import (
     Settings,
+)
+from service.learning.attention import (
+    top_k,
 )
 from service.mission import Mission
 from service.onboard import attention_of

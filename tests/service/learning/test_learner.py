@@ -7,9 +7,21 @@ import numpy as np
 import pytest
 import torch
 
-from service.checkpoint import initial_weights
-from service.gradient import Sample, descend
-from service.learner import Learner, Modules
+from service.learning.backpropagation import (
+    descend,
+)
+from service.learning.initial_weights import (
+    initial_weights,
+)
+from service.learning.learner import (
+    Learner,
+)
+from service.learning.modules import (
+    Modules,
+)
+from service.learning.sample import (
+    Sample,
+)
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
@@ -166,7 +178,7 @@ def test_nothing_brings_torchs_compiler_into_the_process() -> None:
     # Its import takes seconds, on a busy machine longer than a decision may.
     script = (
         "import sys; from service.mission import Mission; from service.config.settings import Settings;"
-        "from shared.wire import MissionSpec; from tests.service.test_learner import sample;"
+        "from shared.wire import MissionSpec; from tests.service.learning.test_learner import sample;"
         "Mission('m', MissionSpec(), Settings()).learner.update(sample('reach'), 0.3);"
         "print([m for m in ('torch._dynamo', 'torch._inductor', 'sympy') if m in sys.modules])"
     )

@@ -2,7 +2,10 @@ import math
 
 import pytest
 
-from service.trust import Advice, Trust
+from service.learning.trust import (
+    Advice,
+    Trust,
+)
 
 PRIOR = {"llm": 0.5, "value": 0.25, "policy": 0.25}
 

@@ -7,27 +7,11 @@ take a tenth of the time that torch's autograd takes for them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One decision as the modules saw it.
-
-    ``features`` are the admissible sensors' ``(n, d)``, ``chosen`` the row that was decided for, ``approach``
-    what the velocity scorer was told of that sensor (see :meth:`State.approach`), ``velocity`` the level flown.
-    """
-
-    features: Array
-    chosen: int
-    approach: Array
-    velocity: int
+from service.learning.sample import Array, Sample
 
 
 class Parameters(NamedTuple):

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.attention import WIDTH
+from service.learning.attention import (
+    WIDTH,
+)
 
 
 class VelocityWeights(NamedTuple):

@@ -9,7 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from service.learner import Modules, Weights
+from service.learning.modules import (
+    Modules,
+)
+from service.learning.parameters import (
+    Weights,
+)
 from shared.wire import Features, Init
 
 # Only preset `paper` has weights for each velocity level.
