@@ -13,7 +13,6 @@ from typing import Any
 
 from paper_template import EXPERIENCES, Newest, PaperTemplate
 
-from service.candidates import GuidedTemplate, Offer
 from service.config.settings import (
     Settings,
 )
@@ -24,7 +23,13 @@ from service.llm.request_bodies import (
     label_body,
 )
 from service.mission import Mission
-from service.prompt import Prompt
+from service.prompting.candidates import (
+    CandidateSet,
+    GuidedTemplate,
+)
+from service.prompting.prompt import (
+    Prompt,
+)
 from service.view import View
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
@@ -51,7 +56,7 @@ class Put:
 
     prompt: Prompt
     sensors: list[int]
-    offer: Offer | None = None
+    offer: CandidateSet | None = None
 
     def body(self, velocities: int) -> dict[str, Any]:
         """The request to the embedded LLM, as the edge would send it."""
@@ -97,7 +102,7 @@ class Scribe(LocalPilot):
         self._missions = missions(scenario, seed)
         self._owed: dict[int, Outcome] = {}
         self._decided: dict[int, str] = {}
-        self._step: dict[int, tuple[Offer, View]] = {}
+        self._step: dict[int, tuple[CandidateSet, View]] = {}
         self.asked: list[Asked] = []
         self.together: list[Together] = []
 
@@ -133,7 +138,7 @@ class Scribe(LocalPilot):
         self._note(mission, mission.template, view, offer)
         return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.offered, offer)
 
-    def _note(self, mission: Mission, template: GuidedTemplate, view: View, offer: Offer) -> None:
+    def _note(self, mission: Mission, template: GuidedTemplate, view: View, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
         self._step[view.uav_id] = offer, view
         if len(self._step) == mission.scenario.uavs:

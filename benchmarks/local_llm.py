@@ -17,7 +17,9 @@ from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import (
     embedded_model,
 )
-from service.prompt import Prompt
+from service.prompting.prompt import (
+    Prompt,
+)
 
 # Of a call that may take longer, only that it took so long is known.
 LIMIT_S = 120.0

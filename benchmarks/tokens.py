@@ -42,7 +42,9 @@ from service.llm.answer_format import (
     NoDecision,
     check_answer,
 )
-from service.tokens import TokenCounter
+from service.prompting.token_accounting import (
+    TokenCounter,
+)
 from shared.actions import Action
 from shared.scenario import Scenario, scenario_named
 from simulator.experiments.intervals import interval, paired

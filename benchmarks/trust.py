@@ -25,7 +25,6 @@ from rich.progress import track
 
 from service.app import create_app
 from service.asking import Asking, Word, by_action
-from service.candidates import Offer
 from service.config.settings import (
     Settings,
 )
@@ -37,7 +36,12 @@ from service.mission import Mission
 from service.observability.metrics import (
     Metrics,
 )
-from service.prompt import Prompt
+from service.prompting.candidates import (
+    CandidateSet,
+)
+from service.prompting.prompt import (
+    Prompt,
+)
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient
@@ -73,7 +77,7 @@ class Echo(Asking):
         super().__init__(llm, metrics, most=64)
         self.answer: tuple[int, int] = (0, 0)
 
-    async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
+    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> Word:
         """Nearly sure of the velocity nearest to the answer's for its sensor; of the first letter without it."""
         sensor, velocity = self.answer
         letters = list(offer.labels)

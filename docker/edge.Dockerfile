@@ -24,7 +24,7 @@ RUN touch README.md LICENSE \
 # These files alone, so that an edit elsewhere does not bring the model again.
 FROM dependencies AS model
 COPY shared/ shared/
-COPY service/__init__.py service/llm/model_file.py service/config/settings.py service/vocabulary.py service/
+COPY service/__init__.py service/llm/model_file.py service/config/settings.py service/prompting/tokenizer.py service/
 RUN PYTHONPATH=/src AICVDS_CACHE_DIR=/opt/model aicvds model fetch
 
 FROM dependencies AS application

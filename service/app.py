@@ -33,10 +33,12 @@ from service.observability.tracing import (
     provider_from_environment,
 )
 from service.openapi import schema_of
+from service.prompting.token_accounting import (
+    TokenCounter,
+)
 from service.prompting.warm_up import warm_up
 from service.routes import router
 from service.store import Store
-from service.tokens import TokenCounter
 
 
 class State(TypedDict):

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from service.candidates import Offer
 from service.guided import offered, template_of
 from service.llm.answer_format import (
     NoDecision,
@@ -26,7 +25,12 @@ from service.mission import Mission
 from service.observability.metrics import (
     Metrics,
 )
-from service.prompt import Prompt
+from service.prompting.candidates import (
+    CandidateSet,
+)
+from service.prompting.prompt import (
+    Prompt,
+)
 from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray
@@ -98,7 +102,7 @@ class Asking:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``. Deadlines are of ``time.perf_counter``."""
         return await self._within(self._llm.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
 
-    async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
+    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> Word:
         """Mode ``guided``: what the LLM says of one UAV's candidates."""
         template = template_of(mission)
         lists = [list(offer.labels)]
@@ -183,6 +187,6 @@ class Asking:
             self._waiting.discard(limit)
 
 
-def by_action(offer: Offer, told: dict[str, float]) -> dict[Action, float]:
+def by_action(offer: CandidateSet, told: dict[str, float]) -> dict[Action, float]:
     """Probabilities of an offer's labels as those of its actions."""
     return dict(zip(offer.actions, offer.spread(told).tolist(), strict=True))

@@ -43,7 +43,9 @@ def main(argv: list[str]) -> int:
     """Choose and write; returns the exit code."""
     args = tyro.cli(Demonstrate, prog="aicvds demonstrate", args=argv)
     # They import torch, which takes seconds; `--help` answers without it.
-    from service.demonstrations import Demonstrations
+    from service.prompting.demonstrations import (
+        Demonstrations,
+    )
     from service.teachers import TEACHERS, farthest_first, solutions
 
     try:

@@ -53,9 +53,14 @@ from service.observability.tracing import (
 )
 from service.outcomes import Outcomes
 from service.policy import decide_without_llm
-from service.prompt import Prompt
+from service.prompting.prompt import (
+    Prompt,
+)
+from service.prompting.token_accounting import (
+    TokenCounter,
+    with_usage,
+)
 from service.store import Store
-from service.tokens import TokenCounter, with_usage
 from service.verifier import verify
 from service.view import View
 from shared.actions import Action

@@ -12,8 +12,10 @@ from service.learning.sample import (
 from service.learning.trust import (
     Advice,
 )
+from service.prompting.row_formats import (
+    Cells,
+)
 from service.repeats import Answered
-from service.rows import Cells
 from shared.wire import Outcome, UavState
 
 

@@ -23,7 +23,6 @@ from typing import Self
 
 import numpy as np
 
-from service.candidates import GuidedTemplate, Offer
 from service.critic import Judgement, Situation, judge
 from service.experts import EXPERTS, SMOOTHING
 from service.learning.trust import (
@@ -35,7 +34,13 @@ from service.learning.trust import (
     Trust,
 )
 from service.mission import Mission
-from service.prompt import Prompt
+from service.prompting.candidates import (
+    CandidateSet,
+    GuidedTemplate,
+)
+from service.prompting.prompt import (
+    Prompt,
+)
 from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray
@@ -60,7 +65,7 @@ class Deliberation:
     Taken at once from what the mission knows then; ``judge`` may run in another thread.
     """
 
-    offer: Offer
+    offer: CandidateSet
     prompt: Prompt
     advised: dict[str, FloatArray]
     situation: Situation
@@ -165,9 +170,9 @@ def template_of(mission: Mission) -> GuidedTemplate:
     return mission.template
 
 
-def offered(mission: Mission, view: View) -> Offer:
+def offered(mission: Mission, view: View) -> CandidateSet:
     """What the LLM may choose from, at velocities that the operator allows; the view has at least one row."""
-    shown = Offer.of(view.state, view.shown(mission), view.uav_id, template_of(mission), mission.scenario)
+    shown = CandidateSet.of(view.state, view.shown(mission), view.uav_id, template_of(mission), mission.scenario)
     asked = view.asked
     if asked is None:
         return shown

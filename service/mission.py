@@ -11,17 +11,14 @@ from numpy.typing import NDArray
 
 from service.applied import Applied
 from service.bases import Bases, Told
-from service.candidates import GuidedTemplate
 from service.config.prompt_budget import (
     prompt_tokens,
 )
 from service.config.settings import (
     Settings,
 )
-from service.demonstrations import solved
 from service.errors import Conflict, NotFound, Refused
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
-from service.experiences import NEAREST, Experience, Experiences
 from service.guidance import OperatorGuidance
 from service.learning.initial_weights import (
     initial_weights,
@@ -41,7 +38,21 @@ from service.learning.trust import (
     Trust,
 )
 from service.planner import Planner, can_plan
-from service.prompt import Template, note_block
+from service.prompting.candidates import (
+    GuidedTemplate,
+)
+from service.prompting.demonstrations import (
+    solved,
+)
+from service.prompting.experiences import (
+    NEAREST,
+    Experience,
+    Experiences,
+)
+from service.prompting.prompt import (
+    Template,
+    note_block,
+)
 from service.repeats import Repeats
 from service.spec import in_full, required
 from service.turns import STEPS_APART, Given, Turns

@@ -11,9 +11,11 @@ import numpy as np
 from service.config.settings import (
     Settings,
 )
-from service.demonstrations import Demonstration
 from service.mission import Mission
 from service.policy import decide_without_llm
+from service.prompting.demonstrations import (
+    Demonstration,
+)
 from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray

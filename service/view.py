@@ -19,7 +19,9 @@ from service.learning.sample import (
     Sample,
 )
 from service.mission import Mission
-from service.rows import cells
+from service.prompting.row_formats import (
+    cells,
+)
 from shared.actions import Action
 from shared.features import State, augment
 from shared.wire import Candidate, UavState

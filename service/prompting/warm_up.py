@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from service.candidates import GuidedTemplate
 from service.config.settings import (
     Settings,
 )
 from service.llm.server import (
     WarmUp,
 )
-from service.prompt import Template
+from service.prompting.candidates import (
+    GuidedTemplate,
+)
+from service.prompting.prompt import (
+    Template,
+)
 from shared.scenario import SCENARIOS
 
 

@@ -12,7 +12,6 @@ from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from service.asked import Asked
-from service.candidates import GuidedTemplate
 from service.config.settings import (
     Settings,
 )
@@ -27,7 +26,12 @@ from service.llm.server import (
 from service.mission import Mission
 from service.orders import INSTRUCTION, constrain_orders
 from service.policy import decide_without_llm
-from service.prompt import Template
+from service.prompting.candidates import (
+    GuidedTemplate,
+)
+from service.prompting.prompt import (
+    Template,
+)
 from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import MissionSpec

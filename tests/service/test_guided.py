@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from fastapi.responses import Response
 
-from service.candidates import GuidedTemplate, velocities
 from service.config.settings import (
     Settings,
 )
@@ -27,6 +26,10 @@ from service.llm.answer_format import (
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
 from service.mission import Mission
+from service.prompting.candidates import (
+    GuidedTemplate,
+    velocities,
+)
 from service.view import View
 from shared.actions import Action
 from shared.reach import Reach

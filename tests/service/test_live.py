@@ -22,10 +22,16 @@ from service.live.history import History
 from service.live.routes import STATIC
 from service.live.watch import MOST_LISTENERS
 from service.packing import pack
-from service.prompt import Prompt
-from service.rows import FORMATS
+from service.prompting.prompt import (
+    Prompt,
+)
+from service.prompting.row_formats import (
+    FORMATS,
+)
+from service.prompting.unpruned_baseline import (
+    Uncompressed,
+)
 from service.storage.event_codec import decode, encode
-from service.uncompressed import Uncompressed
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav

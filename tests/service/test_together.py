@@ -14,14 +14,22 @@ import pytest
 from fastapi.responses import JSONResponse, Response
 
 from service.asking import Asking, Word
-from service.candidates import GuidedTemplate
 from service.llm.answer_format import (
     constrain_labels,
 )
 from service.mission import Mission
-from service.prompt import Prompt
-from service.rows import FORMATS
-from service.uncompressed import Uncompressed
+from service.prompting.candidates import (
+    GuidedTemplate,
+)
+from service.prompting.prompt import (
+    Prompt,
+)
+from service.prompting.row_formats import (
+    FORMATS,
+)
+from service.prompting.unpruned_baseline import (
+    Uncompressed,
+)
 from service.view import View
 from shared.actions import Action
 from tests.running import serving

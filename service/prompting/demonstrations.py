@@ -19,7 +19,10 @@ from service.learning.attention import (
 from service.learning.parameters import (
     Weights,
 )
-from service.rows import Cells, cells
+from service.prompting.row_formats import (
+    Cells,
+    cells,
+)
 from shared.features import State, augment
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, SensorId, Step, UavState, Wire

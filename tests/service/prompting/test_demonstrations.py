@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from service.demonstrate import main
-from service.demonstrations import packaged
 from service.errors import Refused
 from service.policy import decide_without_llm
+from service.prompting.demonstrations import (
+    packaged,
+)
 from service.teachers import TEACHERS, farthest_first, likeness, solutions
 from shared.actions import Action
 from shared.features import State

@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.experiences import Experience, Experiences
+from service.prompting.experiences import (
+    Experience,
+    Experiences,
+)
 from shared.wire import MissionSpec, Outcome, PromptStyle, Selection
 from tests.service.making import attended, mission, uav
 

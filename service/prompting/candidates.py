@@ -15,9 +15,19 @@ from typing import Self
 
 import numpy as np
 
-from service.prompt import Prompt, Template, note_block
-from service.rows import FORMATS, Cells, cells
-from service.uncompressed import Uncompressed
+from service.prompting.prompt import (
+    Prompt,
+    Template,
+    note_block,
+)
+from service.prompting.row_formats import (
+    FORMATS,
+    Cells,
+    cells,
+)
+from service.prompting.unpruned_baseline import (
+    Uncompressed,
+)
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State
@@ -106,7 +116,9 @@ class GuidedTemplate(Template):
         """Such as ``52,3>7:0``, the cost in tenths."""
         return f"{seen['queue']},{seen['age']}>{velocity}:{min(99, round(10 * cost))}\n"
 
-    def offer(self, offer: Offer, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()) -> Prompt:
+    def offer(
+        self, offer: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()
+    ) -> Prompt:
         """The prompt for one decision, the offer's rows in their order."""
         last = "".join(nearest)
         return Prompt(
@@ -117,7 +129,7 @@ class GuidedTemplate(Template):
         )
 
     def together(
-        self, offers: Mapping[int, tuple[Offer, State]], experiences: Sequence[str], nearest: Sequence[str] = ()
+        self, offers: Mapping[int, tuple[CandidateSet, State]], experiences: Sequence[str], nearest: Sequence[str] = ()
     ) -> dict[int, Prompt]:
         """Each UAV's share of one prompt about several, by number.
 
@@ -154,7 +166,7 @@ class GuidedTemplate(Template):
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class CandidateSet:
     """What there is to choose from: ``actions`` (sensor ID, velocity), each once, in the order of the rows.
 
     ``labels`` names actions by index; several letters may name the same. ``rows`` is their text.
@@ -180,16 +192,16 @@ class Offer:
             text.append(f"{letters[0]}{known['queue']},{known['age']},{_span(speeds)}\n")
         return cls(list(actions), labels, "".join(text))
 
-    def flown_as(self, velocity: Callable[[int, int], int]) -> Offer:
+    def flown_as(self, velocity: Callable[[int, int], int]) -> CandidateSet:
         """With other velocities, told by sensor and velocity; labels may come to name the same action."""
         actions: dict[Action, int] = {}
         places = [actions.setdefault(Action(s, velocity(s, v)), len(actions)) for s, v in self.actions]
-        return Offer(list(actions), {label: places[i] for label, i in self.labels.items()}, self.rows)
+        return CandidateSet(list(actions), {label: places[i] for label, i in self.labels.items()}, self.rows)
 
-    def with_actions(self, added: Sequence[Action]) -> Offer:
+    def with_actions(self, added: Sequence[Action]) -> CandidateSet:
         """With more that no letter names."""
         known = dict.fromkeys(self.actions)
-        return Offer(list(known | dict.fromkeys(added)), self.labels, self.rows)
+        return CandidateSet(list(known | dict.fromkeys(added)), self.labels, self.rows)
 
     def numbered_rows(self) -> str:
         """The rows with the sensor's ID after the letter."""

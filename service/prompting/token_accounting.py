@@ -9,8 +9,13 @@ from service.config.settings import (
     Settings,
 )
 from service.llm.completion import Completion
-from service.prompt import Prompt
-from service.vocabulary import ENCODING, encoding
+from service.prompting.prompt import (
+    Prompt,
+)
+from service.prompting.tokenizer import (
+    ENCODING,
+    encoding,
+)
 from shared.wire import Tokens
 
 

@@ -8,10 +8,21 @@ import pytest
 from service.config.settings import (
     Settings,
 )
-from service.rows import FORMATS
-from service.tokens import TokenCounter, price_usd
-from service.uncompressed import Uncompressed
-from service.vocabulary import VocabularyDamaged, encoding, ensure_vocabulary
+from service.prompting.row_formats import (
+    FORMATS,
+)
+from service.prompting.token_accounting import (
+    TokenCounter,
+    price_usd,
+)
+from service.prompting.tokenizer import (
+    VocabularyDamaged,
+    encoding,
+    ensure_vocabulary,
+)
+from service.prompting.unpruned_baseline import (
+    Uncompressed,
+)
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, PromptStyle
 from tests.service.making import attended, mission, uav
@@ -37,7 +48,7 @@ def test_a_damaged_vocabulary_is_refused(tmp_path: Path, monkeypatch: pytest.Mon
     package = tmp_path / "package"
     (package / "data").mkdir(parents=True)
     (package / "data" / "o200k_base.tiktoken.gz").write_bytes(gzip.compress(b"IQ== 0\n"))
-    monkeypatch.setattr("service.vocabulary.files", lambda _: package)
+    monkeypatch.setattr("service.prompting.tokenizer.files", lambda _: package)
     with pytest.raises(VocabularyDamaged):
         ensure_vocabulary(tmp_path / "cache")
     assert not (tmp_path / "cache").exists()
@@ -65,7 +76,7 @@ def test_a_folder_that_cannot_be_written_to_is_read(tmp_path: Path, monkeypatch:
     def full(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr("service.vocabulary._write", full)
+    monkeypatch.setattr("service.prompting.tokenizer._write", full)
     assert len(encoding(tmp_path).encode_ordinary("hello world")) == 2
 
 

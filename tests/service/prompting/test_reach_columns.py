@@ -6,7 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from service.rows import columns
+from service.prompting.row_formats import (
+    columns,
+)
 from service.view import View
 from shared.channel import link_holds, packets_per_step
 from shared.features import FEATURES
