@@ -21,9 +21,17 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from service.compiler import understood
 from service.config.settings import (
     Settings,
+)
+from service.guidance.note_compiler import (
+    understood,
+)
+from service.guidance.note_orders import (
+    BadOrders,
+    number_of,
+    read,
+    shown,
 )
 from service.llm.answer_format import (
     NoDecision,
@@ -31,7 +39,6 @@ from service.llm.answer_format import (
 from service.llm.server_pool import (
     ServerPool,
 )
-from service.orders import BadOrders, number_of, read, shown
 from service.prompting.warm_up import warm_up
 from shared.guidance import Guidance, Impossible
 from shared.scenario import SCENARIOS

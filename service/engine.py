@@ -14,7 +14,6 @@ from pydantic import TypeAdapter
 
 from service.asking import Asking, Word
 from service.choice import RESERVE_S, Choice, Turn
-from service.compiler import Compiler
 from service.config.cores import (
     usable_cores,
 )
@@ -23,6 +22,9 @@ from service.config.settings import (
 )
 from service.errors import Unavailable
 from service.events import Counsel
+from service.guidance.note_compiler import (
+    NoteCompiler,
+)
 from service.guided import Deliberation
 from service.journal import Journal, Unkept
 from service.learning.trust import (
@@ -103,7 +105,7 @@ class Engine:
         self._settings = settings
         self._llm = llm
         self.asking = Asking(llm, metrics, settings.llm_concurrency)
-        self.compiler = Compiler(llm)
+        self.compiler = NoteCompiler(llm)
         self._counter = counter
         self._metrics = metrics
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")

@@ -19,7 +19,9 @@ from service.config.settings import (
 )
 from service.errors import Conflict, NotFound, Refused
 from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
-from service.guidance import OperatorGuidance
+from service.guidance.operator_guidance import (
+    OperatorGuidance,
+)
 from service.learning.initial_weights import (
     initial_weights,
 )

@@ -6,7 +6,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from service.asked import Asked
+from service.guidance.step_guidance import (
+    StepGuidance,
+)
 from shared.actions import Action
 from shared.features import State
 from shared.reach import Reach, distances_ahead
@@ -14,7 +16,7 @@ from shared.scenario import Scenario
 
 
 def decide_without_llm(
-    state: State, uav: int, scenario: Scenario, reserved: Collection[int], asked: Asked | None = None
+    state: State, uav: int, scenario: Scenario, reserved: Collection[int], asked: StepGuidance | None = None
 ) -> Action:
     """One step of look-ahead over every velocity and every sensor heard, free and with a battery.
 

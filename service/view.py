@@ -10,8 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from service.asked import Asked
 from service.events import Pending
+from service.guidance.step_guidance import (
+    StepGuidance,
+)
 from service.learning.attention import (
     top_k,
 )
@@ -41,7 +43,7 @@ class View:
     uav_id: int
     step: int
     state: State
-    asked: Asked | None = None
+    asked: StepGuidance | None = None
     rows: list[int] = field(default_factory=list)
     candidates: list[Candidate] = field(default_factory=list)
     _admissible: list[int] = field(default_factory=list)
@@ -62,7 +64,7 @@ class View:
             belief=mission.belief if mission.decides_from == "fleet" else None,
         )
         guidance, scenario = mission.guidance.obeyed, mission.scenario
-        asked = Asked.of(guidance, state, step, mission.visits, uav.uav_id, scenario)
+        asked = StepGuidance.of(guidance, state, step, mission.visits, uav.uav_id, scenario)
         return cls(uav_id=uav.uav_id, step=step, state=state, asked=asked)
 
     @property

@@ -11,11 +11,17 @@ import pytest
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from service.asked import Asked
 from service.config.settings import (
     Settings,
 )
 from service.critic import Situation, judge
+from service.guidance.note_orders import (
+    INSTRUCTION,
+    constrain_orders,
+)
+from service.guidance.step_guidance import (
+    StepGuidance,
+)
 from service.guided import Deliberation
 from service.llm.completion import Completion
 from service.llm.server import (
@@ -24,7 +30,6 @@ from service.llm.server import (
     WarmUp,
 )
 from service.mission import Mission
-from service.orders import INSTRUCTION, constrain_orders
 from service.policy import decide_without_llm
 from service.prompting.candidates import (
     GuidedTemplate,
@@ -325,7 +330,7 @@ def test_guided_offers_no_forbidden_velocity() -> None:
 def test_an_overdue_sensor_out_of_reach_is_not_waited_for() -> None:
     state = attended(mission(), uav(x=[500.0, 5000.0], queue=[10.0, 50.0]), 0).state
     wish = Guidance(sensors=[SensorWish(sensor_id=1, visit_every=1)])
-    asked = Asked.of(wish, state, 9, np.full(10, -1), 0, PAPER)
+    asked = StepGuidance.of(wish, state, 9, np.full(10, -1), 0, PAPER)
     assert asked is not None
     assert not asked.due.any()
     assert (asked.worth == 0).all()

@@ -16,7 +16,16 @@ import logging
 import time
 from typing import Protocol
 
-from service.guidance import OperatorGuidance
+from service.guidance.note_orders import (
+    INSTRUCTION,
+    BadOrders,
+    constrain_orders,
+    read,
+    shown,
+)
+from service.guidance.operator_guidance import (
+    OperatorGuidance,
+)
 from service.llm.answer_format import (
     NoDecision,
 )
@@ -26,7 +35,6 @@ from service.llm.server import (
 from service.llm.server_pool import (
     ServerPool,
 )
-from service.orders import INSTRUCTION, BadOrders, constrain_orders, read, shown
 from shared.guidance import Guidance, Impossible
 from shared.scenario import Scenario
 
@@ -57,7 +65,7 @@ class NoteOwner(Protocol):
         ...
 
 
-class Compiler:
+class NoteCompiler:
     """Compiles the notes of a service's missions, one after another."""
 
     def __init__(self, llm: ServerPool) -> None:

@@ -16,7 +16,7 @@ from shared.scenario import Scenario
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class StepGuidance:
     """V velocity levels, J sensors in the order of the state.
 
     Attributes:
