@@ -22,7 +22,9 @@ from service.llm.request_bodies import (
     chat_body,
     label_body,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.prompting.candidates import (
     CandidateSet,
     GuidedTemplate,

@@ -32,7 +32,9 @@ from service.engine import Engine
 from service.llm.server_pool import (
     ServerPool,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )

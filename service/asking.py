@@ -21,7 +21,9 @@ from service.llm.completion import Completion
 from service.llm.server_pool import (
     ServerPool,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )

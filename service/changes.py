@@ -9,7 +9,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.events import Event
+from service.mission.events import (
+    Event,
+)
 from service.schema import checkpoints, journal, missions
 from service.storage.event_codec import encode
 from shared.wire import MissionSpec

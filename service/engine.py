@@ -21,7 +21,6 @@ from service.config.settings import (
     Settings,
 )
 from service.errors import Unavailable
-from service.events import Counsel
 from service.guidance.note_compiler import (
     NoteCompiler,
 )
@@ -39,7 +38,12 @@ from service.llm.completion import Completion
 from service.llm.server_pool import (
     ServerPool,
 )
-from service.mission import Mission
+from service.mission.events import (
+    AdviserReport,
+)
+from service.mission.mission import (
+    Mission,
+)
 from service.missions import Missions
 from service.observability import (
     logs,
@@ -319,7 +323,7 @@ class Engine:
             deadline_ms=turn.deadline_ms,
             latency_ms=watch.total(),
         )
-        counsel = None if choice.advice is None else Counsel(choice.model or "", choice.advice)
+        counsel = None if choice.advice is None else AdviserReport(choice.model or "", choice.advice)
         mission.commit(pending, turn.attempt, counsel)
         mission.bases.hold(uav, step, decision_id)
         self.live.drafted(mission, uav, prompt, answer)

@@ -17,7 +17,9 @@ from service.config.settings import (
 from service.learning.sample import (
     Sample,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.policy import decide_without_llm
 from service.reward import Reward, Speed
 from service.view import View

@@ -11,7 +11,9 @@ from scipy.special import softmax
 from service.learning.trust import (
     PLANNER,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.policy import decide_without_llm
 from service.view import View
 from shared.actions import Action

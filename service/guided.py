@@ -33,7 +33,9 @@ from service.learning.trust import (
     Advice,
     Trust,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.prompting.candidates import (
     CandidateSet,
     GuidedTemplate,

@@ -19,8 +19,14 @@ from typing import Any
 from zlib import crc32
 
 from service.changes import Change, Checkpoint, Deleted, Entry, Made
-from service.events import Decided, Event, unheard
-from service.mission import Mission
+from service.mission.events import (
+    Decided,
+    Event,
+    unheard,
+)
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )

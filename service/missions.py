@@ -15,7 +15,9 @@ from service.config.settings import (
 )
 from service.errors import Conflict, NotFound, Unavailable
 from service.journal import Journal, Unkept
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )

@@ -8,7 +8,9 @@ from http import HTTPStatus
 
 from fastapi import Response
 
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from shared.missions import MissionAttention, WeightArray
 
 

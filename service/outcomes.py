@@ -16,7 +16,9 @@ from service.learning.sample import (
     Sample,
 )
 from service.live.watch import Live
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )

@@ -5,9 +5,19 @@ from __future__ import annotations
 from service.config.settings import (
     Settings,
 )
-from service.events import Decided, Event, Guided, Reported, Settled
-from service.mission import Mission
-from service.repeats import Answered
+from service.mission.events import (
+    Decided,
+    Event,
+    Guided,
+    Reported,
+    Settled,
+)
+from service.mission.idempotency import (
+    Answered,
+)
+from service.mission.mission import (
+    Mission,
+)
 from service.store import Kept
 
 

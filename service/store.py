@@ -13,8 +13,10 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.changes import Statements
-from service.events import Event
 from service.hold import DatabaseHold, FileHold, StoreUnusable
+from service.mission.events import (
+    Event,
+)
 from service.packing import unpack
 from service.schema import SCHEMA, checkpoints, journal, missions, terms
 from service.sqlite_writer import BUSY_MS, PRAGMAS

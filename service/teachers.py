@@ -11,7 +11,9 @@ import numpy as np
 from service.config.settings import (
     Settings,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.policy import decide_without_llm
 from service.prompting.demonstrations import (
     Demonstration,

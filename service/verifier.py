@@ -12,7 +12,9 @@ import numpy as np
 from service.llm.answer_format import (
     NoDecision,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.view import View
 from shared.channel import link_holds
 from shared.reach import distances_ahead

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from service.events import Pending
 from service.guidance.step_guidance import (
     StepGuidance,
 )
@@ -20,7 +19,12 @@ from service.learning.attention import (
 from service.learning.sample import (
     Sample,
 )
-from service.mission import Mission
+from service.mission.events import (
+    Pending,
+)
+from service.mission.mission import (
+    Mission,
+)
 from service.prompting.row_formats import (
     cells,
 )

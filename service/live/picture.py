@@ -8,7 +8,9 @@ import numpy as np
 from pydantic_core import to_json
 
 from service.live.history import Kept
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 from shared.urgency import urgency

@@ -17,7 +17,9 @@ from contextlib import asynccontextmanager, contextmanager
 from service.errors import Unavailable
 from service.live import picture
 from service.live.history import History
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.prompting.prompt import (
     Prompt,
 )

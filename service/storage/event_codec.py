@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled
 from service.learning.trust import (
     Advice,
 )
+from service.mission.events import (
+    AdviserReport,
+    Decided,
+    Event,
+    Guided,
+    Pending,
+    Reported,
+    Settled,
+)
+from service.mission.idempotency import (
+    Answered,
+)
 from service.packing import pack, unpack
-from service.repeats import Answered
 from shared.wire import Outcome, UavState
 
 # Requests carry more; the outcome that comes with a report is an event of its own, and how it was sent is past.
@@ -44,7 +54,7 @@ def decode(kind: str, data: bytes) -> Event:
             case "reported":
                 return Reported(body[0], UavState.model_validate(body[1]))
             case "decided":
-                counsel = None if body[2] is None else Counsel(body[2][0], Advice(**body[2][1]))
+                counsel = None if body[2] is None else AdviserReport(body[2][0], Advice(**body[2][1]))
                 return Decided(Pending.of(body[0]), body[1], counsel)
             case "settled":
                 return Settled(Outcome.model_validate(body[0]), body[1])

@@ -21,7 +21,9 @@ from service.config.settings import (
     Settings,
 )
 from service.engine import Engine
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.store import Store
 from service.writers import Writer
 from tests.running import serving

@@ -7,7 +7,9 @@ from typing import Any
 from service.config.settings import (
     Settings,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.view import View
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, SensorColumns, UavState

@@ -25,7 +25,9 @@ from service.llm.answer_format import (
 )
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.prompting.candidates import (
     GuidedTemplate,
     velocities,

@@ -16,11 +16,13 @@ import httpx
 import psutil
 import pytest
 
-from service.events import Settled
 from service.keys import editing
 from service.live.history import History
 from service.live.routes import STATIC
 from service.live.watch import MOST_LISTENERS
+from service.mission.events import (
+    Settled,
+)
 from service.packing import pack
 from service.prompting.prompt import (
     Prompt,

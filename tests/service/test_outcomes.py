@@ -16,7 +16,9 @@ from service.config.settings import (
 from service.engine import Engine
 from service.journal import Unkept
 from service.live.watch import Live
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )

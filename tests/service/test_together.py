@@ -17,7 +17,9 @@ from service.asking import Asking, Word
 from service.llm.answer_format import (
     constrain_labels,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.prompting.candidates import (
     GuidedTemplate,
 )

@@ -11,7 +11,9 @@ import pytest
 from service.llm.answer_format import (
     NoDecision,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.verifier import verify
 from service.view import View
 from shared.wire import MissionSpec

@@ -22,12 +22,16 @@ from service.config.settings import (
 )
 from service.errors import Refused, Unavailable
 from service.journal import Journal
-from service.mission import Mission
+from service.mission.idempotency import (
+    IdempotentAnswers,
+)
+from service.mission.mission import (
+    Mission,
+)
 from service.observability.metrics import (
     Metrics,
 )
 from service.packing import pack
-from service.repeats import Repeats
 from service.replaying import revived
 from service.store import Kept, Store
 from service.writers import Done, WriteFailed, Writer
@@ -297,7 +301,7 @@ def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeyp
 
 
 async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again() -> None:
-    repeats = Repeats(8)
+    repeats = IdempotentAnswers(8)
     begun = asyncio.Event()
 
     async def never() -> str:

@@ -18,7 +18,9 @@ from service.config.settings import (
 from service.learning.attention import (
     top_k,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.onboard import attention_of
 from shared.features import FEATURES
 from shared.missions import MissionAttention

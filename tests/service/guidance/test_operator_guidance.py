@@ -29,7 +29,9 @@ from service.llm.server import (
     Rewriting,
     WarmUp,
 )
-from service.mission import Mission
+from service.mission.mission import (
+    Mission,
+)
 from service.policy import decide_without_llm
 from service.prompting.candidates import (
     GuidedTemplate,

@@ -177,7 +177,7 @@ def test_a_decision_never_sees_half_a_step() -> None:
 def test_nothing_brings_torchs_compiler_into_the_process() -> None:
     # Its import takes seconds, on a busy machine longer than a decision may.
     script = (
-        "import sys; from service.mission import Mission; from service.config.settings import Settings;"
+        "import sys; from service.mission.mission import Mission; from service.config.settings import Settings;"
         "from shared.wire import MissionSpec; from tests.service.learning.test_learner import sample;"
         "Mission('m', MissionSpec(), Settings()).learner.update(sample('reach'), 0.3);"
         "print([m for m in ('torch._dynamo', 'torch._inductor', 'sympy') if m in sys.modules])"

@@ -12,10 +12,12 @@ from service.learning.sample import (
 from service.learning.trust import (
     Advice,
 )
+from service.mission.idempotency import (
+    Answered,
+)
 from service.prompting.row_formats import (
     Cells,
 )
-from service.repeats import Answered
 from shared.wire import Outcome, UavState
 
 
@@ -49,7 +51,7 @@ class Pending:
 
 
 @dataclass(frozen=True, slots=True)
-class Counsel:
+class AdviserReport:
     """What the advisers said to a decision, of whom one was this LLM."""
 
     model: str
@@ -70,7 +72,7 @@ class Decided:
 
     decision: Pending
     attempt: int
-    counsel: Counsel | None
+    counsel: AdviserReport | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ STEPS_APART = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class Reservation:
     """The sensor that a UAV was given at a step, and by which of its attempts."""
 
     uav_id: int
@@ -19,12 +19,12 @@ class Given:
     attempt: int
 
 
-class Turns:
+class Reservations:
     """By step and UAV; the earliest of too many steps is forgotten."""
 
     def __init__(self) -> None:
         # A step's in a tuple, and attempts only while they are under way: a mission has 64 steps of them.
-        self._given: dict[int, tuple[Given, ...]] = {}
+        self._given: dict[int, tuple[Reservation, ...]] = {}
         self._attempts: dict[int, dict[int, int]] = {}
 
     def reserved(self, step: int, uav_id: int) -> frozenset[int]:
@@ -40,11 +40,11 @@ class Turns:
         _forget_lowest(self._attempts)
         return number
 
-    def given(self, step: int, uav_id: int) -> Given | None:
+    def given(self, step: int, uav_id: int) -> Reservation | None:
         """What the UAV was told last at this step."""
         return next((given for given in self._given.get(step, ()) if given.uav_id == uav_id), None)
 
-    def give(self, step: int, given: Given) -> None:
+    def give(self, step: int, given: Reservation) -> None:
         """Reserve a sensor, and free what the UAV was given before at this step."""
         others = tuple(other for other in self._given.get(step, ()) if other.uav_id != given.uav_id)
         self._given[step] = (*others, given)
@@ -68,7 +68,8 @@ class Turns:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As it was when the state was taken."""
         self._given = {
-            step: tuple(Given(uav, *given) for uav, given in by_uav.items()) for step, by_uav in state["given"].items()
+            step: tuple(Reservation(uav, *given) for uav, given in by_uav.items())
+            for step, by_uav in state["given"].items()
         }
         self._attempts = state["attempts"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 
-class Applied:
+class AppliedOutcomes:
     """The newest outcomes by decision, a hundred bytes each: an edge remembers hundreds of each of its missions.
 
     Args:

@@ -12,7 +12,7 @@ from service.errors import Incomplete, Refused
 from shared.channel import FloatArray
 from shared.wire import SensorColumns, UavState
 
-Told = TypeVar("Told", bound=UavState)
+AnyReport = TypeVar("Told", bound=UavState)
 
 # The columns of a base, in this order.
 _COLUMNS = ("id", "queue", "battery", "channel_gain", "last_seen")
@@ -27,7 +27,7 @@ class Base:
     columns: FloatArray
 
 
-class Bases:
+class DeltaBases:
     """The last report of each UAV that asks for it, by what it was told then.
 
     In memory only, 40 bytes a sensor: what is lost with the process, or the mission, the UAV tells anew.
@@ -43,7 +43,7 @@ class Bases:
             return
         self._held[uav.uav_id] = Base(decision_id, step, _array(uav.sensors))
 
-    def complete(self, uav: Told, step: int, places: FloatArray, at: str = "") -> Told:
+    def complete(self, uav: AnyReport, step: int, places: FloatArray, at: str = "") -> AnyReport:
         """The report in full; as it is, where it leaves nothing out.
 
         Args:

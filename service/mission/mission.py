@@ -9,8 +9,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.applied import Applied
-from service.bases import Bases, Told
 from service.config.prompt_budget import (
     prompt_tokens,
 )
@@ -18,7 +16,6 @@ from service.config.settings import (
     Settings,
 )
 from service.errors import Conflict, NotFound, Refused
-from service.events import Counsel, Decided, Event, Guided, Pending, Reported, Settled, unheard
 from service.guidance.operator_guidance import (
     OperatorGuidance,
 )
@@ -39,7 +36,39 @@ from service.learning.trust import (
     PRIOR_UNPLANNED,
     Trust,
 )
-from service.planner import Planner, can_plan
+from service.mission.applied_outcomes import (
+    AppliedOutcomes,
+)
+from service.mission.delta_reports import (
+    AnyReport,
+    DeltaBases,
+)
+from service.mission.events import (
+    AdviserReport,
+    Decided,
+    Event,
+    Guided,
+    Pending,
+    Reported,
+    Settled,
+    unheard,
+)
+from service.mission.idempotency import (
+    IdempotentAnswers,
+)
+from service.mission.planner import (
+    Planner,
+    can_plan,
+)
+from service.mission.reservations import (
+    STEPS_APART,
+    Reservation,
+    Reservations,
+)
+from service.mission.resolved_spec import (
+    in_full,
+    required,
+)
 from service.prompting.candidates import (
     GuidedTemplate,
 )
@@ -55,9 +84,6 @@ from service.prompting.prompt import (
     Template,
     note_block,
 )
-from service.repeats import Repeats
-from service.spec import in_full, required
-from service.turns import STEPS_APART, Given, Turns
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.guidance import Guidance, GuidanceAnswer
@@ -121,12 +147,12 @@ class Mission:
         self.feedback = 0
         self.learner = Learner(weights, learning_rate=settings.learning_rate)
         self.records = Records(self.scenario)
-        self.turns = Turns()
+        self.turns = Reservations()
         self._pending: dict[str, Pending] = {}
-        self._applied = Applied(_APPLIED_PER_UAV * self.scenario.uavs)
-        self.repeats = Repeats(_PENDING_PER_UAV * self.scenario.uavs)
+        self._applied = AppliedOutcomes(_APPLIED_PER_UAV * self.scenario.uavs)
+        self.repeats = IdempotentAnswers(_PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
-        self.bases = Bases()
+        self.bases = DeltaBases()
         wanted = spec.planner == "on"
         self.planner = Planner(self.scenario, self.belief) if wanted and can_plan(self.scenario) else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
@@ -200,7 +226,7 @@ class Mission:
         """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
         return self.records.rates
 
-    def completed(self, uav: Told, step: int, at: str = "") -> Told:
+    def completed(self, uav: AnyReport, step: int, at: str = "") -> AnyReport:
         """A UAV's report in full. What this mission's world does not have is refused, before anything is recorded.
 
         Args:
@@ -208,7 +234,7 @@ class Mission:
 
         Raises:
             Refused: a step far past the newest one, an unknown UAV or sensor, a queue past its capacity, a beacon later
-                than the step, an outcome of another UAV's decision, or as :meth:`Bases.complete`.
+                than the step, an outcome of another UAV's decision, or as :meth:`DeltaBases.complete`.
             Incomplete: the report leaves out what is not held.
             NotFound: an outcome of a decision that this mission does not know.
         """
@@ -315,7 +341,7 @@ class Mission:
         """Sensors that other UAVs were given this step."""
         return self.turns.reserved(step, uav_id)
 
-    def commit(self, decision: Pending, attempt: int = 1, counsel: Counsel | None = None) -> None:
+    def commit(self, decision: Pending, attempt: int = 1, counsel: AdviserReport | None = None) -> None:
         """Reserve the sensor, note the visit, and wait for the outcome.
 
         An earlier decision for the same UAV and step is withdrawn: its sensor is free again and was not visited.
@@ -328,7 +354,7 @@ class Mission:
             raise Conflict("step", f"UAV {decision.uav_id} asked again for step {decision.step} and was answered")
         if earlier is not None:
             self.records.withdraw(earlier.sensor_id, earlier.decision_id)
-        given = Given(decision.uav_id, decision.sensor_id, decision.decision_id, attempt)
+        given = Reservation(decision.uav_id, decision.sensor_id, decision.decision_id, attempt)
         self.turns.give(decision.step, given)
         self.records.presume(decision.sensor_id, decision.decision_id, decision.step)
         self._pending[decision.decision_id] = decision

@@ -29,7 +29,7 @@ class Answered:
         return max(1, self.body.count(_A_DECISION))
 
 
-class Repeats:
+class IdempotentAnswers:
     """The newest answers by key, as JSON.
 
     Args:
