@@ -38,7 +38,9 @@ from service.prompting.token_accounting import (
 )
 from service.prompting.warm_up import warm_up
 from service.routes import router
-from service.store import Store
+from service.storage.store import (
+    Store,
+)
 
 
 class State(TypedDict):

@@ -25,7 +25,6 @@ from service.guidance.note_compiler import (
     NoteCompiler,
 )
 from service.guided import Deliberation
-from service.journal import Journal, Unkept
 from service.learning.trust import (
     LLM,
 )
@@ -66,7 +65,13 @@ from service.prompting.token_accounting import (
     TokenCounter,
     with_usage,
 )
-from service.store import Store
+from service.storage.journal import (
+    Journal,
+    NullJournal,
+)
+from service.storage.store import (
+    Store,
+)
 from service.verifier import verify
 from service.view import View
 from shared.actions import Action
@@ -116,7 +121,7 @@ class Engine:
         self._judging = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="critic")
         self._plans: set[asyncio.Task[None]] = set()
         self._own_s = _OWN_S
-        self.keeper: Journal | Unkept = Unkept() if store is None else Journal(store, metrics)
+        self.keeper: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self.live = Live()
         self._outcomes = Outcomes(metrics, self.keeper, self.live)
         self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)

@@ -14,15 +14,22 @@ from service.config.settings import (
     Settings,
 )
 from service.errors import Conflict, NotFound, Unavailable
-from service.journal import Journal, Unkept
 from service.mission.mission import (
     Mission,
 )
 from service.observability.metrics import (
     Metrics,
 )
-from service.replaying import revived
-from service.store import Store
+from service.storage.journal import (
+    Journal,
+    NullJournal,
+)
+from service.storage.recovery import (
+    restore_mission,
+)
+from service.storage.store import (
+    Store,
+)
 from shared.wire import BatchRequest, DecideRequest, MissionSpec
 
 log = logging.getLogger(__name__)
@@ -43,7 +50,7 @@ class Missions:
         self,
         settings: Settings,
         metrics: Metrics,
-        keeper: Journal | Unkept,
+        keeper: Journal | NullJournal,
         store: Store | None,
         on_wake: Callable[[Mission], None],
     ) -> None:
@@ -174,7 +181,7 @@ class Missions:
             kept = await loop.run_in_executor(self._reading, store.load, mission_id)
             if kept is None:
                 raise ValueError("it is gone from the store")
-            mission = await loop.run_in_executor(self._reading, revived, mission_id, kept, self._settings)
+            mission = await loop.run_in_executor(self._reading, restore_mission, mission_id, kept, self._settings)
         except SQLAlchemyError as error:
             log.error("mission %s: the store cannot be read: %s", mission_id, str(error).splitlines()[0])
             raise Unavailable("mission_id", "the store cannot be read; its log says more") from None

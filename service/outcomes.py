@@ -11,7 +11,6 @@ from contextlib import suppress
 from typing import Literal, NamedTuple
 
 from service.errors import Conflict
-from service.journal import Journal, Unkept
 from service.learning.sample import (
     Sample,
 )
@@ -21,6 +20,10 @@ from service.mission.mission import (
 )
 from service.observability.metrics import (
     Metrics,
+)
+from service.storage.journal import (
+    Journal,
+    NullJournal,
 )
 from shared.wire import Outcome
 
@@ -46,7 +49,7 @@ class Outcomes:
     and a fleet that is flown again in the same order learns the same.
     """
 
-    def __init__(self, metrics: Metrics, keeper: Journal | Unkept, live: Live) -> None:
+    def __init__(self, metrics: Metrics, keeper: Journal | NullJournal, live: Live) -> None:
         self._metrics = metrics
         self._live = live
         self._keeper = keeper

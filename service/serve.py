@@ -107,9 +107,13 @@ def _serve(listener: socket.socket, host: str) -> int:
 def _application(settings: Settings) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
     from service.app import create_app
-    from service.hold import StoreUnusable
     from service.keys import BadKeys
-    from service.store import Store
+    from service.storage.locks import (
+        StoreUnusable,
+    )
+    from service.storage.store import (
+        Store,
+    )
 
     try:
         return create_app(settings, None if settings.store == "none" else Store(settings.store))

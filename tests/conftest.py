@@ -17,7 +17,9 @@ from service.app import create_app
 from service.config.settings import (
     Settings,
 )
-from service.store import Store
+from service.storage.store import (
+    Store,
+)
 from tests.running import serving
 
 # Edges that are started as processes keep nothing, unless a test says so: they would share the user's store.

@@ -103,7 +103,7 @@ class Mission:
     """One fleet's state. Only the event loop touches it.
 
     Everything that changes it is an event, which ``record`` hears of: the same events in the same order, on the same
-    spec, make the same mission again (see :mod:`service.replaying`).
+    spec, make the same mission again (see :mod:`service.storage.recovery`).
 
     Attributes:
         asked_for: the spec as it was given; ``spec`` says in full what the service's settings made of it.

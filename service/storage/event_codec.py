@@ -19,7 +19,10 @@ from service.mission.events import (
 from service.mission.idempotency import (
     Answered,
 )
-from service.packing import pack, unpack
+from service.storage.serialization import (
+    pack,
+    unpack,
+)
 from shared.wire import Outcome, UavState
 
 # Requests carry more; the outcome that comes with a report is an event of its own, and how it was sent is past.

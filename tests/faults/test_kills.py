@@ -20,8 +20,12 @@ from service.app import create_app
 from service.config.settings import (
     Settings,
 )
-from service.journal import Journal
-from service.store import Store
+from service.storage.journal import (
+    Journal,
+)
+from service.storage.store import (
+    Store,
+)
 from tests.e2e.processes import serving_edge
 from tests.faults.fleet import UAVS, Report
 from tests.faults.table import Tables

@@ -16,7 +16,6 @@ import numpy as np
 import psutil
 
 from service.app import create_app
-from service.changes import Change
 from service.config.settings import (
     Settings,
 )
@@ -24,8 +23,15 @@ from service.engine import Engine
 from service.mission.mission import (
     Mission,
 )
-from service.store import Store
-from service.writers import Writer
+from service.storage.operations import (
+    Change,
+)
+from service.storage.store import (
+    Store,
+)
+from service.storage.writer import (
+    Writer,
+)
 from tests.running import serving
 
 Body = dict[str, Any]

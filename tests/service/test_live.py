@@ -23,7 +23,6 @@ from service.live.watch import MOST_LISTENERS
 from service.mission.events import (
     Settled,
 )
-from service.packing import pack
 from service.prompting.prompt import (
     Prompt,
 )
@@ -34,6 +33,9 @@ from service.prompting.unpruned_baseline import (
     Uncompressed,
 )
 from service.storage.event_codec import decode, encode
+from service.storage.serialization import (
+    pack,
+)
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav

@@ -14,7 +14,6 @@ from service.config.settings import (
     Settings,
 )
 from service.engine import Engine
-from service.journal import Unkept
 from service.live.watch import Live
 from service.mission.mission import (
     Mission,
@@ -23,6 +22,9 @@ from service.observability.metrics import (
     Metrics,
 )
 from service.outcomes import Outcomes
+from service.storage.journal import (
+    NullJournal,
+)
 from shared.wire import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state
 from tests.service.making import attended, uav
@@ -71,7 +73,7 @@ def test_as_many_lessons_are_learned_as_outcomes_come() -> None:
     turns = 30
 
     async def flown() -> list[int]:
-        outcomes = Outcomes(Metrics(), Unkept(), Live())
+        outcomes = Outcomes(Metrics(), NullJournal(), Live())
         fleets = [Mission(f"fleet{n}", MissionSpec(mode="value"), Settings(mode="value")) for n in range(40)]
         for turn in range(turns):
             for mission in fleets:

@@ -12,16 +12,41 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.changes import Statements
-from service.hold import DatabaseHold, FileHold, StoreUnusable
 from service.mission.events import (
     Event,
 )
-from service.packing import unpack
-from service.schema import SCHEMA, checkpoints, journal, missions, terms
-from service.sqlite_writer import BUSY_MS, PRAGMAS
 from service.storage.event_codec import decode
-from service.writers import ProcessWriter, ThreadWriter, Writer
+from service.storage.locks import (
+    AdvisoryLock,
+    FileLock,
+    StoreUnusable,
+)
+from service.storage.process_writer import (
+    ProcessWriter,
+)
+from service.storage.schema import (
+    SCHEMA,
+    checkpoints,
+    journal,
+    missions,
+    terms,
+)
+from service.storage.serialization import (
+    unpack,
+)
+from service.storage.sql_statements import (
+    Statements,
+)
+from service.storage.sqlite_process import (
+    BUSY_MS,
+    PRAGMAS,
+)
+from service.storage.thread_writer import (
+    ThreadWriter,
+)
+from service.storage.writer import (
+    Writer,
+)
 from shared.wire import MissionSpec
 
 # The longest that PostgreSQL is waited for: to connect, for a statement, and for a network that says nothing.
@@ -30,7 +55,7 @@ _STATEMENT_MS = 5000
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class StoredMission:
     """A mission as the store has it: its last checkpoint, and the events since; ``seq`` is the newest's."""
 
     asked_for: MissionSpec
@@ -51,15 +76,15 @@ class Store:
     """
 
     def __init__(self, url: str) -> None:
-        self._hold: FileHold | DatabaseHold | None = None
+        self._hold: FileLock | AdvisoryLock | None = None
         try:
             self._engine = _engine(url)
             if self._engine.url.database and self._engine.dialect.name == "sqlite":
-                self._hold = FileHold(self._engine.url.database)
+                self._hold = FileLock(self._engine.url.database)
             else:
-                self._hold = DatabaseHold(self._engine, terms)
+                self._hold = AdvisoryLock(self._engine, terms)
             self._migrate()
-            if isinstance(self._hold, DatabaseHold):
+            if isinstance(self._hold, AdvisoryLock):
                 self._hold.begin_term()
         except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
             self.close()
@@ -81,7 +106,7 @@ class Store:
         with self._engine.connect() as db:
             return list(db.scalars(sa.select(missions.c.mission_id)))
 
-    def load(self, mission_id: str) -> Kept | None:
+    def load(self, mission_id: str) -> StoredMission | None:
         """A mission as it was last written, or None; raises ``ValueError`` where what is there cannot be read."""
         with self._engine.connect() as db:
             found = db.execute(sa.select(missions).where(missions.c.mission_id == mission_id)).first()
@@ -94,7 +119,7 @@ class Store:
         numbers = [row.seq for row in rows]
         if numbers != list(range(since + 1, since + 1 + len(rows))):
             raise ValueError(f"mission {mission_id}: events are missing after {since}")
-        return Kept(
+        return StoredMission(
             asked_for=MissionSpec.model_validate_json(found.asked_for),
             spec=MissionSpec.model_validate_json(found.spec),
             seq=since + len(rows),
@@ -106,7 +131,7 @@ class Store:
         """Who writes to it, beside the event loop; to be closed before the store is."""
         assert self._hold is not None
         statements = Statements(self._engine.dialect)
-        if isinstance(self._hold, FileHold):
+        if isinstance(self._hold, FileLock):
             return ProcessWriter(statements, self._hold.file, self._hold.descriptor)
         return ThreadWriter(statements, self._hold.transaction)
 

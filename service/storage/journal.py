@@ -18,7 +18,6 @@ from itertools import islice
 from typing import Any
 from zlib import crc32
 
-from service.changes import Change, Checkpoint, Deleted, Entry, Made
 from service.mission.events import (
     Decided,
     Event,
@@ -30,8 +29,20 @@ from service.mission.mission import (
 from service.observability.metrics import (
     Metrics,
 )
-from service.packing import pack
-from service.store import Store, cause
+from service.storage.operations import (
+    Change,
+    Checkpoint,
+    Deleted,
+    Entry,
+    Made,
+)
+from service.storage.serialization import (
+    pack,
+)
+from service.storage.store import (
+    Store,
+    cause,
+)
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +59,7 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
 _LINGER_S = 0.25
 
 
-class Track:
+class MissionLog:
     """A mission's place in the journal.
 
     Attributes:
@@ -64,7 +75,7 @@ class Track:
         self.over = False
 
 
-class Unkept:
+class NullJournal:
     """Keeps nothing: missions live as long as the process."""
 
     failing = False
@@ -91,7 +102,7 @@ class Journal:
         self._writer = store.writer()
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
-        self._tracks: dict[str, Track] = {}
+        self._tracks: dict[str, MissionLog] = {}
         self._queue: deque[tuple[int, Change]] = deque()
         self._added = self._written = 0
         # What is being written, since when, and whether it is the last attempt.
@@ -123,7 +134,7 @@ class Journal:
         self._follow(mission, seq, sum(map(_weight, played)))
 
     def _follow(self, mission: Mission, seq: int, since: int) -> None:
-        track = Track(mission, seq, since)
+        track = MissionLog(mission, seq, since)
         self._tracks[mission.mission_id] = track
 
         def record(event: Event) -> None:
@@ -143,7 +154,7 @@ class Journal:
             track.mission.record = unheard
         self._add(Deleted(mission_id))
 
-    def due(self, mission: Mission, least: int = _EVENTS) -> Track | None:
+    def due(self, mission: Mission, least: int = _EVENTS) -> MissionLog | None:
         """The mission's track, where it has so many events since its last checkpoint; they are counted anew then."""
         track = self._tracks.get(mission.mission_id)
         if track is None or track.mission is not mission or track.since < least:
@@ -151,7 +162,7 @@ class Journal:
         track.since = 0
         return track
 
-    def checkpoint(self, track: Track, state: dict[str, Any]) -> None:
+    def checkpoint(self, track: MissionLog, state: dict[str, Any]) -> None:
         """Keep a mission's state as it is now in place of the events until now.
 
         While the store fails events would gather without end, so those that the checkpoint stands for leave the queue.
@@ -202,7 +213,7 @@ class Journal:
         self._writer.close()
         return True
 
-    def _take_packed(self, track: Track, seq: int, packing: asyncio.Future[bytes]) -> None:
+    def _take_packed(self, track: MissionLog, seq: int, packing: asyncio.Future[bytes]) -> None:
         self._packed.discard(packing)
         if packing.cancelled():
             return
@@ -211,7 +222,7 @@ class Journal:
             return
         self._take(track, seq, packing.result())
 
-    def _take(self, track: Track, seq: int, packed: bytes) -> None:
+    def _take(self, track: MissionLog, seq: int, packed: bytes) -> None:
         if track.over:
             return
         taken = Checkpoint(track.mission.mission_id, seq, packed)

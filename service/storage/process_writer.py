@@ -1,4 +1,4 @@
-"""Who writes to a store, beside the event loop: a process for SQLite, a thread for PostgreSQL."""
+"""The writer of a SQLite store: a process of its own at the other end of a socket."""
 
 from __future__ import annotations
 
@@ -7,49 +7,31 @@ import logging
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
-from functools import partial
-from queue import SimpleQueue
-from typing import Protocol
+from collections.abc import Sequence
+from contextlib import suppress
 
 import msgpack
-import sqlalchemy as sa
 
-from service import sqlite_writer
-from service.changes import Change, Statement, Statements
-from service.sqlite_writer import LENGTH, framed
+from service.storage import (
+    sqlite_process,
+)
+from service.storage.operations import (
+    Change,
+)
+from service.storage.sql_statements import (
+    Statements,
+)
+from service.storage.sqlite_process import (
+    LENGTH,
+    framed,
+)
+from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)
-
-# Called on the event loop: with None when all is on disk, or with why nothing is, as far as is known.
-Done = Callable[[Exception | None], None]
 
 # The longest that a process may take to end when nothing is left to write.
 _ENDS_S = 1.0
 _READ_BYTES = 65_536
-
-
-class WriteFailed(Exception):
-    """What was to be written is not on disk, as far as is known."""
-
-
-class Writer(Protocol):
-    """Writes one transaction after the other; called from the event loop."""
-
-    def write(self, changes: Sequence[Change], done: Done) -> None:
-        """Begin to write all of it, in order, or nothing; the one before must have ended.
-
-        Args:
-            done: told once, in a later turn of the loop, how it ended.
-
-        Raises:
-            Exception: it could not begin; ``done`` is not told.
-        """
-
-    def close(self) -> None:
-        """End; nothing may be on its way."""
 
 
 class ProcessWriter:
@@ -128,7 +110,7 @@ class ProcessWriter:
             try:
                 self._process = subprocess.Popen(
                     # Without the folder of that file in its path: some of its names are the standard library's too.
-                    [sys.executable, "-P", sqlite_writer.__file__, str(theirs.fileno()), self._path],
+                    [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), self._path],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     # Not the edge's own: who waits for the end of that waits for a killed edge's last commit besides.
@@ -200,45 +182,3 @@ class ProcessWriter:
         done, self._done = self._done, None
         if done is not None:
             done(error)
-
-
-class ThreadWriter:
-    """Has a thread write to a database that is another process anyhow.
-
-    Args:
-        statements: SQL for the database.
-        begin: makes a transaction, committed at its end.
-    """
-
-    def __init__(self, statements: Statements, begin: Callable[[], AbstractContextManager[sa.Connection]]) -> None:
-        self._statements = statements
-        self._begin = begin
-        self._given: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        # Nobody waits for one that hangs, when the edge ends.
-        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
-        self._thread.start()
-
-    def write(self, changes: Sequence[Change], done: Done) -> None:
-        """As :class:`Writer` says."""
-        self._given.put(partial(self._write, self._statements.of(changes), done, asyncio.get_running_loop()))
-
-    def close(self) -> None:
-        """As :class:`Writer` says."""
-        self._given.put(None)
-        self._thread.join()
-
-    def _run(self) -> None:
-        while (given := self._given.get()) is not None:
-            given()
-
-    def _write(self, transaction: Sequence[Statement], done: Done, loop: asyncio.AbstractEventLoop) -> None:
-        failed: Exception | None = None
-        try:
-            with self._begin() as db:
-                for sql, rows in transaction:
-                    db.exec_driver_sql(sql, rows)
-        except Exception as error:
-            failed = error
-        # Unless the edge has ended meanwhile.
-        with suppress(RuntimeError):
-            loop.call_soon_threadsafe(done, failed)

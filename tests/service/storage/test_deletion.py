@@ -15,7 +15,10 @@ from typing import Any
 
 import pytest
 
-from service.store import Kept, Store
+from service.storage.store import (
+    Store,
+    StoredMission,
+)
 from tests.running import listening
 from tests.service.keeping import copy_of, fly, running, writers
 from tests.service.stub_llm import misbehaving, saying, wait_for
@@ -89,7 +92,7 @@ def test_a_mission_deleted_while_it_wakes_stays_deleted(
         fly(client, report, range(2))
     load, begun = Store.load, threading.Event()
 
-    def slowly(self: Store, mission_id: str) -> Kept | None:
+    def slowly(self: Store, mission_id: str) -> StoredMission | None:
         begun.set()
         time.sleep(0.7)
         return load(self, mission_id)

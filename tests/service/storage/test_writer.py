@@ -14,10 +14,21 @@ import httpx
 import psutil
 import pytest
 
-from service.changes import Change, Checkpoint, Deleted, Made
-from service.hold import StoreUnusable
-from service.store import Store
-from service.writers import WriteFailed
+from service.storage.locks import (
+    StoreUnusable,
+)
+from service.storage.operations import (
+    Change,
+    Checkpoint,
+    Deleted,
+    Made,
+)
+from service.storage.store import (
+    Store,
+)
+from service.storage.writer import (
+    WriteFailed,
+)
 from shared.wire import MissionSpec
 from tests.e2e.processes import serving_edge
 from tests.service.keeping import fly, running, writers, written
@@ -118,7 +129,7 @@ async def test_a_writer_that_ends_again_and_again_is_told_with_what_it_said(
     store = Store(str(tmp_path / "m.db"))
     broken = tmp_path / "broken.py"
     broken.write_text("raise SystemExit('this disk is on fire')")
-    monkeypatch.setattr("service.sqlite_writer.__file__", str(broken))
+    monkeypatch.setattr("service.storage.sqlite_process.__file__", str(broken))
     writer = store.writer()
     for _ in range(3):
         with pytest.raises(WriteFailed, match="this disk is on fire"):

@@ -11,9 +11,15 @@ import pytest
 from alembic.config import Config
 from sqlalchemy import create_engine, text
 
-from service.hold import StoreUnusable
-from service.schema import SCHEMA
-from service.store import Store
+from service.storage.locks import (
+    StoreUnusable,
+)
+from service.storage.schema import (
+    SCHEMA,
+)
+from service.storage.store import (
+    Store,
+)
 from tests.service.keeping import fly, running
 
 Body = dict[str, Any]
@@ -60,7 +66,7 @@ def test_an_address_that_is_none_is_refused_and_no_password_is_told(url: str) ->
 
 def _migrations() -> Config:
     config = Config()
-    config.set_main_option("script_location", "service/migrations")
+    config.set_main_option("script_location", "service/storage/migrations")
     config.set_main_option("path_separator", "os")
     return config
 

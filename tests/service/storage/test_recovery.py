@@ -16,12 +16,10 @@ from typing import Any
 import pytest
 
 from service import outcomes
-from service.changes import Change, Checkpoint, Entry
 from service.config.settings import (
     Settings,
 )
 from service.errors import Refused, Unavailable
-from service.journal import Journal
 from service.mission.idempotency import (
     IdempotentAnswers,
 )
@@ -31,10 +29,29 @@ from service.mission.mission import (
 from service.observability.metrics import (
     Metrics,
 )
-from service.packing import pack
-from service.replaying import revived
-from service.store import Kept, Store
-from service.writers import Done, WriteFailed, Writer
+from service.storage.journal import (
+    Journal,
+)
+from service.storage.operations import (
+    Change,
+    Checkpoint,
+    Entry,
+)
+from service.storage.recovery import (
+    restore_mission,
+)
+from service.storage.serialization import (
+    pack,
+)
+from service.storage.store import (
+    Store,
+    StoredMission,
+)
+from service.storage.writer import (
+    Done,
+    WriteFailed,
+    Writer,
+)
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome
 from tests.running import serving
@@ -107,7 +124,7 @@ async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_pat
     assert isinstance(tail[0], Checkpoint)
     kept = store.load("test")
     assert kept is not None
-    assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+    assert same(state(restore_mission("test", kept, Settings(mode="value"))), state(mission))
     assert await journal.close(5)
     store.close()
 
@@ -141,7 +158,7 @@ async def test_a_journal_that_is_closed_writes_no_more_and_starts_nothing(tmp_pa
 
 
 async def test_large_checkpoints_are_written_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.journal._MOST_BYTES", 50_000)
+    monkeypatch.setattr("service.storage.journal._MOST_BYTES", 50_000)
     store = MoodyStore(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
     most: list[int] = []
@@ -189,7 +206,7 @@ async def test_a_large_checkpoint_is_packed_beside_the_decisions(
     assert track is not None
     if thread == "MainThread":
         at_rest.set()
-    monkeypatch.setattr("service.journal.pack", slowly)
+    monkeypatch.setattr("service.storage.journal.pack", slowly)
     journal.checkpoint(track, {**mission.state_dict(), "learner": mission.learner.state_dict()})
     # What happens while it is packed is on disk at once, and is not lost when the checkpoint comes after it.
     for step in range(1, 4):
@@ -199,7 +216,7 @@ async def test_a_large_checkpoint_is_packed_beside_the_decisions(
     assert await journal.close(5)
     kept = store.load("test")
     assert kept is not None and kept.state is not None and len(kept.events) == 3
-    assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+    assert same(state(restore_mission("test", kept, Settings(mode="value"))), state(mission))
     assert threads == [thread]
     store.close()
 
@@ -212,7 +229,7 @@ def test_a_store_that_hangs_keeps_no_other_mission_waiting_and_a_sleeping_one_no
             client.post("/decide", json=report(mission_id=f"m{number}"))
     load, hung, well = Store.load, threading.Event(), threading.Event()
 
-    def slowly(self: Store, mission_id: str) -> Kept | None:
+    def slowly(self: Store, mission_id: str) -> StoredMission | None:
         hung.set()
         well.wait(timeout=60)
         return load(self, mission_id)
@@ -285,7 +302,7 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
         kept = store.load("test")
         store.close()
         assert kept is not None
-        assert same(state(revived("test", kept, Settings(mode="value"))), state(mission))
+        assert same(state(restore_mission("test", kept, Settings(mode="value"))), state(mission))
 
 
 def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

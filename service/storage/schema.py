@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-# The newest of service/migrations/versions.
+# The newest of service/storage/migrations/versions.
 SCHEMA = "0002"
 
 metadata = sa.MetaData()

@@ -18,10 +18,12 @@ from service.mission.idempotency import (
 from service.mission.mission import (
     Mission,
 )
-from service.store import Kept
+from service.storage.store import (
+    StoredMission,
+)
 
 
-def revived(mission_id: str, kept: Kept, settings: Settings) -> Mission:
+def restore_mission(mission_id: str, kept: StoredMission, settings: Settings) -> Mission:
     """The mission as it was after the last event kept, but for its plan, which is made again.
 
     Raises:

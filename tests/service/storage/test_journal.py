@@ -15,12 +15,18 @@ from typing import Any
 import httpx
 import pytest
 
-from service import journal
 from service.config.settings import (
     Settings,
 )
-from service.replaying import revived
-from service.store import Store
+from service.storage import (
+    journal,
+)
+from service.storage.recovery import (
+    restore_mission,
+)
+from service.storage.store import (
+    Store,
+)
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
 
 Body = dict[str, Any]
@@ -33,7 +39,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, mode: str, events: int
 ) -> None:
     monkeypatch.setattr(journal, "_EVENTS", events)
-    monkeypatch.setattr("service.journal.Journal.due.__defaults__", (events,))
+    monkeypatch.setattr("service.storage.journal.Journal.due.__defaults__", (events,))
     settings = Settings(mode=mode, llm_gguf=Path("none"))
     with running(tmp_path / "m.db", mode=mode, llm_gguf="none", planner_ms=20) as (client, engine):
         spec = {"seed": 3, "note": "visit sensor 2 every fourth step", "mode": mode, "prompt": {"selection": "similar"}}
@@ -54,7 +60,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
     else:
         assert kept.state is None
         assert len(kept.events) > 170
-    again = revived("test", kept, settings)
+    again = restore_mission("test", kept, settings)
     after = state(again)
     store.close()
     assert [name for name in before if not same(before[name], after[name])] == []
@@ -183,7 +189,7 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
 def test_what_waits_for_a_store_that_fails_is_bounded(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.journal.Journal.due.__defaults__", (20,))
+    monkeypatch.setattr("service.storage.journal.Journal.due.__defaults__", (20,))
     with running(tmp_path / "m.db") as (client, engine):
         fly(client, report, range(3))
         other = locked(tmp_path / "m.db")

@@ -1,10 +1,12 @@
-"""Run by alembic, on the connection that :meth:`service.store.Store` gives it."""
+"""Run by alembic, on the connection that :meth:`service.storage.store.Store` gives it."""
 
 from __future__ import annotations
 
 from alembic import context
 
-from service.schema import metadata
+from service.storage.schema import (
+    metadata,
+)
 
 context.configure(connection=context.config.attributes["connection"], target_metadata=metadata)
 with context.begin_transaction():

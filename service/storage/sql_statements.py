@@ -1,4 +1,4 @@
-"""What changes a store, and the SQL for it."""
+"""The SQL that makes the store's changes, in one dialect."""
 
 from __future__ import annotations
 
@@ -9,49 +9,13 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.mission.events import (
-    Event,
-)
-from service.schema import checkpoints, journal, missions
 from service.storage.event_codec import encode
-from shared.wire import MissionSpec
-
-
-@dataclass(frozen=True, slots=True)
-class Made:
-    """A mission begins."""
-
-    mission_id: str
-    asked_for: MissionSpec
-    spec: MissionSpec
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """The event number ``seq`` of a mission, from 1."""
-
-    mission_id: str
-    seq: int
-    event: Event
-
-
-@dataclass(frozen=True, slots=True)
-class Checkpoint:
-    """A mission's whole state after event ``seq``, packed."""
-
-    mission_id: str
-    seq: int
-    state: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Deleted:
-    """A mission is over."""
-
-    mission_id: str
-
-
-Change = Made | Entry | Checkpoint | Deleted
+from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
+from service.storage.schema import (
+    checkpoints,
+    journal,
+    missions,
+)
 
 # As the database's driver takes it, and its parameters: a row, or many.
 Statement = tuple[str, list[Any]]

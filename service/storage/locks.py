@@ -21,7 +21,7 @@ class StoreUnusable(Exception):
     """The store cannot be opened or written to; the text says why, and names no password."""
 
 
-class FileHold:
+class FileLock:
     """Has a SQLite file as long as this process lives, however it ends, and the one that writes for it.
 
     Attributes:
@@ -54,7 +54,7 @@ class FileHold:
         self._lock.close()
 
 
-class DatabaseHold:
+class AdvisoryLock:
     """Has a PostgreSQL database as long as its connection lives.
 
     A connection that broke lets another edge in, unseen. So each edge begins a term of its own, a number in the
