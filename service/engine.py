@@ -28,7 +28,9 @@ from service.guided import Deliberation
 from service.learning.trust import (
     LLM,
 )
-from service.live.watch import Live
+from service.live.broadcaster import (
+    Broadcaster,
+)
 from service.llm.answer_format import (
     NoDecision,
     check_answer,
@@ -122,7 +124,7 @@ class Engine:
         self._plans: set[asyncio.Task[None]] = set()
         self._own_s = _OWN_S
         self.keeper: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
-        self.live = Live()
+        self.live = Broadcaster()
         self._outcomes = Outcomes(metrics, self.keeper, self.live)
         self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
 

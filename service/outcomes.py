@@ -14,7 +14,9 @@ from service.errors import Conflict
 from service.learning.sample import (
     Sample,
 )
-from service.live.watch import Live
+from service.live.broadcaster import (
+    Broadcaster,
+)
 from service.mission.mission import (
     Mission,
 )
@@ -49,7 +51,7 @@ class Outcomes:
     and a fleet that is flown again in the same order learns the same.
     """
 
-    def __init__(self, metrics: Metrics, keeper: Journal | NullJournal, live: Live) -> None:
+    def __init__(self, metrics: Metrics, keeper: Journal | NullJournal, live: Broadcaster) -> None:
         self._metrics = metrics
         self._live = live
         self._keeper = keeper

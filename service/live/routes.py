@@ -16,7 +16,9 @@ from starlette.types import Message, Scope, Send
 
 from service.errors import NotFound
 from service.guard import STILL_KNOWN
-from service.live.watch import Live
+from service.live.broadcaster import (
+    Broadcaster,
+)
 from service.problems import documented
 from service.routes import TheEngine
 from shared.missions import DecisionPrompt, MissionLine, MissionList
@@ -55,7 +57,7 @@ class EventStream(StreamingResponse):
 
     media_type = "text/event-stream"
 
-    def __init__(self, live: Live, events: AsyncGenerator[bytes], still_known: Callable[[], bool]) -> None:
+    def __init__(self, live: Broadcaster, events: AsyncGenerator[bytes], still_known: Callable[[], bool]) -> None:
         self._events = self._while_known(events, still_known)
         super().__init__(self._events)
         self._live = live
@@ -119,7 +121,7 @@ async def list_missions(engine: TheEngine) -> MissionList:
 async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
     """A mission as it flies: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
 
-    As :mod:`service.live.picture` makes them. Comments come while nothing happens; who falls behind gets a snapshot.
+    As :mod:`service.live.snapshots` makes them. Comments come while nothing happens; who falls behind gets a snapshot.
     """
     mission = await engine.missions.get(mission_id)
     still_known: Callable[[], bool] = request.scope.get(STILL_KNOWN, lambda: True)

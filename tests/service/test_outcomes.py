@@ -14,7 +14,9 @@ from service.config.settings import (
     Settings,
 )
 from service.engine import Engine
-from service.live.watch import Live
+from service.live.broadcaster import (
+    Broadcaster,
+)
 from service.mission.mission import (
     Mission,
 )
@@ -73,7 +75,7 @@ def test_as_many_lessons_are_learned_as_outcomes_come() -> None:
     turns = 30
 
     async def flown() -> list[int]:
-        outcomes = Outcomes(Metrics(), NullJournal(), Live())
+        outcomes = Outcomes(Metrics(), NullJournal(), Broadcaster())
         fleets = [Mission(f"fleet{n}", MissionSpec(mode="value"), Settings(mode="value")) for n in range(40)]
         for turn in range(turns):
             for mission in fleets:

@@ -27,7 +27,7 @@ class Blocks:
 
 
 @dataclass(slots=True)
-class Kept:
+class RecentDecision:
     """One decision: where its UAV was, m, what was asked, what was answered, and what came of it.
 
     ``order`` counts up as decisions are answered, 0 until then; ``settled`` is the order at which the outcome came.
@@ -51,11 +51,11 @@ class Kept:
         return {"order": self.order, "position": self.position, "answer": self.answer, "outcome": self.outcome}
 
 
-class History:
+class RecentDecisions:
     """By decision, oldest first. Keeping one costs references to what is there anyway: nothing is made."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[str, Kept] = OrderedDict()
+        self._kept: OrderedDict[str, RecentDecision] = OrderedDict()
         self._characters = 0
         self.order = 0
         self.edge = uuid.uuid4().hex
@@ -63,7 +63,7 @@ class History:
     def drafted(self, mission_id: str, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
         """A decision was made; it is shown once it is answered."""
         blocks = Blocks(prompt.static, prompt.experiences, prompt.state)
-        kept = Kept(mission_id, position, blocks, answer)
+        kept = RecentDecision(mission_id, position, blocks, answer)
         self._kept[answer.decision_id] = kept
         self._characters += kept.characters
         while len(self._kept) > _MOST:
@@ -84,12 +84,12 @@ class History:
             self.order += 1
             kept.outcome, kept.settled = outcome, self.order
 
-    def of(self, mission_id: str) -> list[Kept]:
+    def of(self, mission_id: str) -> list[RecentDecision]:
         """A mission's answered decisions, in the order answered."""
         found = (kept for kept in self._kept.values() if kept.mission_id == mission_id and kept.order)
         return sorted(found, key=lambda kept: kept.order)
 
-    def find(self, mission_id: str, decision_id: str) -> Kept | None:
+    def find(self, mission_id: str, decision_id: str) -> RecentDecision | None:
         """The mission's decision, if it is still kept."""
         kept = self._kept.get(decision_id)
         return kept if kept is not None and kept.mission_id == mission_id else None

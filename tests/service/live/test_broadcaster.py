@@ -17,9 +17,13 @@ import psutil
 import pytest
 
 from service.keys import editing
-from service.live.history import History
+from service.live.broadcaster import (
+    MOST_LISTENERS,
+)
+from service.live.recent_decisions import (
+    RecentDecisions,
+)
 from service.live.routes import STATIC
-from service.live.watch import MOST_LISTENERS
 from service.mission.events import (
     Settled,
 )
@@ -297,7 +301,7 @@ def prompt_of(state: str) -> Prompt:
 
 
 def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
-    history = History()
+    history = RecentDecisions()
     prompt = prompt_of("x" * 20_000)
     for number in range(2000):
         answer = answer_of(f"{number:032x}", f"m{number % 2}")
@@ -315,7 +319,7 @@ def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
 
 
 def test_a_decision_is_shown_once_it_is_answered() -> None:
-    history = History()
+    history = RecentDecisions()
     answer = answer_of("a" * 32)
     history.drafted("test", (1.0, 2.0), prompt_of(""), answer)
     assert history.of("test") == []

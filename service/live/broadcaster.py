@@ -15,8 +15,12 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 
 from service.errors import Unavailable
-from service.live import picture
-from service.live.history import History
+from service.live import (
+    snapshots,
+)
+from service.live.recent_decisions import (
+    RecentDecisions,
+)
 from service.mission.mission import (
     Mission,
 )
@@ -41,10 +45,10 @@ _HEARTBEAT_S = 5.0
 _STALLED_S, _LAST_S = 20.0, 0.5
 
 
-class Watched:
+class MissionStream:
     """One mission while somebody watches it."""
 
-    def __init__(self, mission: Mission, history: History) -> None:
+    def __init__(self, mission: Mission, history: RecentDecisions) -> None:
         self.mission = mission
         self.listeners = 0
         self.gone = False
@@ -54,7 +58,7 @@ class Watched:
         # How many there were ever; where `_frames` has fewer than a listener missed, it begins again.
         self._made = 0
         self._since = history.order
-        self._named = picture.named(mission)
+        self._named = snapshots.named(mission)
         self._whole: tuple[int, bytes] | None = None
         self._changed = asyncio.Event()
         self._pulse: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -104,7 +108,7 @@ class Watched:
 
     def _advance(self) -> None:
         """Make the next update."""
-        named = picture.named(self.mission)
+        named = snapshots.named(self.mission)
         if named != self._named:
             # Everyone needs a snapshot.
             self._named = named
@@ -112,7 +116,7 @@ class Watched:
             self._bytes = 0
         else:
             kept = self._history.of(self.mission.mission_id)
-            self._keep(_event("update", picture.update(self.mission, kept, self._since)))
+            self._keep(_event("update", snapshots.update(self.mission, kept, self._since)))
         self._since = self._history.order
         self._made += 1
         self.wake()
@@ -127,16 +131,16 @@ class Watched:
         """What came after it, and before the next update, is in that."""
         if self._whole is None or self._whole[0] != self._made:
             kept = self._history.of(self.mission.mission_id)[-_SHOWN:]
-            self._whole = self._made, _event("snapshot", picture.snapshot(self.mission, kept, self._history.edge))
+            self._whole = self._made, _event("snapshot", snapshots.snapshot(self.mission, kept, self._history.edge))
         return self._whole[1]
 
 
-class Live:
+class Broadcaster:
     """What the engine tells, for those who watch; all of it on the event loop."""
 
     def __init__(self) -> None:
-        self.history = History()
-        self._watched: dict[str, Watched] = {}
+        self.history = RecentDecisions()
+        self._watched: dict[str, MissionStream] = {}
         self._listeners = 0
         self._sending: set[asyncio.Timeout] = set()
         self._closing = False
@@ -198,7 +202,7 @@ class Live:
         """Of one mission, as server-sent events, for one listener that has its place."""
         watched = self._watched.get(mission.mission_id)
         if watched is None:
-            watched = self._watched[mission.mission_id] = Watched(mission, self.history)
+            watched = self._watched[mission.mission_id] = MissionStream(mission, self.history)
         watched.listeners += 1
         try:
             async for event in watched.events(lambda: self._closing):

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from service.live.history import Kept
+from service.live.recent_decisions import (
+    RecentDecision,
+)
 from service.mission.mission import (
     Mission,
 )
@@ -19,7 +21,7 @@ from shared.urgency import urgency
 _POINTS = 97
 
 
-def snapshot(mission: Mission, kept: list[Kept], edge: str) -> bytes:
+def snapshot(mission: Mission, kept: list[RecentDecision], edge: str) -> bytes:
     """All that the page needs to begin, decisions included.
 
     Args:
@@ -48,7 +50,7 @@ def snapshot(mission: Mission, kept: list[Kept], edge: str) -> bytes:
     )
 
 
-def update(mission: Mission, kept: list[Kept], since: int) -> bytes:
+def update(mission: Mission, kept: list[RecentDecision], since: int) -> bytes:
     """What has changed.
 
     Args:
