@@ -16,8 +16,15 @@ from paper_template import EXPERIENCES, Newest, PaperTemplate
 from service.config.settings import (
     Settings,
 )
-from service.critic import Situation
-from service.guided import offered
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.deliberation import (
+    offered,
+)
+from service.deciding.rollout_evaluator import (
+    RolloutState,
+)
 from service.llm.request_bodies import (
     chat_body,
     label_body,
@@ -32,7 +39,6 @@ from service.prompting.candidates import (
 from service.prompting.prompt import (
     Prompt,
 )
-from service.view import View
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
 from simulator.mission import Choice, LocalPilot, decide_request, fly
@@ -76,7 +82,7 @@ class Asked:
     step: int
     uav: int
     ways: dict[str, Put]
-    situation: Situation
+    situation: RolloutState
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,7 @@ class Scribe(LocalPilot):
         self._missions = missions(scenario, seed)
         self._owed: dict[int, Outcome] = {}
         self._decided: dict[int, str] = {}
-        self._step: dict[int, tuple[CandidateSet, View]] = {}
+        self._step: dict[int, tuple[CandidateSet, AttendedState]] = {}
         self.asked: list[Asked] = []
         self.together: list[Together] = []
 
@@ -115,24 +121,24 @@ class Scribe(LocalPilot):
         self._decided[uav] = name = uuid.uuid4().hex
         request = decide_request(uav, observation, "flown", outcome=self._owed.pop(uav, None))
         ways: dict[str, Put] = {}
-        situation: Situation | None = None
+        situation: RolloutState | None = None
         for way, mission in self._missions.items():
             if request.outcome is not None:
                 mission.apply(request.outcome)
             attempt = mission.observe(request, step)
-            view = View.of(mission, request, step)
+            view = AttendedState.of(mission, request, step)
             view.attend(mission)
             if view.rows:
                 ways[way] = self._put(mission, view)
             if way == GUIDED:
                 reserved = mission.reserved(step, uav)
-                situation = Situation.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
+                situation = RolloutState.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
             mission.commit(view.pending(mission, name, choice.sensor, choice.velocity), attempt)
         if situation is not None and len(ways) == len(self._missions):
             self.asked.append(Asked(self._seed, step, uav, ways, situation))
         return choice
 
-    def _put(self, mission: Mission, view: View) -> Put:
+    def _put(self, mission: Mission, view: AttendedState) -> Put:
         shown, nearest = view.shown(mission), view.nearest(mission)
         if not isinstance(mission.template, GuidedTemplate):
             return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.offered)
@@ -140,7 +146,7 @@ class Scribe(LocalPilot):
         self._note(mission, mission.template, view, offer)
         return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.offered, offer)
 
-    def _note(self, mission: Mission, template: GuidedTemplate, view: View, offer: CandidateSet) -> None:
+    def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
         self._step[view.uav_id] = offer, view
         if len(self._step) == mission.scenario.uavs:

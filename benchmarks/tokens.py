@@ -37,7 +37,9 @@ from rich.table import Table
 from service.config.settings import (
     Settings,
 )
-from service.critic import judge
+from service.deciding.rollout_evaluator import (
+    judge,
+)
 from service.llm.answer_format import (
     NoDecision,
     check_answer,

@@ -24,9 +24,13 @@ from rich.console import Console
 from rich.progress import track
 
 from service.app import create_app
-from service.asking import Asking, Word, by_action
 from service.config.settings import (
     Settings,
+)
+from service.deciding.llm_query import (
+    LlmAdvice,
+    LlmQueries,
+    by_action,
 )
 from service.engine import Engine
 from service.llm.server_pool import (
@@ -72,21 +76,21 @@ class Trusted:
     """Where to write the figures."""
 
 
-class Echo(Asking):
+class Echo(LlmQueries):
     """Asks nobody: its word is for ``answer``, or the nearest to it that is offered."""
 
     def __init__(self, llm: ServerPool, metrics: Metrics) -> None:
         super().__init__(llm, metrics, most=64)
         self.answer: tuple[int, int] = (0, 0)
 
-    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> Word:
+    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> LlmAdvice:
         """Nearly sure of the velocity nearest to the answer's for its sensor; of the first letter without it."""
         sensor, velocity = self.answer
         letters = list(offer.labels)
         there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
         said = min(there, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
         told = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == said) for letter in letters}
-        return Word(prompt, by_action(offer, told), None, None, calibrated=False, model=self._llm.model)
+        return LlmAdvice(prompt, by_action(offer, told), None, None, calibrated=False, model=self._llm.model)
 
 
 class Pilot(EdgePilot):

@@ -12,19 +12,37 @@ from dataclasses import replace
 
 from pydantic import TypeAdapter
 
-from service.asking import Asking, Word
-from service.choice import RESERVE_S, Choice, Turn
 from service.config.cores import (
     usable_cores,
 )
 from service.config.settings import (
     Settings,
 )
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.decision_task import (
+    RESERVE_S,
+    Choice,
+    DecisionTask,
+)
+from service.deciding.deliberation import (
+    Deliberation,
+)
+from service.deciding.llm_query import (
+    LlmAdvice,
+    LlmQueries,
+)
+from service.deciding.look_ahead import (
+    decide_without_llm,
+)
+from service.deciding.verifier import (
+    verify,
+)
 from service.errors import Unavailable
 from service.guidance.note_compiler import (
     NoteCompiler,
 )
-from service.guided import Deliberation
 from service.learning.trust import (
     LLM,
 )
@@ -59,7 +77,6 @@ from service.observability.tracing import (
     Traces,
 )
 from service.outcomes import Outcomes
-from service.policy import decide_without_llm
 from service.prompting.prompt import (
     Prompt,
 )
@@ -74,8 +91,6 @@ from service.storage.journal import (
 from service.storage.store import (
     Store,
 )
-from service.verifier import verify
-from service.view import View
 from shared.actions import Action
 from shared.wire import (
     BatchRequest,
@@ -115,7 +130,7 @@ class Engine:
         self._traces = traces
         self._settings = settings
         self._llm = llm
-        self.asking = Asking(llm, metrics, settings.llm_concurrency)
+        self.asking = LlmQueries(llm, metrics, settings.llm_concurrency)
         self.compiler = NoteCompiler(llm)
         self._counter = counter
         self._metrics = metrics
@@ -165,7 +180,7 @@ class Engine:
         deadline_ms = request.deadline_ms or self._settings.deadline_ms
         attempt = mission.observe(request, request.step)
         plan = self._plan(mission, [request.uav_id], request.step, watch.started + deadline_ms / 1e3)
-        return [await self._decide(mission, Turn(request, request.step, attempt, deadline_ms, watch, plan))]
+        return [await self._decide(mission, DecisionTask(request, request.step, attempt, deadline_ms, watch, plan))]
 
     async def decide_batch(
         self, request: BatchRequest, *, may_make: bool = True, key: str | None = None
@@ -195,12 +210,12 @@ class Engine:
         # Before the LLM is asked: a batch that is sent again meanwhile is the later attempt.
         attempts = {uav.uav_id: mission.observe(uav, request.step) for uav in request.uavs}
         plan: asyncio.Task[None] | None = None
-        words: dict[int, Word] = {}
+        words: dict[int, LlmAdvice] = {}
         llm_s = min(_TOGETHER_MOST * total_ms / 1e3, total_ms / 1e3 - 2 * len(waiting) * self._own_s)
         enough = llm_s >= _TOGETHER_LEAST * total_ms / 1e3
         if enough and self.asking.may_ask_together(mission, len(waiting)):
             plan = self._plan(mission, waiting, request.step, ends)
-            views = [View.of(mission, uav, request.step) for uav in request.uavs]
+            views = [AttendedState.of(mission, uav, request.step) for uav in request.uavs]
             for view in views:
                 view.attend(mission)
             watch.lap("attend")
@@ -215,7 +230,7 @@ class Engine:
             word = words.get(uav.uav_id)
             # The critic may take more than its UAV's share, as long as it leaves the others what they need.
             latest = ends - RESERVE_S - self._own_s * (len(waiting) - turn - 1)
-            its = Turn(uav, request.step, attempts[uav.uav_id], deadline_ms, own, plan, word, latest)
+            its = DecisionTask(uav, request.step, attempts[uav.uav_id], deadline_ms, own, plan, word, latest)
             answer = await self._decide(mission, its)
             if mission.planner is None or mission.planner.action(uav.uav_id) != (answer.sensor_id, answer.velocity):
                 plan = None
@@ -285,12 +300,12 @@ class Engine:
             self.live.answered(answer)
         return told
 
-    async def _decide(self, mission: Mission, turn: Turn) -> DecideResponse:
+    async def _decide(self, mission: Mission, turn: DecisionTask) -> DecideResponse:
         uav, step, watch, word = turn.uav, turn.step, turn.watch, turn.word
         if mission.mode == "guided":
             await _until(turn.plan, turn.deadline)
             watch.lap("plan")
-        view = View.of(mission, uav, step)
+        view = AttendedState.of(mission, uav, step)
         self._metrics.overflow_risk.observe(view.state.overflow_risk)
         watch.lap("augment")
         view.attend(mission)
@@ -351,7 +366,7 @@ class Engine:
         task.add_done_callback(self._plans.discard)
         return task
 
-    async def _choose(self, mission: Mission, view: View, prompt: Prompt, turn: Turn) -> Choice:
+    async def _choose(self, mission: Mission, view: AttendedState, prompt: Prompt, turn: DecisionTask) -> Choice:
         """The LLM's choice or the learned values', as the mission's mode says; the policy's where neither has one."""
         completion: Completion | None = None
         reason: Reason | None = None
@@ -384,7 +399,7 @@ class Engine:
             self._metrics.llm_requests.labels(reason or "ok").inc()
         return Choice(sensor, velocity, reason, completion, completion.model if completion else None)
 
-    def _by_policy(self, mission: Mission, view: View) -> Action:
+    def _by_policy(self, mission: Mission, view: AttendedState) -> Action:
         """The plan's, or one step of look-ahead where there is no plan."""
         reserved = mission.reserved(view.step, view.uav_id)
         planned = mission.planner.action(view.uav_id, reserved) if mission.planner is not None else None
@@ -396,7 +411,9 @@ class Engine:
             sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
         return Action(sensor, velocity)
 
-    async def _weigh(self, mission: Mission, view: View, deliberation: Deliberation, turn: Turn) -> Choice:
+    async def _weigh(
+        self, mission: Mission, view: AttendedState, deliberation: Deliberation, turn: DecisionTask
+    ) -> Choice:
         """Mode ``guided``: the LLM's word weighed with the others' and with the critic, which thinks while it is asked.
 
         Without a word the others decide: source ``policy``, with the reason; without the critic, the policy.
@@ -404,7 +421,9 @@ class Engine:
         thinking = asyncio.get_running_loop().run_in_executor(self._judging, deliberation.judge)
         word = turn.word
         if not mission.promptable:
-            word = Word(deliberation.prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
+            word = LlmAdvice(
+                deliberation.prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model
+            )
         try:
             if word is None:
                 word = await self.asking.word(mission, deliberation.offer, deliberation.prompt, turn.deadline)

@@ -14,15 +14,19 @@ from torch import Tensor
 from service.config.settings import (
     Settings,
 )
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.look_ahead import (
+    decide_without_llm,
+)
 from service.learning.sample import (
     Sample,
 )
 from service.mission.mission import (
     Mission,
 )
-from service.policy import decide_without_llm
 from service.reward import Reward, Speed
-from service.view import View
 from shared.features import State
 from shared.reach import Reach, distances_ahead
 from shared.rollouts import Header, Reference, RolloutStep
@@ -86,7 +90,7 @@ def replay(
         for number, step in enumerate(logged):
             decision_id = f"{number:032x}"
             mission.observe(step.request, step.request.step)
-            view = View.of(mission, step.request, step.request.step)
+            view = AttendedState.of(mission, step.request, step.request.step)
             view.attend(mission)
             taught = _taught(mission, view, step.reference)
             mission.commit(view.pending(mission, decision_id, step.sensor_id, step.velocity))
@@ -97,7 +101,7 @@ def replay(
         yield examples
 
 
-def _taught(mission: Mission, view: View, reference: Reference | None) -> Taught | None:
+def _taught(mission: Mission, view: AttendedState, reference: Reference | None) -> Taught | None:
     if reference is None:
         reserved = mission.reserved(view.step, view.uav_id)
         sensor_id, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)

@@ -11,14 +11,18 @@ import numpy as np
 from service.config.settings import (
     Settings,
 )
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.look_ahead import (
+    decide_without_llm,
+)
 from service.mission.mission import (
     Mission,
 )
-from service.policy import decide_without_llm
 from service.prompting.demonstrations import (
     Demonstration,
 )
-from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State
@@ -64,7 +68,7 @@ def solutions(
         for number, step in enumerate(group):
             uav, decision_id = step.request, f"{number:032x}"
             mission.observe(uav, uav.step)
-            view = View.of(mission, uav, uav.step)
+            view = AttendedState.of(mission, uav, uav.step)
             if view.state.admissible.sum() > 1:
                 reserved = mission.reserved(uav.step, uav.uav_id)
                 answer = teacher(step, view.state, mission.scenario, reserved)

@@ -7,10 +7,12 @@ from typing import Any
 from service.config.settings import (
     Settings,
 )
+from service.deciding.attended_state import (
+    AttendedState,
+)
 from service.mission.mission import (
     Mission,
 )
-from service.view import View
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, SensorColumns, UavState
 
@@ -49,7 +51,7 @@ def uav(
     return UavState(uav_id=uav_id, position=list(position), sensors=sensors)
 
 
-def attended(mission: Mission, state: UavState, step: int = 0) -> View:
-    view = View.of(mission, state, step)
+def attended(mission: Mission, state: UavState, step: int = 0) -> AttendedState:
+    view = AttendedState.of(mission, state, step)
     view.attend(mission)
     return view

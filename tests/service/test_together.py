@@ -13,7 +13,13 @@ import httpx
 import pytest
 from fastapi.responses import JSONResponse, Response
 
-from service.asking import Asking, Word
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.llm_query import (
+    LlmAdvice,
+    LlmQueries,
+)
 from service.llm.answer_format import (
     constrain_labels,
 )
@@ -32,7 +38,6 @@ from service.prompting.row_formats import (
 from service.prompting.unpruned_baseline import (
     Uncompressed,
 )
-from service.view import View
 from shared.actions import Action
 from tests.running import serving
 from tests.service.making import PAPER, attended, mission, uav
@@ -162,13 +167,15 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Eight UAVs' candidates are weighed after the LLM's time is over: that must fit into the deadline too."""
-    words, given_s = Asking.words, list[float]()
+    words, given_s = LlmQueries.words, list[float]()
 
-    async def timed(self: Asking, mission: Mission, views: Sequence[View], deadline: float) -> dict[int, Word]:
+    async def timed(
+        self: LlmQueries, mission: Mission, views: Sequence[AttendedState], deadline: float
+    ) -> dict[int, LlmAdvice]:
         given_s.append(deadline - time.perf_counter())
         return await words(self, mission, views, deadline)
 
-    monkeypatch.setattr(Asking, "words", timed)
+    monkeypatch.setattr(LlmQueries, "words", timed)
     chorus = Chorus(hangs_on="UAV")
     with serving(chorus.app) as url:
         client = edge(mode="guided", llm_url=f"{url}/v1")
@@ -225,7 +232,7 @@ def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
 def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     """A velocity forbidden meanwhile counts as the nearest that is offered; of sensors given away nothing is left."""
     prompt = Prompt("", "", "", Uncompressed(attended(mission(), uav()).state, FORMATS["csv"].row))
-    word = Word(
+    word = LlmAdvice(
         prompt, {Action(1, 9): 0.3, Action(1, 2): 0.1, Action(4, 7): 0.6}, None, None, calibrated=False, model=None
     )
     left = word.of([Action(1, 3), Action(1, 7), Action(2, 7)])

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from service.config.settings import (
     Settings,
 )
-from service.critic import Situation, judge
+from service.deciding.deliberation import (
+    Deliberation,
+)
+from service.deciding.look_ahead import (
+    decide_without_llm,
+)
+from service.deciding.rollout_evaluator import (
+    RolloutState,
+    judge,
+)
 from service.guidance.note_orders import (
     INSTRUCTION,
     constrain_orders,
@@ -22,7 +31,6 @@ from service.guidance.note_orders import (
 from service.guidance.step_guidance import (
     StepGuidance,
 )
-from service.guided import Deliberation
 from service.llm.completion import Completion
 from service.llm.server import (
     LlmServer,
@@ -32,7 +40,6 @@ from service.llm.server import (
 from service.mission.mission import (
     Mission,
 )
-from service.policy import decide_without_llm
 from service.prompting.candidates import (
     GuidedTemplate,
 )
@@ -314,7 +321,7 @@ def test_the_critic_counts_what_the_operator_asks(asked: dict[str, Any]) -> None
     made.observe(uav(queue=[55.0, 59.0]), 0)
 
     def lost(guidance: Guidance) -> NDArray[np.float64]:
-        return judge(Situation.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
+        return judge(RolloutState.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
 
     before, after = lost(Guidance()), lost(Guidance(sensors=[SensorWish.model_validate({"sensor_id": 0, **asked})]))
     assert before[0] > before[1] and after[0] < after[1]

@@ -5,9 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.deciding.look_ahead import (
+    decide_without_llm,
+)
 from service.demonstrate import main
 from service.errors import Refused
-from service.policy import decide_without_llm
 from service.prompting.demonstrations import (
     packaged,
 )

@@ -6,10 +6,12 @@ import math
 import numpy as np
 import pytest
 
+from service.deciding.attended_state import (
+    AttendedState,
+)
 from service.prompting.row_formats import (
     columns,
 )
-from service.view import View
 from shared.channel import link_holds, packets_per_step
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES, distances_ahead
@@ -35,7 +37,7 @@ def at(progress: float) -> Point:
     return x, y
 
 
-def seen(state: UavState, spec: MissionSpec = REACH, step: int = 0) -> View:
+def seen(state: UavState, spec: MissionSpec = REACH, step: int = 0) -> AttendedState:
     return attended(mission(spec), state, step)
 
 

@@ -41,7 +41,7 @@ _MOST_UAVS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class RolloutState:
     """What the critic needs to judge one UAV's candidates, taken from a belief at once: another thread may judge.
 
     Attributes:
@@ -91,7 +91,7 @@ class Situation:
         reserved: Collection[int] = (),
         course: Mapping[int, Sequence[Action]] | None = None,
         guidance: Guidance = NO_GUIDANCE,
-    ) -> Situation:
+    ) -> RolloutState:
         """As things stand when this UAV decides at this step; ``course`` is the fleet's plan from this step on."""
         left = scenario.steps - step
         # Past the scenario's last step a fleet may fly on.
@@ -162,19 +162,19 @@ class Judgement:
     cost: FloatArray
 
 
-def judge(situation: Situation, candidates: Sequence[Action]) -> Judgement:
+def judge(situation: RolloutState, candidates: Sequence[Action]) -> Judgement:
     """Fly every candidate through the same futures, and count; takes milliseconds to tens of them."""
     scenario, sensors, count = situation.scenario, len(situation.kept), len(candidates)
     entries = count * max(1, sensors) * (scenario.max_velocity + 1) * len(situation.links) * situation.horizon
     courses = [{}, situation.course] if situation.course else [{}]
-    futures = _Futures.of(situation, int(np.clip(_MOST_ENTRIES // (entries * len(courses)), 1, _FUTURES)))
+    futures = _SampledFutures.of(situation, int(np.clip(_MOST_ENTRIES // (entries * len(courses)), 1, _FUTURES)))
     # A sensor out of everyone's reach is one past the kept, with a link that never holds.
     rows = np.searchsorted(situation.kept, [sensor for sensor, _ in candidates])
     known = np.isin([sensor for sensor, _ in candidates], situation.kept)
     first = np.stack((np.where(known, rows, 0), [v for _, v in candidates]), axis=1)
     losses = []
     for course in courses:
-        world = _Copies(situation, np.tile(futures.start, (count, 1)), course)
+        world = _RolloutBatch(situation, np.tile(futures.start, (count, 1)), course)
         many = len(futures.start)
         cost = world.fly_first(np.repeat(first, many, axis=0), np.repeat(known, many))
         lost = world.arrive(np.tile(futures.arrivals[0], (count, 1)))
@@ -187,14 +187,14 @@ def judge(situation: Situation, candidates: Sequence[Action]) -> Judgement:
 
 
 @dataclass(frozen=True, slots=True)
-class _Futures:
+class _SampledFutures:
     """What may be in M futures, drawn as the edge believes: queues ``(M, n)`` and arrivals ``(H, M, n)``."""
 
     start: FloatArray
     arrivals: FloatArray
 
     @classmethod
-    def of(cls, situation: Situation, count: int) -> _Futures:
+    def of(cls, situation: RolloutState, count: int) -> _SampledFutures:
         """Each with rates of its own: a sensor hardly ever heard may fill fast."""
         scenario, random, shape = (
             situation.scenario,
@@ -211,10 +211,10 @@ class _Futures:
         )
 
 
-class _Copies:
+class _RolloutBatch:
     """B copies of the situation: queues ``(B, n)`` and the metres a second that each UAV flew so far."""
 
-    def __init__(self, situation: Situation, queue: FloatArray, course: Mapping[int, NDArray[np.int64]]) -> None:
+    def __init__(self, situation: RolloutState, queue: FloatArray, course: Mapping[int, NDArray[np.int64]]) -> None:
         self._situation = situation
         self._course = course
         scenario = situation.scenario
@@ -287,7 +287,7 @@ class _Copies:
         return np.asarray((over * self._weights).sum(axis=1) + late)
 
     def _follow(self, uav: int, served: NDArray[np.bool_]) -> None:
-        """One step of look-ahead, as in :func:`service.policy.decide_without_llm`."""
+        """One step of look-ahead, as in :func:`service.deciding.look_ahead.decide_without_llm`."""
         if not len(self._columns):
             return
         ahead = self._ahead[uav][self._flown[uav]]

@@ -37,7 +37,7 @@ _NO_CONTEXTS = torch.empty(0)
 
 
 @dataclass(slots=True)
-class View:
+class AttendedState:
     """A UAV's view at one step. ``rows`` index the state's arrays: the k sensors kept, best first.
 
     Without attention ``rows`` are all that is admissible, in the request's order. ``asked`` is what the operator's

@@ -11,8 +11,12 @@ import pytest
 from service.config.cores import (
     usable_cores,
 )
-from service.critic import Judgement
-from service.guided import Deliberation
+from service.deciding.deliberation import (
+    Deliberation,
+)
+from service.deciding.rollout_evaluator import (
+    Judgement,
+)
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, wait_for
 

@@ -8,14 +8,18 @@ from typing import Any
 import httpx
 import pytest
 
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.verifier import (
+    verify,
+)
 from service.llm.answer_format import (
     NoDecision,
 )
 from service.mission.mission import (
     Mission,
 )
-from service.verifier import verify
-from service.view import View
 from shared.wire import MissionSpec
 from tests.running import serving
 from tests.service.making import attended, mission, uav
@@ -25,7 +29,7 @@ Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
 
 
-def ready(**spec: Any) -> tuple[Mission, View]:
+def ready(**spec: Any) -> tuple[Mission, AttendedState]:
     """A UAV over the centre, off its trajectory, with sensors 0 to 500 m away: 4 and 5 are out of reach."""
     m = mission(MissionSpec(**spec))
     state = uav()

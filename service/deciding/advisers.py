@@ -8,14 +8,18 @@ from typing import Protocol
 import numpy as np
 from scipy.special import softmax
 
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.look_ahead import (
+    decide_without_llm,
+)
 from service.learning.trust import (
     PLANNER,
 )
 from service.mission.mission import (
     Mission,
 )
-from service.policy import decide_without_llm
-from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray
 
@@ -25,46 +29,46 @@ _VALUE_TEMPERATURE = 0.05
 SMOOTHING = 0.01
 
 
-class Expert(Protocol):
+class Adviser(Protocol):
     """An adviser. ``name`` is its key in the trust, the response and the metrics."""
 
     name: str
 
-    def proposal(self, mission: Mission, view: View) -> Action | None:
+    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
         """What it would do itself, to be among the candidates; None where it has nothing to say."""
         ...
 
-    def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
+    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
         """How it would choose among the candidates, ``(n,)``, summing to 1; only where it has a proposal."""
         ...
 
 
-class PlannerExpert:
+class PlannerAdviser:
     """The receding-horizon plan, where there is one of this step."""
 
     name = PLANNER
 
-    def proposal(self, mission: Mission, view: View) -> Action | None:
+    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
         """The plan's action."""
         if mission.planner is None:
             return None
         return mission.planner.action(view.uav_id, mission.reserved(view.step, view.uav_id))
 
-    def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
+    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
         """Nearly all for the plan's action."""
         return one_hot(self.proposal(mission, view), actions)
 
 
-class ValueExpert:
+class ValueAdviser:
     """The learned values, ``softmax((s_j + u_jv - max_v u_jv) / 0.05)``: likeliest is what mode ``value`` would do."""
 
     name = "value"
 
-    def proposal(self, mission: Mission, view: View) -> Action | None:
+    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
         """The best-scored sensor and the best velocity for it."""
         return view.by_value(mission)
 
-    def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
+    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
         """A sensor that attention did not see scores as low as the lowest."""
         values = view.values(mission)
         lowest = min((float(levels.min()) for levels in values.values()), default=0.0)
@@ -72,23 +76,23 @@ class ValueExpert:
         return np.asarray(softmax(scores / _VALUE_TEMPERATURE))
 
 
-class PolicyExpert:
+class PolicyAdviser:
     """The LLM-free policy: one step of look-ahead."""
 
     name = "policy"
 
-    def proposal(self, mission: Mission, view: View) -> Action | None:
+    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
         """Its decision."""
         reserved = mission.reserved(view.step, view.uav_id)
         return decide_without_llm(view.state, view.uav_id, mission.scenario, reserved, view.asked)
 
-    def probabilities(self, mission: Mission, view: View, actions: Sequence[Action]) -> FloatArray:
+    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
         """Nearly all for its decision."""
         return one_hot(self.proposal(mission, view), actions)
 
 
 # In the order of the response.
-EXPERTS: tuple[Expert, ...] = (PlannerExpert(), ValueExpert(), PolicyExpert())
+ADVISERS: tuple[Adviser, ...] = (PlannerAdviser(), ValueAdviser(), PolicyAdviser())
 
 
 def one_hot(action: Action | None, actions: Sequence[Action]) -> FloatArray:

@@ -15,8 +15,17 @@ from fastapi.responses import Response
 from service.config.settings import (
     Settings,
 )
-from service.critic import Judgement, Situation, judge
-from service.guided import Deliberation
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.deliberation import (
+    Deliberation,
+)
+from service.deciding.rollout_evaluator import (
+    Judgement,
+    RolloutState,
+    judge,
+)
 from service.learning.trust import (
     LLM,
 )
@@ -32,7 +41,6 @@ from service.prompting.candidates import (
     GuidedTemplate,
     velocities,
 )
-from service.view import View
 from shared.actions import Action
 from shared.reach import Reach
 from shared.trajectory import trajectories
@@ -51,7 +59,7 @@ def guided(**settings: Any) -> Mission:
     return Mission("test", MissionSpec(features="reach"), Settings(mode="guided", **settings))
 
 
-def deliberation(mission: Mission, step: int = 0) -> tuple[View, Deliberation]:
+def deliberation(mission: Mission, step: int = 0) -> tuple[AttendedState, Deliberation]:
     x, y = PAPER.lap_centres[0]
     state = uav(
         step=step, position=(x + PAPER.lap_radius_m, y), x=[x + PAPER.lap_radius_m + 40.0 * i for i in range(6)]
@@ -171,7 +179,7 @@ def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None
     state = uav(position=(float(start[0]), float(start[1])), x=near, queue=[60.0])
     state.sensors.y[0] = float(start[1])
     mission.observe(state, 0)
-    situation = Situation.of(mission.belief, PAPER, 0, 0)
+    situation = RolloutState.of(mission.belief, PAPER, 0, 0)
     judged = judge(situation, [Action(0, 0), Action(1, 0)])
     assert judged.lost[1] > judged.lost[0] + 1
     # Sensor 1 was never reported: nothing can be collected from it.
@@ -188,7 +196,7 @@ def test_a_plan_is_judged_by_its_own_continuation_and_never_below_look_ahead() -
 
     def lost(course: list[Action] | None) -> float:
         plan = None if course is None else {0: course}
-        return float(judge(Situation.of(mission.belief, PAPER, 0, 0, course=plan), [Action(0, 0)]).lost[0])
+        return float(judge(RolloutState.of(mission.belief, PAPER, 0, 0, course=plan), [Action(0, 0)]).lost[0])
 
     pairs = [(0, 0), (2, 0), (0, 0), (2, 0), (2, 14), (0, 14), (0, 7), (2, 14)]
     dwells = [Action(*pair) for pair in pairs]
@@ -200,11 +208,11 @@ def test_a_sensor_never_heard_may_hold_anything_that_the_world_draws() -> None:
     mission = guided()
     state = uav(x=[PAPER.lap_centres[0][0], PAPER.lap_centres[0][0] + 9.0], queue=[39.0, None])
     mission.observe(state, 0)
-    situation = Situation.of(mission.belief, PAPER, 0, 0)
+    situation = RolloutState.of(mission.belief, PAPER, 0, 0)
     assert situation.unknown.tolist() == [False, True]
 
 
-def planned(mission: Mission, view: View) -> Action:
+def planned(mission: Mission, view: AttendedState) -> Action:
     """Let the mission's planner plan."""
     assert mission.planner is not None
     with ThreadPoolExecutor(1) as beside:

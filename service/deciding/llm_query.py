@@ -12,7 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from service.guided import offered, template_of
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.deliberation import (
+    offered,
+    template_of,
+)
 from service.llm.answer_format import (
     NoDecision,
 )
@@ -33,7 +39,6 @@ from service.prompting.candidates import (
 from service.prompting.prompt import (
     Prompt,
 )
-from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Reason
@@ -47,7 +52,7 @@ _LATE = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
+class LlmAdvice:
     """What the LLM said of one UAV's candidates in mode ``guided``.
 
     ``told`` holds the probabilities of the actions that it was asked about; None where it was silent, for the
@@ -75,7 +80,7 @@ class Word:
         return found / found.sum() if found.sum() > 0.0 else None
 
 
-class Asking:
+class LlmQueries:
     """Asks one LLM for every mission of a service, ``most`` decisions at once."""
 
     def __init__(self, llm: ServerPool, metrics: Metrics, most: int) -> None:
@@ -104,23 +109,23 @@ class Asking:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``. Deadlines are of ``time.perf_counter``."""
         return await self._within(self._llm.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
 
-    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> Word:
+    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> LlmAdvice:
         """Mode ``guided``: what the LLM says of one UAV's candidates."""
         template = template_of(mission)
         lists = [list(offer.labels)]
         completion, told, reason = await self._heard(mission, prompt.static, prompt.user, lists, deadline)
         calibrated, model = self._knows(completion, prompt.static, lists), self._model(completion)
         if told is None:
-            return Word(prompt, None, reason, completion, calibrated, model)
+            return LlmAdvice(prompt, None, reason, completion, calibrated, model)
         self._labels.calibrate(model, prompt.static, template.content_free(), [template.labels])
-        return Word(prompt, by_action(offer, told[0]), None, completion, calibrated, model)
+        return LlmAdvice(prompt, by_action(offer, told[0]), None, completion, calibrated, model)
 
     def may_ask_together(self, mission: Mission, uavs: int) -> bool:
         """Whether one call can decide for so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
         able = self._llm.status == "ready" and uavs <= self._llm.most_together
         return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
 
-    async def words(self, mission: Mission, views: Sequence[View], deadline: float) -> dict[int, Word]:
+    async def words(self, mission: Mission, views: Sequence[AttendedState], deadline: float) -> dict[int, LlmAdvice]:
         """Mode ``guided``: what the LLM says of every UAV's candidates, by UAV, asked in one call.
 
         Where that fails before the deadline, nothing is returned, and the LLM is asked about so many UAVs no more until
@@ -150,7 +155,7 @@ class Asking:
         words = {}
         for place, (uav, (_, offer)) in enumerate(asked.items()):
             heard = None if told is None else by_action(offer, told[place])
-            words[uav] = Word(prompts[uav], heard, reason, None if place else completion, calibrated, model)
+            words[uav] = LlmAdvice(prompts[uav], heard, reason, None if place else completion, calibrated, model)
         return words
 
     async def _heard(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from service.asking import Word
+from service.deciding.llm_query import (
+    LlmAdvice,
+)
 from service.learning.trust import (
     Advice,
 )
@@ -21,7 +23,7 @@ RESERVE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class DecisionTask:
     """One UAV's turn to be told: its attempt at this step, its time, and what has been begun for it.
 
     ``word`` is there where the LLM has been asked about it already; ``latest`` where others of its batch can wait for
@@ -34,7 +36,7 @@ class Turn:
     deadline_ms: int
     watch: Stopwatch
     plan: asyncio.Task[None] | None
-    word: Word | None = None
+    word: LlmAdvice | None = None
     latest: float = 0.0
 
     @property

@@ -12,7 +12,7 @@ adviser is overruled where the critic sees a disaster, even before trust has lea
 counts for more than the critic's small differences. The best is taken rather than a draw: losses are estimated for
 every candidate, so that exploring would teach nothing, and cost packets.
 
-The weights and what they guarantee are in :mod:`service.learning.trust`; the critic in :mod:`service.critic`.
+The weights and what they guarantee are in :mod:`service.learning.trust`; the critic in :mod:`service.deciding.rollout_evaluator`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,18 @@ from typing import Self
 
 import numpy as np
 
-from service.critic import Judgement, Situation, judge
-from service.experts import EXPERTS, SMOOTHING
+from service.deciding.advisers import (
+    ADVISERS,
+    SMOOTHING,
+)
+from service.deciding.attended_state import (
+    AttendedState,
+)
+from service.deciding.rollout_evaluator import (
+    Judgement,
+    RolloutState,
+    judge,
+)
 from service.learning.trust import (
     CAP,
     LLM,
@@ -43,7 +53,6 @@ from service.prompting.candidates import (
 from service.prompting.prompt import (
     Prompt,
 )
-from service.view import View
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Guided, Weighed
@@ -70,17 +79,17 @@ class Deliberation:
     offer: CandidateSet
     prompt: Prompt
     advised: dict[str, FloatArray]
-    situation: Situation
+    situation: RolloutState
 
     @classmethod
-    def of(cls, mission: Mission, view: View) -> Self:
+    def of(cls, mission: Mission, view: AttendedState) -> Self:
         """For a mission of mode ``guided`` and a view with at least one row."""
         template = template_of(mission)
         shown = offered(mission, view)
-        proposed = {expert: action for expert in EXPERTS if (action := expert.proposal(mission, view)) is not None}
+        proposed = {expert: action for expert in ADVISERS if (action := expert.proposal(mission, view)) is not None}
         offer = shown.with_actions(list(proposed.values()))
         reserved = mission.reserved(view.step, view.uav_id)
-        situation = Situation.of(
+        situation = RolloutState.of(
             mission.belief,
             mission.scenario,
             view.step,
@@ -172,7 +181,7 @@ def template_of(mission: Mission) -> GuidedTemplate:
     return mission.template
 
 
-def offered(mission: Mission, view: View) -> CandidateSet:
+def offered(mission: Mission, view: AttendedState) -> CandidateSet:
     """What the LLM may choose from, at velocities that the operator allows; the view has at least one row."""
     shown = CandidateSet.of(view.state, view.shown(mission), view.uav_id, template_of(mission), mission.scenario)
     asked = view.asked

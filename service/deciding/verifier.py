@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.deciding.attended_state import (
+    AttendedState,
+)
 from service.llm.answer_format import (
     NoDecision,
 )
 from service.mission.mission import (
     Mission,
 )
-from service.view import View
 from shared.channel import link_holds
 from shared.reach import distances_ahead
 
 
-def verify(mission: Mission, view: View, sensor: int, velocity: int) -> None:
+def verify(mission: Mission, view: AttendedState, sensor: int, velocity: int) -> None:
     """Raises :class:`NoDecision` where the answer breaks a rule.
 
     A sensor out of reach breaks none while nothing that is admissible is in reach at any velocity.
