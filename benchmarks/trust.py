@@ -32,7 +32,9 @@ from service.deciding.llm_query import (
     LlmQueries,
     by_action,
 )
-from service.engine import Engine
+from service.edge.engine import (
+    Engine,
+)
 from service.llm.server_pool import (
     ServerPool,
 )

@@ -15,7 +15,9 @@ from service import problems
 from service.config.settings import (
     Settings,
 )
-from service.engine import Engine
+from service.edge.engine import (
+    Engine,
+)
 from service.guard import Guard
 from service.headers import CarefulHeaders
 from service.keys import Keys

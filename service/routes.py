@@ -9,7 +9,9 @@ from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
 from service import onboard
-from service.engine import Engine
+from service.edge.engine import (
+    Engine,
+)
 from service.guard import may_make_missions
 from service.llm.server_pool import (
     ServerPool,

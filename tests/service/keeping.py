@@ -19,7 +19,9 @@ from service.app import create_app
 from service.config.settings import (
     Settings,
 )
-from service.engine import Engine
+from service.edge.engine import (
+    Engine,
+)
 from service.mission.mission import (
     Mission,
 )

@@ -119,7 +119,7 @@ def test_a_forged_outcome_does_not_refuse_the_fleet_its_batch(edge: Any, report:
     second = client.post("/decide/batch", json={"mission_id": "test", "step": 1, "uavs": uavs})
     assert (second.status_code, len(second.json()["decisions"])) == (200, 3)
     assert client.get("/missions/test").json()["feedback"] == 3
-    told = [record.getMessage() for record in caplog.records if record.name == "service.outcomes"]
+    told = [record.getMessage() for record in caplog.records if record.name == "service.edge.feedback"]
     assert len(told) == 1 and "mission test" in told[0] and ids[2] in told[0]
 
 

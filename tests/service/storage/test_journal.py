@@ -161,7 +161,7 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
             first = client.post("/decide", json=report(step=3, outcome=owed[0]))
             assert (first.status_code, first.json()["stored"]) == (200, False)
             # Nobody waits for a store that is known to fail: each that did would take a minute here.
-            monkeypatch.setattr("service.engine._STORE_S", 60.0)
+            monkeypatch.setattr("service.edge.engine._STORE_S", 60.0)
             for step in range(4, 40):
                 answer = client.post("/decide", json=report(step=step, deadline_ms=60_000))
                 assert (answer.status_code, answer.json()["stored"]) == (200, False)

@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 
-from service import outcomes
 from service.config.settings import (
     Settings,
+)
+from service.edge import (
+    feedback,
 )
 from service.errors import Refused, Unavailable
 from service.mission.idempotency import (
@@ -282,7 +284,7 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Of a batch's three outcomes, which come at once, two can wait.
-    monkeypatch.setattr(outcomes, "_MAX_LESSONS", 2)
+    monkeypatch.setattr(feedback, "_MAX_LESSONS", 2)
     with running(tmp_path / "m.db") as (client, engine):
         owed: dict[int, str] = {}
         for step in range(6):

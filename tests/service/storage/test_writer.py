@@ -51,7 +51,7 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
         told = client.post("/decide", json=report(step=2, outcome=owed[0]))
         assert (told.status_code, told.json()["stored"]) == (200, False)
         # A busy machine may take longer than that to start another.
-        monkeypatch.setattr("service.engine._STORE_S", 30.0)
+        monkeypatch.setattr("service.edge.engine._STORE_S", 30.0)
         first.kill()
         # Nobody is told: another process writes what this one was to write.
         assert client.post("/decide", json=report(step=3, deadline_ms=60_000)).json()["stored"]

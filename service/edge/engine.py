@@ -39,6 +39,12 @@ from service.deciding.look_ahead import (
 from service.deciding.verifier import (
     verify,
 )
+from service.edge.feedback import (
+    Outcomes,
+)
+from service.edge.mission_registry import (
+    MissionRegistry,
+)
 from service.errors import Unavailable
 from service.guidance.note_compiler import (
     NoteCompiler,
@@ -63,7 +69,6 @@ from service.mission.events import (
 from service.mission.mission import (
     Mission,
 )
-from service.missions import Missions
 from service.observability import (
     logs,
 )
@@ -76,7 +81,6 @@ from service.observability.stopwatch import (
 from service.observability.tracing import (
     Traces,
 )
-from service.outcomes import Outcomes
 from service.prompting.prompt import (
     Prompt,
 )
@@ -141,7 +145,7 @@ class Engine:
         self.keeper: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self.live = Broadcaster()
         self._outcomes = Outcomes(metrics, self.keeper, self.live)
-        self.missions = Missions(settings, metrics, self.keeper, store, self.compiler.compile)
+        self.missions = MissionRegistry(settings, metrics, self.keeper, store, self.compiler.compile)
 
     def hurry(self) -> None:
         """Closing time: who waits for the LLM does so for a few seconds more, and pages are told no more."""

@@ -13,7 +13,12 @@ import httpx
 from service.config.settings import (
     Settings,
 )
-from service.engine import Engine
+from service.edge.engine import (
+    Engine,
+)
+from service.edge.feedback import (
+    Outcomes,
+)
 from service.live.broadcaster import (
     Broadcaster,
 )
@@ -23,7 +28,6 @@ from service.mission.mission import (
 from service.observability.metrics import (
     Metrics,
 )
-from service.outcomes import Outcomes
 from service.storage.journal import (
     NullJournal,
 )

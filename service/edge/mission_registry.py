@@ -34,13 +34,13 @@ from shared.wire import BatchRequest, DecideRequest, MissionSpec
 
 log = logging.getLogger(__name__)
 
-Asked = TypeVar("Asked", DecideRequest, BatchRequest)
+AnyRequest = TypeVar("Asked", DecideRequest, BatchRequest)
 
 # The longest that who asks about a mission waits for its being read back; a decision no longer than its deadline.
 _WAKE_S = 10.0
 
 
-class Missions:
+class MissionRegistry:
     """Missions by ID, bounded in number; a request that is refused leaves no mission behind.
 
     One that the store has is read back when it is first asked about, so that a restart takes no longer for many.
@@ -91,8 +91,8 @@ class Missions:
         return mission
 
     async def checked(
-        self, request: Asked, *, may_make: bool, key: str | None, within_s: float
-    ) -> tuple[Mission, Asked]:
+        self, request: AnyRequest, *, may_make: bool, key: str | None, within_s: float
+    ) -> tuple[Mission, AnyRequest]:
         """The mission for a request that fits it, and the request with what it leaves out.
 
         One with scenario ``paper`` is made on first use, where one may.
