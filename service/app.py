@@ -19,7 +19,6 @@ from service.edge.engine import (
     Engine,
 )
 from service.guard import Guard
-from service.headers import CarefulHeaders
 from service.keys import Keys
 from service.limits import BodyLimit, Crowd
 from service.live import routes as live_routes
@@ -40,6 +39,9 @@ from service.prompting.token_accounting import (
 )
 from service.prompting.warm_up import warm_up
 from service.routes import router
+from service.server.security_headers import (
+    SecurityHeaders,
+)
 from service.storage.store import (
     Store,
 )
@@ -99,7 +101,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     app.add_middleware(Crowd, most=settings.max_requests)
     if settings.keys is not None:
         app.add_middleware(Guard, keys=Keys(settings.keys))
-    app.add_middleware(CarefulHeaders)
+    app.add_middleware(SecurityHeaders)
     if traces.provider is not None:
         app.add_middleware(Traced)
     problems.install(app)

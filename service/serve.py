@@ -65,10 +65,12 @@ def main(argv: list[str]) -> int:
 
 
 def _serve(listener: socket.socket, host: str) -> int:
-    from service.allocator import hand_back_memory
     from service.config.settings import (
         Settings,
         unknown_variables,
+    )
+    from service.server.malloc import (
+        hand_back_memory,
     )
 
     hand_back_memory()
@@ -92,7 +94,9 @@ def _serve(listener: socket.socket, host: str) -> int:
     from service.observability import (
         logs,
     )
-    from service.server import Server
+    from service.server.server import (
+        Server,
+    )
 
     logs.configure(settings.log_level, settings.log_format)
     server = Server(partial(_application, settings), settings.log_level)

@@ -11,7 +11,9 @@ from contextlib import contextmanager
 import uvicorn
 from starlette.types import ASGIApp
 
-from service.heads import BoundedHeads
+from service.server.connection_limits import (
+    BoundedHttpProtocol,
+)
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
@@ -19,7 +21,7 @@ Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]
 @contextmanager
 def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
     """The application under a real uvicorn, with the edge's bounds on heads; yields its base URL."""
-    config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", http=BoundedHeads, ws="none")
+    config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", http=BoundedHttpProtocol, ws="none")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

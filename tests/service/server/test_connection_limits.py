@@ -14,7 +14,9 @@ import pytest
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
-from service import heads
+from service.server import (
+    connection_limits,
+)
 from tests.e2e.processes import serving_edge
 from tests.running import serving
 
@@ -44,8 +46,8 @@ def answered(address: Address, sent: bytes) -> bytes:
 
 def long(begun: bytes, piece: bytes, ended: bytes = b"") -> bytes:
     """A head of a byte more than is taken: nothing of it is on its way when it is refused, and the answer arrives."""
-    pieces = piece * (heads._MOST_BYTES // len(piece))
-    return (begun + pieces)[: heads._MOST_BYTES + 1] + ended
+    pieces = piece * (connection_limits._MOST_BYTES // len(piece))
+    return (begun + pieces)[: connection_limits._MOST_BYTES + 1] + ended
 
 
 HOST = b"GET /healthz HTTP/1.1\r\nhost: x\r\n"
@@ -103,14 +105,14 @@ def test_a_body_in_many_small_chunks_is_no_head() -> None:
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nho"])
 def test_who_does_not_end_its_head_is_hung_up(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
-    monkeypatch.setattr(heads, "_MOST_S", 0.3)
+    monkeypatch.setattr(connection_limits, "_MOST_S", 0.3)
     with serving(counting) as url:
         assert answered(address_of(url), sent) == b""
 
 
 @pytest.mark.parametrize("sent", [b"\r\n", b"GET / HT"])
 def test_nor_does_it_help_to_have_asked_before(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
-    monkeypatch.setattr(heads, "_MOST_S", 0.3)
+    monkeypatch.setattr(connection_limits, "_MOST_S", 0.3)
     with serving(counting) as url, socket.create_connection(address_of(url), timeout=60) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
         assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
@@ -121,7 +123,7 @@ def test_nor_does_it_help_to_have_asked_before(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_who_has_asked_may_wait_longer_than_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(heads, "_MOST_S", 0.3)
+    monkeypatch.setattr(connection_limits, "_MOST_S", 0.3)
     asked, may = threading.Event(), threading.Event()
 
     async def patient(scope: Scope, receive: Receive, send: Send) -> None:

@@ -11,18 +11,20 @@ from starlette.applications import Starlette
 from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
-from service.headers import CarefulHeaders
+from service.server.security_headers import (
+    SecurityHeaders,
+)
 from shared.wire import Problem
 
 # As service.routes has it: the process lives, and nothing else is said.
-_ALIVE = CarefulHeaders(JSONResponse({"status": "ok"}))
+_ALIVE = SecurityHeaders(JSONResponse({"status": "ok"}))
 _PROBLEM = Problem(title="Service Unavailable", status=503, detail="the edge ends before it has started", errors=[])
-_REFUSED = CarefulHeaders(
+_REFUSED = SecurityHeaders(
     JSONResponse(_PROBLEM.model_dump(), 503, headers={"Retry-After": "1"}, media_type="application/problem+json")
 )
 
 
-class Loading:
+class StartupGate:
     """An ASGI application that becomes another one as soon as that is loaded.
 
     Until then ``GET /healthz`` is answered, and every other request waits. Where the other cannot be loaded, those get

@@ -31,7 +31,7 @@ class _TooLarge(Exception):
     """A head is complete, and larger than it may be."""
 
 
-class BoundedHeads(HttpToolsProtocol):
+class BoundedHttpProtocol(HttpToolsProtocol):
     """uvicorn's protocol, which answers 431 to a head past 64 KB and hangs up on one that is not sent within 30 s.
 
     It hangs up at once on a connection for which no file is left, so that those that there are, the store and the LLM
@@ -49,8 +49,8 @@ class BoundedHeads(HttpToolsProtocol):
         super().connection_made(transport)
         if len(self.connections) > most_connections():
             transport.abort()
-            if self.loop.time() > BoundedHeads._told_until:
-                BoundedHeads._told_until = self.loop.time() + _TOLD_S
+            if self.loop.time() > BoundedHttpProtocol._told_until:
+                BoundedHttpProtocol._told_until = self.loop.time() + _TOLD_S
                 log.warning("%d connections: whoever comes next is hung up on", len(self.connections) - 1)
             return
         self._hang_up = self.loop.call_later(_MOST_S, transport.close)

@@ -9,10 +9,14 @@ from collections.abc import Callable
 import uvicorn
 from starlette.applications import Starlette
 
-from service.heads import BoundedHeads
-from service.loading import Loading
 from service.observability import (
     logs,
+)
+from service.server.connection_limits import (
+    BoundedHttpProtocol,
+)
+from service.server.startup_gate import (
+    StartupGate,
 )
 
 # The longest that a request takes from its connection's being accepted to its first bytes, when the service ends.
@@ -34,11 +38,11 @@ class Server(uvicorn.Server):
     """
 
     def __init__(self, load: Callable[[], Starlette], log_level: str) -> None:
-        self._loading = Loading(load, self._end)
+        self._loading = StartupGate(load, self._end)
         config = uvicorn.Config(
             self._loading,
             log_config=None,
-            http=BoundedHeads,
+            http=BoundedHttpProtocol,
             # There are none; their library would take heads that nobody counts.
             ws="none",
             log_level=log_level,

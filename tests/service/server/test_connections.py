@@ -14,7 +14,9 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from service import heads
+from service.server import (
+    connection_limits,
+)
 from tests.e2e.processes import serving_edge
 
 LEAST = 16
@@ -38,7 +40,7 @@ def test_those_that_there_are_go_on(tmp_path: Path, report: Callable[..., dict[s
         ExitStack() as crowd,
     ):
         uav.get("/readyz").raise_for_status()
-        files = heads._OTHER_FILES + LEAST
+        files = connection_limits._OTHER_FILES + LEAST
         resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (files, files))
         address = urlsplit(url)
         host, port = address.hostname or "", address.port or 0

@@ -13,7 +13,7 @@ _CAREFUL = {
 }
 
 
-class CarefulHeaders:
+class SecurityHeaders:
     """Pure ASGI middleware: answers are not cached, not framed, and not taken for another content type."""
 
     def __init__(self, app: ASGIApp) -> None:

@@ -19,12 +19,14 @@ from service.app import create_app
 from service.config.settings import (
     Settings,
 )
-from service.loading import Loading
+from service.server.startup_gate import (
+    StartupGate,
+)
 from tests.running import serving
 
 
 @contextmanager
-def held(make: Callable[[], FastAPI]) -> Iterator[tuple[str, Loading, threading.Event, threading.Event]]:
+def held(make: Callable[[], FastAPI]) -> Iterator[tuple[str, StartupGate, threading.Event, threading.Event]]:
     """An edge whose loading waits: its URL, itself, what lets it load, and what tells that it asked for its end."""
     may, stopped = threading.Event(), threading.Event()
 
@@ -32,7 +34,7 @@ def held(make: Callable[[], FastAPI]) -> Iterator[tuple[str, Loading, threading.
         may.wait(timeout=60)
         return make()
 
-    loading = Loading(load, stopped.set)
+    loading = StartupGate(load, stopped.set)
     with serving(loading) as url:
         try:
             yield url, loading, may, stopped
@@ -107,7 +109,7 @@ def test_nothing_slow_is_imported_before_the_first_answer() -> None:
         [
             sys.executable,
             "-c",
-            "import sys, uvicorn, service.serve, service.config.settings, service.observability.logs, service.loading\n"
+            "import sys, uvicorn, service.serve, service.config.settings, service.observability.logs, service.server.startup_gate\n"
             f"print([name for name in {slow} if name in sys.modules])",
         ],
         capture_output=True,
