@@ -23,7 +23,9 @@ import uvicorn
 from rich.console import Console
 from rich.progress import track
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
 from service.config.settings import (
     Settings,
 )

@@ -110,8 +110,12 @@ def _serve(listener: socket.socket, host: str) -> int:
 
 def _application(settings: Settings) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
-    from service.app import create_app
-    from service.keys import BadKeys
+    from service.api.api_keys import (
+        BadKeys,
+    )
+    from service.api.app import (
+        create_app,
+    )
     from service.storage.locks import (
         StoreUnusable,
     )

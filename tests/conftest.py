@@ -13,7 +13,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
 from service.config.settings import (
     Settings,
 )

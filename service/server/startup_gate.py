@@ -16,7 +16,7 @@ from service.server.security_headers import (
 )
 from shared.wire import Problem
 
-# As service.routes has it: the process lives, and nothing else is said.
+# As service.api.routes has it: the process lives, and nothing else is said.
 _ALIVE = SecurityHeaders(JSONResponse({"status": "ok"}))
 _PROBLEM = Problem(title="Service Unavailable", status=503, detail="the edge ends before it has started", errors=[])
 _REFUSED = SecurityHeaders(

@@ -61,7 +61,7 @@ MADE = {
     "make test": "this is part of it",
     "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
-    "make fuzz": "some minutes; tests/service/test_fuzz.py is a short one",
+    "make fuzz": "some minutes; tests/service/api/test_fuzz.py is a short one",
     "make soak": "ten minutes",
     "make docs": "tests/test_docs.py builds the pages",
     "make release": "minutes; it tries what it builds",

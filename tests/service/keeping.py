@@ -15,7 +15,9 @@ import httpx
 import numpy as np
 import psutil
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
 from service.config.settings import (
     Settings,
 )

@@ -12,6 +12,9 @@ import httpx
 import numpy as np
 import pytest
 
+from service.api.attention_weights import (
+    attention_of,
+)
 from service.config.settings import (
     Settings,
 )
@@ -21,7 +24,6 @@ from service.learning.attention import (
 from service.mission.mission import (
     Mission,
 )
-from service.onboard import attention_of
 from shared.features import FEATURES
 from shared.missions import MissionAttention
 from shared.scenario import SCENARIOS

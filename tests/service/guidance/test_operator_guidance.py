@@ -50,9 +50,11 @@ from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import MissionSpec
 from tests.running import serving
+from tests.service.api.test_routes import (
+    fields,
+)
 from tests.service.making import PAPER, attended, mission, uav
 from tests.service.stub_llm import StubLlm, said, wait_for
-from tests.service.test_api import fields
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]

@@ -16,14 +16,18 @@ import httpx
 import psutil
 import pytest
 
-from service.keys import editing
+from service.api.api_keys import (
+    editing,
+)
+from service.api.live_routes import (
+    STATIC,
+)
 from service.live.broadcaster import (
     MOST_LISTENERS,
 )
 from service.live.recent_decisions import (
     RecentDecisions,
 )
-from service.live.routes import STATIC
 from service.mission.events import (
     Settled,
 )

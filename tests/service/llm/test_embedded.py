@@ -8,7 +8,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
 from service.config.cores import (
     usable_cores,
 )

@@ -15,7 +15,9 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
 from service.config.settings import (
     Settings,
 )

@@ -14,9 +14,17 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Asked
 
-from service.keys import Key, Keys, Scope
-from service.limits import READING
-from service.problems import problem_response
+from service.api.api_keys import (
+    ApiKey,
+    ApiKeys,
+    Scope,
+)
+from service.api.concurrency_limit import (
+    READING,
+)
+from service.api.problem_details import (
+    problem_response,
+)
 
 # What says nothing of missions: probes of containers and load balancers carry no key.
 _OPEN = frozenset(("/healthz", "/readyz", "/"))
@@ -49,13 +57,13 @@ def may_make_missions(request: Request) -> bool:
     return scopes is None or "admin" in scopes
 
 
-class Guard:
+class KeyAuthentication:
     """Pure ASGI middleware. Answers 401 without a known key, 403 where it may not, 429 with ``Retry-After`` too often.
 
     Nothing of the body is read before. Keys come as ``Authorization: Bearer KEY``.
     """
 
-    def __init__(self, app: ASGIApp, keys: Keys) -> None:
+    def __init__(self, app: ASGIApp, keys: ApiKeys) -> None:
         self.app = app
         self._keys = keys
         self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
@@ -84,7 +92,7 @@ class Guard:
         refusal.headers["Connection"] = "close"
         await refusal(scope, receive, send)
 
-    async def _wait(self, key: Key) -> int | None:
+    async def _wait(self, key: ApiKey) -> int | None:
         """Seconds until the key may ask again; None where it may now, which then counts."""
         rate = RateLimitItemPerMinute(key.per_minute)
         if await self._rates.hit(rate, key.name):

@@ -14,7 +14,9 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
 from service.config.settings import (
     Settings,
 )

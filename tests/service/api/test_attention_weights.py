@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from shared.missions import MissionAttention
+from tests.service.api.test_authentication import (
+    bearer,
+    made,
+)
 from tests.service.keeping import running
-from tests.service.test_keys import bearer, made
 
 Body = dict[str, Any]
 Report = Callable[..., Body]

@@ -12,7 +12,13 @@ from typing import Any
 import httpx
 import pytest
 
-from service.keys import BadKeys, KeyFile, Keys, Scope, editing
+from service.api.api_keys import (
+    ApiKeys,
+    BadKeys,
+    KeyFile,
+    Scope,
+    editing,
+)
 from service.keys_command import main
 from shared.wire import DecideRequest
 from simulator.client import EdgeClient, EdgeRefused
@@ -96,7 +102,7 @@ def test_a_key_that_asks_too_often_is_told_to_wait(edge: Edge, report: Report, t
 def test_a_key_taken_back_is_out_and_a_new_one_in_without_a_restart(tmp_path: Path) -> None:
     path, now = tmp_path / "keys.json", [0.0]
     first = made(path, first=("decide",))["first"]
-    keys = Keys(path, clock=lambda: now[0])
+    keys = ApiKeys(path, clock=lambda: now[0])
     assert keys.find(first) is not None
     second = made(path, second=("decide",))["second"]
     now[0] = 2.0
@@ -114,7 +120,7 @@ def test_a_file_that_cannot_be_read_for_a_while_is_read_when_it_can(tmp_path: Pa
     """Neither chmod nor chown change what tells that a file is another."""
     path, now = tmp_path / "keys.json", [0.0]
     leaked = made(path, leaked=("decide",))["leaked"]
-    keys = Keys(path, clock=lambda: now[0])
+    keys = ApiKeys(path, clock=lambda: now[0])
     made(path, other=("decide",))
     with monkeypatch.context() as patched:
         patched.setattr(Path, "read_bytes", lambda self: (_ for _ in ()).throw(PermissionError(13, "denied")))
@@ -175,7 +181,7 @@ def test_the_command_makes_lists_and_removes(tmp_path: Path, capsys: pytest.Capt
     file = ["--file", str(tmp_path / "keys.json")]
     assert main(["add", "fleet-1", *file, "--scopes", "decide", "admin"]) == 0
     key = capsys.readouterr().out.strip()
-    found = Keys(tmp_path / "keys.json").find(key)
+    found = ApiKeys(tmp_path / "keys.json").find(key)
     assert found is not None and found.scopes == {"decide", "admin"}
     assert main(["list", *file]) == 0
     listed = capsys.readouterr().out
@@ -185,7 +191,7 @@ def test_the_command_makes_lists_and_removes(tmp_path: Path, capsys: pytest.Capt
     assert main(["remove", "fleet-1", *file]) == 0
     assert main(["remove", "fleet-1", *file]) == 2
     with pytest.raises(BadKeys, match="holds no key"):
-        Keys(tmp_path / "keys.json")
+        ApiKeys(tmp_path / "keys.json")
 
 
 @pytest.mark.parametrize(
@@ -213,7 +219,7 @@ def test_bad_use_is_one_clear_line(
 def test_a_broken_file_is_named_and_never_quoted(tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "keys.json").write_text(content)
     with pytest.raises(BadKeys) as caught:
-        Keys(tmp_path / "keys.json")
+        ApiKeys(tmp_path / "keys.json")
     assert f"keys.json: {said}" in str(caught.value)
     assert "nonsense" not in str(caught.value)
 

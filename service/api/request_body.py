@@ -1,9 +1,8 @@
-"""The door: requests are bounded in number, and bodies in time and in size, before and after they are unpacked."""
+"""Bodies of requests: bounded in time, and in size before and after they are unpacked."""
 
 from __future__ import annotations
 
 import asyncio
-import re
 import zlib
 from collections.abc import Callable
 
@@ -11,13 +10,10 @@ import zstandard
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.problems import problem_response
+from service.api.problem_details import (
+    problem_response,
+)
 
-# What is read has no body: nothing of it is kept.
-READING = ("GET", "HEAD")
-_NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
-# A page's stream lasts as long as the page: it has a limit of its own, and takes no decision's place.
-_STREAMS = re.compile(r"/missions/[^/]+/events")
 # Meanwhile a body keeps the place of a decision.
 _BODY_S = 10.0
 
@@ -30,41 +26,7 @@ class _Damaged(Exception):
     """The body is not in the encoding that it claims."""
 
 
-class Crowd:
-    """Pure ASGI middleware: past ``most`` requests in hand 503 with ``Retry-After``.
-
-    Probes, metrics and the streams of pages do not count.
-
-    Nothing of the refused body is read.
-    """
-
-    def __init__(self, app: ASGIApp, most: int) -> None:
-        self.app = app
-        self._most = most
-        self._inside = 0
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_let_in(scope["method"], scope["path"]):
-            await self.app(scope, receive, send)
-            return
-        if self._inside >= self._most:
-            response = problem_response(503, f"{self._most} requests are in hand already")
-            response.headers["Retry-After"] = "1"
-            response.headers["Connection"] = "close"
-            await response(scope, receive, send)
-            return
-        self._inside += 1
-        try:
-            await self.app(scope, receive, send)
-        finally:
-            self._inside -= 1
-
-
-def _is_let_in(method: str, path: str) -> bool:
-    return method in READING and (path in _NEVER_REFUSED or _STREAMS.fullmatch(path) is not None)
-
-
-class BodyLimit:
+class RequestBody:
     """Pure ASGI middleware: reads the body up to ``limit`` bytes and undoes ``Content-Encoding: gzip | zstd``.
 
     Answers 413 past the limit, 408 to what has not come within 10 s, 415 for another encoding, 400 for a damaged one,

@@ -14,13 +14,19 @@ from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
 from starlette.types import Message, Scope, Send
 
+from service.api.authentication import (
+    STILL_KNOWN,
+)
+from service.api.problem_details import (
+    documented,
+)
+from service.api.routes import (
+    TheEngine,
+)
 from service.errors import NotFound
-from service.guard import STILL_KNOWN
 from service.live.broadcaster import (
     Broadcaster,
 )
-from service.problems import documented
-from service.routes import TheEngine
 from shared.missions import DecisionPrompt, MissionLine, MissionList
 from shared.wire import DecisionId, MissionId, Reason
 

@@ -8,18 +8,24 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
-from service import onboard
+from service.api import (
+    attention_weights,
+)
+from service.api.authentication import (
+    may_make_missions,
+)
+from service.api.problem_details import (
+    documented,
+)
 from service.edge.engine import (
     Engine,
 )
-from service.guard import may_make_missions
 from service.llm.server_pool import (
     ServerPool,
 )
 from service.observability.metrics import (
     Metrics,
 )
-from service.problems import documented
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionAttention, MissionStatus
 from shared.wire import (
@@ -120,7 +126,7 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
 async def get_attention(mission_id: MissionId, engine: TheEngine, request: Request, held: HeldTag = None) -> Response:
     """The attention module's weights, with an ETag: to score the sensors on board, and report only the k best."""
     mission = await engine.missions.get(mission_id)
-    return onboard.told(mission, held, request.headers.get("Accept-Encoding", ""))
+    return attention_weights.told(mission, held, request.headers.get("Accept-Encoding", ""))
 
 
 @router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])

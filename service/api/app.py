@@ -11,17 +11,36 @@ from typing import TypedDict
 import torch
 from fastapi import FastAPI
 
-from service import problems
+from service.api import (
+    live_routes as live_routes,
+)
+from service.api import (
+    problem_details,
+)
+from service.api.api_keys import (
+    ApiKeys,
+)
+from service.api.authentication import (
+    KeyAuthentication,
+)
+from service.api.concurrency_limit import (
+    ConcurrencyLimit,
+)
+from service.api.openapi import (
+    schema_of,
+)
+from service.api.request_body import (
+    RequestBody,
+)
+from service.api.routes import (
+    router,
+)
 from service.config.settings import (
     Settings,
 )
 from service.edge.engine import (
     Engine,
 )
-from service.guard import Guard
-from service.keys import Keys
-from service.limits import BodyLimit, Crowd
-from service.live import routes as live_routes
 from service.llm.server_pool import (
     ServerPool,
 )
@@ -33,12 +52,10 @@ from service.observability.tracing import (
     Traces,
     provider_from_environment,
 )
-from service.openapi import schema_of
 from service.prompting.token_accounting import (
     TokenCounter,
 )
 from service.prompting.warm_up import warm_up
-from service.routes import router
 from service.server.security_headers import (
     SecurityHeaders,
 )
@@ -97,13 +114,13 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     app.include_router(router)
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
-    app.add_middleware(BodyLimit, limit=settings.max_body_bytes)
-    app.add_middleware(Crowd, most=settings.max_requests)
+    app.add_middleware(RequestBody, limit=settings.max_body_bytes)
+    app.add_middleware(ConcurrencyLimit, most=settings.max_requests)
     if settings.keys is not None:
-        app.add_middleware(Guard, keys=Keys(settings.keys))
+        app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))
     app.add_middleware(SecurityHeaders)
     if traces.provider is not None:
         app.add_middleware(Traced)
-    problems.install(app)
+    problem_details.install(app)
     app.openapi = lambda: schema_of(app)  # type: ignore[method-assign]
     return app

@@ -9,11 +9,17 @@ import httpx
 import jsonschema_rs
 import pytest
 
-from service.app import create_app
+from service.api.app import (
+    create_app,
+)
+from service.api.openapi import (
+    ANSWERS,
+    DECISION_ID,
+    REQUESTS,
+)
 from service.config.settings import (
     Settings,
 )
-from service.openapi import ANSWERS, DECISION_ID, REQUESTS
 from tests.e2e.processes import serving_edge
 
 DOCUMENT = create_app(Settings(mode="value")).openapi()

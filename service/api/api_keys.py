@@ -36,7 +36,7 @@ class BadKeys(Exception):
     """The file of keys cannot be used; the text says why, never what is in it."""
 
 
-class Key(BaseModel):
+class ApiKey(BaseModel):
     """One key, without the key: its name, what it may do, how often a minute, and the hash that it is known by."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -52,7 +52,7 @@ class KeyFile(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    keys: list[Key] = Field(default_factory=list, max_length=_MOST_KEYS)
+    keys: list[ApiKey] = Field(default_factory=list, max_length=_MOST_KEYS)
 
     @classmethod
     def read(cls, path: Path) -> KeyFile:
@@ -91,7 +91,7 @@ class KeyFile(BaseModel):
         if len(self.keys) >= _MOST_KEYS:
             raise BadKeys(f"there are {_MOST_KEYS} keys already")
         shown = _PREFIX + secrets.token_urlsafe(32)
-        self.keys.append(Key(name=name, scopes=scopes, per_minute=per_minute, sha256=hash_of(shown)))
+        self.keys.append(ApiKey(name=name, scopes=scopes, per_minute=per_minute, sha256=hash_of(shown)))
         return shown
 
     def remove(self, name: str) -> None:
@@ -122,7 +122,7 @@ def hash_of(key: str) -> str:
     return hashlib.sha256(key.encode()).hexdigest()
 
 
-class Keys:
+class ApiKeys:
     """The keys of a file, read again when it changes; while it cannot be read, those known before count.
 
     Raises:
@@ -138,7 +138,7 @@ class Keys:
         if not self._keys:
             raise BadKeys(f"{path} holds no key: nobody could ask. Make one with: aicvds keys add NAME --file {path}")
 
-    def find(self, presented: str) -> Key | None:
+    def find(self, presented: str) -> ApiKey | None:
         """Whose key that is. Every key is compared, each in constant time."""
         self._refresh()
         hashed = hash_of(presented)

@@ -17,7 +17,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.keys import KeyFile
+from service.api.api_keys import (
+    KeyFile,
+)
 from tests.running import listening
 from tests.service.stub_llm import misbehaving, silent, wait_for
 
@@ -84,7 +86,7 @@ def test_strangers_whose_bodies_never_come_keep_nobody_out(edge: Edge, report: R
 def test_a_body_that_does_not_come_gives_its_place_back(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.limits._BODY_S", 0.5)
+    monkeypatch.setattr("service.api.request_body._BODY_S", 0.5)
     client = edge(max_requests=2)
     with ExitStack() as held:
         for waiting in [begun(held, client, "POST /decide") for _ in range(2)]:
