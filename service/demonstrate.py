@@ -46,7 +46,11 @@ def main(argv: list[str]) -> int:
     from service.prompting.demonstrations import (
         Demonstrations,
     )
-    from service.teachers import TEACHERS, farthest_first, solutions
+    from service.training.demonstration_teachers import (
+        TEACHERS,
+        farthest_first,
+        solutions,
+    )
 
     try:
         if args.teacher not in TEACHERS:

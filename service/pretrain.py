@@ -17,7 +17,9 @@ def main(argv: list[str]) -> int:
     try:
         _check(args)
         # It imports torch, which takes seconds; `--help` and bad use answer without it.
-        from service.pretraining import pretrain
+        from service.training.training_loop import (
+            pretrain,
+        )
 
         pretrain(args, console)
     except (ValueError, OSError) as error:

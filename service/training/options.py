@@ -9,7 +9,10 @@ from typing import Annotated
 import tyro
 from tyro.conf import arg
 
-from service.reward import Speed, Target
+from service.training.reward import (
+    Speed,
+    Target,
+)
 from shared.wire import Belief, Features
 
 

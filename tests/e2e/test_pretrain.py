@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from service.examples import Batch, Example, replay
 from service.learning import (
     initial_weights as checkpoints,
 )
@@ -17,9 +16,21 @@ from service.learning.initial_weights import (
 from service.learning.modules import (
     Modules,
 )
-from service.pretraining import losses
-from service.recall import recall, references
-from service.reward import Reward
+from service.training.reward import (
+    Reward,
+)
+from service.training.rollout_examples import (
+    Batch,
+    Example,
+    replay,
+)
+from service.training.teacher_agreement import (
+    recall,
+    references,
+)
+from service.training.training_loop import (
+    losses,
+)
 from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from shared.wire import Features

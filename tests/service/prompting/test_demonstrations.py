@@ -13,7 +13,12 @@ from service.errors import Refused
 from service.prompting.demonstrations import (
     packaged,
 )
-from service.teachers import TEACHERS, farthest_first, likeness, solutions
+from service.training.demonstration_teachers import (
+    TEACHERS,
+    farthest_first,
+    likeness,
+    solutions,
+)
 from shared.actions import Action
 from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts

@@ -26,7 +26,10 @@ from service.learning.sample import (
 from service.mission.mission import (
     Mission,
 )
-from service.reward import Reward, Speed
+from service.training.reward import (
+    Reward,
+    Speed,
+)
 from shared.features import State
 from shared.reach import Reach, distances_ahead
 from shared.rollouts import Header, Reference, RolloutStep

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.examples import Example, Taught
 from service.learning.attention import (
     top_k,
 )
 from service.learning.parameters import (
     Weights,
+)
+from service.training.rollout_examples import (
+    Example,
+    Taught,
 )
 
 

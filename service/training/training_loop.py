@@ -12,7 +12,6 @@ from rich.table import Table
 from torch import Tensor
 from torch.nn import functional
 
-from service.examples import Batch, Choices, Example, replay
 from service.learning.initial_weights import (
     initial_weights,
     save,
@@ -20,9 +19,22 @@ from service.learning.initial_weights import (
 from service.learning.modules import (
     Modules,
 )
-from service.recall import recall, references, velocity_agreement, velocity_error
-from service.reward import Reward
 from service.training.options import Pretrain
+from service.training.reward import (
+    Reward,
+)
+from service.training.rollout_examples import (
+    Batch,
+    Choices,
+    Example,
+    replay,
+)
+from service.training.teacher_agreement import (
+    recall,
+    references,
+    velocity_agreement,
+    velocity_error,
+)
 from shared.rollouts import read_rollouts
 
 
