@@ -19,7 +19,9 @@ from service.api.api_keys import (
     Scope,
     editing,
 )
-from service.keys_command import main
+from service.commands.keys import (
+    main,
+)
 from shared.wire import DecideRequest
 from simulator.client import EdgeClient, EdgeRefused
 

@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.commands.demonstrate import (
+    main,
+)
 from service.deciding.look_ahead import (
     decide_without_llm,
 )
-from service.demonstrate import main
 from service.errors import Refused
 from service.prompting.demonstrations import (
     packaged,

@@ -111,7 +111,7 @@ def test_nothing_slow_is_imported_before_the_first_answer() -> None:
         [
             sys.executable,
             "-c",
-            "import sys, uvicorn, service.serve, service.config.settings, service.observability.logs, service.server.startup_gate\n"
+            "import sys, uvicorn, service.commands.serve, service.config.settings, service.observability.logs, service.server.startup_gate\n"
             f"print([name for name in {slow} if name in sys.modules])",
         ],
         capture_output=True,

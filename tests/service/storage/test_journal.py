@@ -212,7 +212,7 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) 
         "import resource, sys, signal\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
-        "from service.serve import main\n"
+        "from service.commands.serve import main\n"
         "sys.exit(main(['--port', '0']))\n"
     )
     path = tmp_path / "m.db"
