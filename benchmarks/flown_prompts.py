@@ -13,32 +13,14 @@ from typing import Any
 
 from paper_template import EXPERIENCES, Newest, PaperTemplate
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.deliberation import (
-    offered,
-)
-from service.deciding.rollout_evaluator import (
-    RolloutState,
-)
-from service.llm.request_bodies import (
-    chat_body,
-    label_body,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.candidates import (
-    CandidateSet,
-    GuidedTemplate,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.deliberation import offered
+from service.deciding.rollout_evaluator import RolloutState
+from service.llm.request_bodies import chat_body, label_body
+from service.mission.mission import Mission
+from service.prompting.candidates import CandidateSet, GuidedTemplate
+from service.prompting.prompt import Prompt
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
 from simulator.mission import Choice, LocalPilot, decide_request, fly

@@ -34,19 +34,10 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.rollout_evaluator import (
-    judge,
-)
-from service.llm.answer_format import (
-    NoDecision,
-    check_answer,
-)
-from service.prompting.token_accounting import (
-    TokenCounter,
-)
+from service.config.settings import Settings
+from service.deciding.rollout_evaluator import judge
+from service.llm.answer_format import NoDecision, check_answer
+from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
 from shared.scenario import Scenario, scenario_named
 from simulator.experiments.intervals import interval, paired

@@ -23,35 +23,15 @@ import uvicorn
 from rich.console import Console
 from rich.progress import track
 
-from service.api.app import (
-    create_app,
-)
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.llm_query import (
-    LlmAdvice,
-    LlmQueries,
-    by_action,
-)
-from service.edge.engine import (
-    Engine,
-)
-from service.llm.server_pool import (
-    ServerPool,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.prompting.candidates import (
-    CandidateSet,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.deciding.llm_query import LlmAdvice, LlmQueries, by_action
+from service.edge.engine import Engine
+from service.llm.server_pool import ServerPool
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.prompting.candidates import CandidateSet
+from service.prompting.prompt import Prompt
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient

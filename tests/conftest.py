@@ -13,15 +13,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.api.app import (
-    create_app,
-)
-from service.config.settings import (
-    Settings,
-)
-from service.storage.store import (
-    Store,
-)
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.storage.store import Store
 from tests.running import serving
 
 # Edges that are started as processes keep nothing, unless a test says so: they would share the user's store.

@@ -11,9 +11,7 @@ from contextlib import contextmanager
 import uvicorn
 from starlette.types import ASGIApp
 
-from service.server.connection_limits import (
-    BoundedHttpProtocol,
-)
+from service.server.connection_limits import BoundedHttpProtocol
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 

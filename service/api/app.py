@@ -11,57 +11,23 @@ from typing import TypedDict
 import torch
 from fastapi import FastAPI
 
-from service.api import (
-    live_routes as live_routes,
-)
-from service.api import (
-    problem_details,
-)
-from service.api.api_keys import (
-    ApiKeys,
-)
-from service.api.authentication import (
-    KeyAuthentication,
-)
-from service.api.concurrency_limit import (
-    ConcurrencyLimit,
-)
-from service.api.openapi import (
-    schema_of,
-)
-from service.api.request_body import (
-    RequestBody,
-)
-from service.api.routes import (
-    router,
-)
-from service.config.settings import (
-    Settings,
-)
-from service.edge.engine import (
-    Engine,
-)
-from service.llm.server_pool import (
-    ServerPool,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.observability.tracing import (
-    Traced,
-    Traces,
-    provider_from_environment,
-)
-from service.prompting.token_accounting import (
-    TokenCounter,
-)
+from service.api import live_routes as live_routes
+from service.api import problem_details
+from service.api.api_keys import ApiKeys
+from service.api.authentication import KeyAuthentication
+from service.api.concurrency_limit import ConcurrencyLimit
+from service.api.openapi import schema_of
+from service.api.request_body import RequestBody
+from service.api.routes import router
+from service.config.settings import Settings
+from service.edge.engine import Engine
+from service.llm.server_pool import ServerPool
+from service.observability.metrics import Metrics
+from service.observability.tracing import Traced, Traces, provider_from_environment
+from service.prompting.token_accounting import TokenCounter
 from service.prompting.warm_up import warm_up
-from service.server.security_headers import (
-    SecurityHeaders,
-)
-from service.storage.store import (
-    Store,
-)
+from service.server.security_headers import SecurityHeaders
+from service.storage.store import Store
 
 
 class State(TypedDict):

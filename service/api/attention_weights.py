@@ -8,9 +8,7 @@ from http import HTTPStatus
 
 from fastapi import Response
 
-from service.mission.mission import (
-    Mission,
-)
+from service.mission.mission import Mission
 from shared.missions import MissionAttention, WeightArray
 
 

@@ -14,17 +14,9 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as Asked
 
-from service.api.api_keys import (
-    ApiKey,
-    ApiKeys,
-    Scope,
-)
-from service.api.concurrency_limit import (
-    READING,
-)
-from service.api.problem_details import (
-    problem_response,
-)
+from service.api.api_keys import ApiKey, ApiKeys, Scope
+from service.api.concurrency_limit import READING
+from service.api.problem_details import problem_response
 
 # What says nothing of missions: probes of containers and load balancers carry no key.
 _OPEN = frozenset(("/healthz", "/readyz", "/"))

@@ -6,9 +6,7 @@ import re
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.api.problem_details import (
-    problem_response,
-)
+from service.api.problem_details import problem_response
 
 # What is read has no body: nothing of it is kept.
 READING = ("GET", "HEAD")

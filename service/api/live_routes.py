@@ -14,19 +14,12 @@ from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
 from starlette.types import Message, Scope, Send
 
-from service.api.authentication import (
-    STILL_KNOWN,
-)
-from service.api.problem_details import (
-    documented,
-)
-from service.api.routes import (
-    TheEngine,
-)
+from service import live
+from service.api.authentication import STILL_KNOWN
+from service.api.problem_details import documented
+from service.api.routes import TheEngine
 from service.errors import NotFound
-from service.live.broadcaster import (
-    Broadcaster,
-)
+from service.live.broadcaster import Broadcaster
 from shared.missions import DecisionPrompt, MissionLine, MissionList
 from shared.wire import DecisionId, MissionId, Reason
 
@@ -34,7 +27,7 @@ log = logging.getLogger(__name__)
 
 router = APIRouter()
 
-STATIC = Path(__file__).parent / "static"
+STATIC = Path(live.__file__).parent / "static"
 # Nothing but the edge's own files; no inline scripts or styles, nothing framed, nothing sent elsewhere.
 _CAREFUL = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "

@@ -8,14 +8,8 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.api.authentication import (
-    is_open,
-    scope_of,
-)
-from service.api.problem_details import (
-    CONTENT_TYPE,
-    documented,
-)
+from service.api.authentication import is_open, scope_of
+from service.api.problem_details import CONTENT_TYPE, documented
 from shared.scenario import SCENARIOS
 from shared.wire import Problem
 
@@ -245,7 +239,7 @@ def schema_of(app: FastAPI) -> dict[str, Any]:
 
 
 def _guard(operation: dict[str, Any], method: str, path: str) -> None:
-    """What :class:`service.api.authentication.KeyAuthentication` asks for, where the edge has keys, and answers without."""
+    """What ``KeyAuthentication`` asks for, where the edge has keys, and answers without."""
     if is_open(method, path):
         return
     operation["security"] = [{"key": []}, {}]

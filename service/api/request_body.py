@@ -10,9 +10,7 @@ import zstandard
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.problem_details import (
-    problem_response,
-)
+from service.api.problem_details import problem_response
 
 # Meanwhile a body keeps the place of a decision.
 _BODY_S = 10.0

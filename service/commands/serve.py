@@ -16,9 +16,7 @@ from pydantic import ValidationError
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from service.config.settings import (
-        Settings,
-    )
+    from service.config.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -65,13 +63,8 @@ def main(argv: list[str]) -> int:
 
 
 def _serve(listener: socket.socket, host: str) -> int:
-    from service.config.settings import (
-        Settings,
-        unknown_variables,
-    )
-    from service.server.malloc import (
-        hand_back_memory,
-    )
+    from service.config.settings import Settings, unknown_variables
+    from service.server.malloc import hand_back_memory
 
     hand_back_memory()
 
@@ -91,12 +84,8 @@ def _serve(listener: socket.socket, host: str) -> int:
             "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
 
-    from service.observability import (
-        logs,
-    )
-    from service.server.server import (
-        Server,
-    )
+    from service.observability import logs
+    from service.server.server import Server
 
     logs.configure(settings.log_level, settings.log_format)
     server = Server(partial(_application, settings), settings.log_level)
@@ -110,18 +99,10 @@ def _serve(listener: socket.socket, host: str) -> int:
 
 def _application(settings: Settings) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
-    from service.api.api_keys import (
-        BadKeys,
-    )
-    from service.api.app import (
-        create_app,
-    )
-    from service.storage.locks import (
-        StoreUnusable,
-    )
-    from service.storage.store import (
-        Store,
-    )
+    from service.api.api_keys import BadKeys
+    from service.api.app import create_app
+    from service.storage.locks import StoreUnusable
+    from service.storage.store import Store
 
     try:
         return create_app(settings, None if settings.store == "none" else Store(settings.store))

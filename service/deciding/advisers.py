@@ -8,18 +8,10 @@ from typing import Protocol
 import numpy as np
 from scipy.special import softmax
 
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
-from service.learning.trust import (
-    PLANNER,
-)
-from service.mission.mission import (
-    Mission,
-)
+from service.deciding.attended_state import AttendedState
+from service.deciding.look_ahead import decide_without_llm
+from service.learning.trust import PLANNER
+from service.mission.mission import Mission
 from shared.actions import Action
 from shared.channel import FloatArray
 

@@ -10,24 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from service.guidance.step_guidance import (
-    StepGuidance,
-)
-from service.learning.attention import (
-    top_k,
-)
-from service.learning.sample import (
-    Sample,
-)
-from service.mission.events import (
-    Pending,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.row_formats import (
-    cells,
-)
+from service.guidance.step_guidance import StepGuidance
+from service.learning.attention import top_k
+from service.learning.sample import Sample
+from service.mission.events import Pending
+from service.mission.mission import Mission
+from service.prompting.row_formats import cells
 from shared.actions import Action
 from shared.features import State, augment
 from shared.wire import Candidate, UavState

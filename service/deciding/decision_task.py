@@ -5,16 +5,10 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from service.deciding.llm_query import (
-    LlmAdvice,
-)
-from service.learning.trust import (
-    Advice,
-)
+from service.deciding.llm_query import LlmAdvice
+from service.learning.trust import Advice
 from service.llm.completion import Completion
-from service.observability.stopwatch import (
-    Stopwatch,
-)
+from service.observability.stopwatch import Stopwatch
 from shared.wire import Guided, Reason, Source, UavState
 
 _SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}

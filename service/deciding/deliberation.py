@@ -12,7 +12,8 @@ adviser is overruled where the critic sees a disaster, even before trust has lea
 counts for more than the critic's small differences. The best is taken rather than a draw: losses are estimated for
 every candidate, so that exploring would teach nothing, and cost packets.
 
-The weights and what they guarantee are in :mod:`service.learning.trust`; the critic in :mod:`service.deciding.rollout_evaluator`.
+The weights and what they guarantee are in :mod:`service.learning.trust`; the critic is
+:mod:`service.deciding.rollout_evaluator`.
 """
 
 from __future__ import annotations
@@ -23,36 +24,13 @@ from typing import Self
 
 import numpy as np
 
-from service.deciding.advisers import (
-    ADVISERS,
-    SMOOTHING,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.rollout_evaluator import (
-    Judgement,
-    RolloutState,
-    judge,
-)
-from service.learning.trust import (
-    CAP,
-    LLM,
-    PLANNER,
-    RATE,
-    Advice,
-    Trust,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.candidates import (
-    CandidateSet,
-    GuidedTemplate,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
+from service.deciding.advisers import ADVISERS, SMOOTHING
+from service.deciding.attended_state import AttendedState
+from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
+from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
+from service.mission.mission import Mission
+from service.prompting.candidates import CandidateSet, GuidedTemplate
+from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Guided, Weighed

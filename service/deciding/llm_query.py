@@ -12,33 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.deliberation import (
-    offered,
-    template_of,
-)
-from service.llm.answer_format import (
-    NoDecision,
-)
+from service.deciding.attended_state import AttendedState
+from service.deciding.deliberation import offered, template_of
+from service.llm.answer_format import NoDecision
 from service.llm.calibration import LabelReader
 from service.llm.completion import Completion
-from service.llm.server_pool import (
-    ServerPool,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.prompting.candidates import (
-    CandidateSet,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
+from service.llm.server_pool import ServerPool
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.prompting.candidates import CandidateSet
+from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Reason

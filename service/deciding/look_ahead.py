@@ -6,9 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from service.guidance.step_guidance import (
-    StepGuidance,
-)
+from service.guidance.step_guidance import StepGuidance
 from shared.actions import Action
 from shared.features import State
 from shared.reach import Reach, distances_ahead

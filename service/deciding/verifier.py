@@ -9,15 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.llm.answer_format import (
-    NoDecision,
-)
-from service.mission.mission import (
-    Mission,
-)
+from service.deciding.attended_state import AttendedState
+from service.llm.answer_format import NoDecision
+from service.mission.mission import Mission
 from shared.channel import link_holds
 from shared.reach import distances_ahead
 

@@ -12,89 +12,33 @@ from dataclasses import replace
 
 from pydantic import TypeAdapter
 
-from service.config.cores import (
-    usable_cores,
-)
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.decision_task import (
-    RESERVE_S,
-    Choice,
-    DecisionTask,
-)
-from service.deciding.deliberation import (
-    Deliberation,
-)
-from service.deciding.llm_query import (
-    LlmAdvice,
-    LlmQueries,
-)
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
-from service.deciding.verifier import (
-    verify,
-)
-from service.edge.feedback import (
-    Outcomes,
-)
-from service.edge.mission_registry import (
-    MissionRegistry,
-)
+from service.config.cores import usable_cores
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.decision_task import RESERVE_S, Choice, DecisionTask
+from service.deciding.deliberation import Deliberation
+from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.deciding.look_ahead import decide_without_llm
+from service.deciding.verifier import verify
+from service.edge.feedback import Outcomes
+from service.edge.mission_registry import MissionRegistry
 from service.errors import Unavailable
-from service.guidance.note_compiler import (
-    NoteCompiler,
-)
-from service.learning.trust import (
-    LLM,
-)
-from service.live.broadcaster import (
-    Broadcaster,
-)
-from service.llm.answer_format import (
-    NoDecision,
-    check_answer,
-)
+from service.guidance.note_compiler import NoteCompiler
+from service.learning.trust import LLM
+from service.live.broadcaster import Broadcaster
+from service.llm.answer_format import NoDecision, check_answer
 from service.llm.completion import Completion
-from service.llm.server_pool import (
-    ServerPool,
-)
-from service.mission.events import (
-    AdviserReport,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability import (
-    logs,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.observability.stopwatch import (
-    Stopwatch,
-)
-from service.observability.tracing import (
-    Traces,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
-from service.prompting.token_accounting import (
-    TokenCounter,
-    with_usage,
-)
-from service.storage.journal import (
-    Journal,
-    NullJournal,
-)
-from service.storage.store import (
-    Store,
-)
+from service.llm.server_pool import ServerPool
+from service.mission.events import AdviserReport
+from service.mission.mission import Mission
+from service.observability import logs
+from service.observability.metrics import Metrics
+from service.observability.stopwatch import Stopwatch
+from service.observability.tracing import Traces
+from service.prompting.prompt import Prompt
+from service.prompting.token_accounting import TokenCounter, with_usage
+from service.storage.journal import Journal, NullJournal
+from service.storage.store import Store
 from shared.actions import Action
 from shared.wire import (
     BatchRequest,

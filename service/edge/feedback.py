@@ -11,22 +11,11 @@ from contextlib import suppress
 from typing import Literal, NamedTuple
 
 from service.errors import Conflict
-from service.learning.sample import (
-    Sample,
-)
-from service.live.broadcaster import (
-    Broadcaster,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.storage.journal import (
-    Journal,
-    NullJournal,
-)
+from service.learning.sample import Sample
+from service.live.broadcaster import Broadcaster
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.storage.journal import Journal, NullJournal
 from shared.wire import Outcome
 
 log = logging.getLogger(__name__)

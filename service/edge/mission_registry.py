@@ -10,31 +10,18 @@ from typing import TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 from service.errors import Conflict, NotFound, Unavailable
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.storage.journal import (
-    Journal,
-    NullJournal,
-)
-from service.storage.recovery import (
-    restore_mission,
-)
-from service.storage.store import (
-    Store,
-)
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.storage.journal import Journal, NullJournal
+from service.storage.recovery import restore_mission
+from service.storage.store import Store
 from shared.wire import BatchRequest, DecideRequest, MissionSpec
 
 log = logging.getLogger(__name__)
 
-AnyRequest = TypeVar("Asked", DecideRequest, BatchRequest)
+AnyRequest = TypeVar("AnyRequest", DecideRequest, BatchRequest)
 
 # The longest that who asks about a mission waits for its being read back; a decision no longer than its deadline.
 _WAKE_S = 10.0

@@ -18,12 +18,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from service.guidance.order_examples import (
-    EXAMPLES,
-)
-from service.llm.answer_format import (
-    Constraint,
-)
+from service.guidance.order_examples import EXAMPLES
+from service.llm.answer_format import Constraint
 from shared.guidance import Guidance, SensorWish
 
 INSTRUCTION = "Rewrite the operator's note as orders for the UAVs."

@@ -10,9 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.config.cores import (
-    usable_cores,
-)
+from service.config.cores import usable_cores
 
 WIDTH = 32
 # Sensors from which on their queries are shared among cores. Of 768 queries and more torch's kernel takes 256 at a

@@ -9,12 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from service.learning.modules import (
-    Modules,
-)
-from service.learning.parameters import (
-    Weights,
-)
+from service.learning.modules import Modules
+from service.learning.parameters import Weights
 from shared.wire import Features, Init
 
 # Only preset `paper` has weights for each velocity level.

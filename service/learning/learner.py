@@ -14,20 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from service.learning.adam import (
-    Moments,
-    stepped,
-)
-from service.learning.attention import (
-    AttentionWeights,
-)
-from service.learning.backpropagation import (
-    descend,
-)
+from service.learning.adam import Moments, stepped
+from service.learning.attention import AttentionWeights
+from service.learning.backpropagation import descend
 from service.learning.parameters import Weights, _buffers
-from service.learning.sample import (
-    Sample,
-)
+from service.learning.sample import Sample
 
 
 class Learner:

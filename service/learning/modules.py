@@ -5,17 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from service.learning.attention import (
-    Attention,
-)
+from service.learning.attention import Attention
 from service.learning.parameters import Layout, Weights
-from service.learning.sample import (
-    Sample,
-)
-from service.learning.velocity import (
-    ReachVelocityScorer,
-    VelocityScorer,
-)
+from service.learning.sample import Sample
+from service.learning.velocity import ReachVelocityScorer, VelocityScorer
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
@@ -45,5 +38,5 @@ class Modules(nn.Module):
 
     def weights(self) -> Weights:
         """A copy to decide by."""
-        layout = Layout.of(self)
+        layout = Layout.of(self.preset, self.named_parameters())
         return Weights(layout, layout.flat([p.detach() for p in self.parameters()]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -12,19 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from service.learning.attention import (
-    AttentionWeights,
-    attend,
-)
-from service.learning.backpropagation import (
-    Parameters,
-)
-from service.learning.modules import Modules
-from service.learning.velocity import (
-    VelocityWeights,
-    by_distance,
-    by_reach,
-)
+from service.learning.attention import AttentionWeights, attend
+from service.learning.backpropagation import Parameters
+from service.learning.velocity import VelocityWeights, by_distance, by_reach
 from shared.wire import Features
 
 # Numbers that torch computes at once: a parameter of so many, or a multiple, is computed the same wherever it lies.
@@ -89,15 +79,15 @@ class Layout:
     starts: tuple[int, ...]
 
     @classmethod
-    def of(cls, modules: Modules) -> Self:
-        """The modules' own."""
-        names, parameters = zip(*modules.named_parameters(), strict=True)
+    def of(cls, preset: Features, named: Iterable[tuple[str, Tensor]]) -> Self:
+        """Of a preset's modules, from their parameters by name."""
+        names, parameters = zip(*named, strict=True)
         shapes = tuple(p.shape for p in parameters)
         starts, end = dict[int, int](), 0
         for index in sorted(range(len(shapes)), key=lambda index: shapes[index].numel() % _AT_ONCE != 0):
             starts[index], end = end, end + shapes[index].numel()
         strides = tuple(p.contiguous().stride() for p in parameters)
-        return cls(modules.preset, names, shapes, strides, tuple(starts[index] for index in range(len(shapes))))
+        return cls(preset, names, shapes, strides, tuple(starts[index] for index in range(len(shapes))))
 
     @property
     def size(self) -> int:

@@ -8,9 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.learning.attention import (
-    WIDTH,
-)
+from service.learning.attention import WIDTH
 
 
 class VelocityWeights(NamedTuple):

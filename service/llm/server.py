@@ -11,29 +11,13 @@ from contextvars import Context
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from service.config.settings import (
-    Settings,
-)
-from service.llm.answer_format import (
-    Constraint,
-    NoDecision,
-    check_labels,
-)
-from service.llm.circuit_breaker import (
-    CircuitBreaker,
-)
+from service.config.settings import Settings
+from service.llm.answer_format import Constraint, NoDecision, check_labels
+from service.llm.circuit_breaker import CircuitBreaker
 from service.llm.completion import Completion, NotUnderstood, Unreachable
 from service.llm.embedded import EmbeddedServer, LoadFailed
-from service.llm.model_file import (
-    ModelMissing,
-    embedded_model,
-)
-from service.llm.request_bodies import (
-    chat_body,
-    draw_temperature,
-    label_body,
-    rewriting_body,
-)
+from service.llm.model_file import ModelMissing, embedded_model
+from service.llm.request_bodies import chat_body, draw_temperature, label_body, rewriting_body
 from shared.wire import Readiness, Reason
 
 if TYPE_CHECKING:
@@ -95,7 +79,8 @@ class LlmServer:
 
     ``/healthz`` and decisions by the policy go on meanwhile. States: ``loading``, ``ready``, ``unavailable``
     (with the reason in ``detail``), and ``off`` where the service was told to do without. A server that fails again and
-    again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.circuit_breaker`; ``on_open`` hears of it.
+    again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.circuit_breaker`; ``on_open`` hears
+    of it.
     """
 
     def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:

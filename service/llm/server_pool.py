@@ -12,19 +12,10 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
-from service.config.settings import (
-    Settings,
-)
-from service.llm.answer_format import (
-    NoDecision,
-)
+from service.config.settings import Settings
+from service.llm.answer_format import NoDecision
 from service.llm.completion import Completion
-from service.llm.server import (
-    LOST,
-    LlmServer,
-    Rewriting,
-    WarmUp,
-)
+from service.llm.server import LOST, LlmServer, Rewriting, WarmUp
 from shared.wire import Readiness
 
 Ask = Callable[[LlmServer], Coroutine[Any, Any, Completion]]

@@ -12,7 +12,7 @@ from service.errors import Incomplete, Refused
 from shared.channel import FloatArray
 from shared.wire import SensorColumns, UavState
 
-AnyReport = TypeVar("Told", bound=UavState)
+AnyReport = TypeVar("AnyReport", bound=UavState)
 
 # The columns of a base, in this order.
 _COLUMNS = ("id", "queue", "battery", "channel_gain", "last_seen")

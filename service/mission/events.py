@@ -6,18 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.learning.sample import (
-    Sample,
-)
-from service.learning.trust import (
-    Advice,
-)
-from service.mission.idempotency import (
-    Answered,
-)
-from service.prompting.row_formats import (
-    Cells,
-)
+from service.learning.sample import Sample
+from service.learning.trust import Advice
+from service.mission.idempotency import Answered
+from service.prompting.row_formats import Cells
 from shared.wire import Outcome, UavState
 
 

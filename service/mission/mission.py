@@ -9,81 +9,26 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.config.prompt_budget import (
-    prompt_tokens,
-)
-from service.config.settings import (
-    Settings,
-)
+from service.config.prompt_budget import prompt_tokens
+from service.config.settings import Settings
 from service.errors import Conflict, NotFound, Refused
-from service.guidance.operator_guidance import (
-    OperatorGuidance,
-)
-from service.learning.initial_weights import (
-    initial_weights,
-)
-from service.learning.learner import (
-    Learner,
-)
-from service.learning.parameters import (
-    Weights,
-)
-from service.learning.sample import (
-    Sample,
-)
-from service.learning.trust import (
-    PRIOR,
-    PRIOR_UNPLANNED,
-    Trust,
-)
-from service.mission.applied_outcomes import (
-    AppliedOutcomes,
-)
-from service.mission.delta_reports import (
-    AnyReport,
-    DeltaBases,
-)
-from service.mission.events import (
-    AdviserReport,
-    Decided,
-    Event,
-    Guided,
-    Pending,
-    Reported,
-    Settled,
-    unheard,
-)
-from service.mission.idempotency import (
-    IdempotentAnswers,
-)
-from service.mission.planner import (
-    Planner,
-    can_plan,
-)
-from service.mission.reservations import (
-    STEPS_APART,
-    Reservation,
-    Reservations,
-)
-from service.mission.resolved_spec import (
-    in_full,
-    required,
-)
-from service.prompting.candidates import (
-    GuidedTemplate,
-)
-from service.prompting.demonstrations import (
-    solved,
-)
-from service.prompting.experiences import (
-    NEAREST,
-    Experience,
-    Experiences,
-)
-from service.prompting.prompt import (
-    Template,
-    note_block,
-)
+from service.guidance.operator_guidance import OperatorGuidance
+from service.learning.initial_weights import initial_weights
+from service.learning.learner import Learner
+from service.learning.parameters import Weights
+from service.learning.sample import Sample
+from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
+from service.mission.applied_outcomes import AppliedOutcomes
+from service.mission.delta_reports import AnyReport, DeltaBases
+from service.mission.events import AdviserReport, Decided, Event, Guided, Pending, Reported, Settled, unheard
+from service.mission.idempotency import IdempotentAnswers
+from service.mission.planner import Planner, can_plan
+from service.mission.reservations import STEPS_APART, Reservation, Reservations
+from service.mission.resolved_spec import in_full, required
+from service.prompting.candidates import GuidedTemplate
+from service.prompting.demonstrations import solved
+from service.prompting.experiences import NEAREST, Experience, Experiences
+from service.prompting.prompt import Template, note_block
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.guidance import Guidance, GuidanceAnswer

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 from shared.wire import MissionSpec
 
 T = TypeVar("T")

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 from shared.wire import DecideResponse
 
 if TYPE_CHECKING:

@@ -15,19 +15,9 @@ from typing import Self
 
 import numpy as np
 
-from service.prompting.prompt import (
-    Prompt,
-    Template,
-    note_block,
-)
-from service.prompting.row_formats import (
-    FORMATS,
-    Cells,
-    cells,
-)
-from service.prompting.unpruned_baseline import (
-    Uncompressed,
-)
+from service.prompting.prompt import Prompt, Template, note_block
+from service.prompting.row_formats import FORMATS, Cells, cells
+from service.prompting.unpruned_baseline import Uncompressed
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State

@@ -13,16 +13,9 @@ from importlib.resources import files
 
 import numpy as np
 
-from service.learning.attention import (
-    top_k,
-)
-from service.learning.parameters import (
-    Weights,
-)
-from service.prompting.row_formats import (
-    Cells,
-    cells,
-)
+from service.learning.attention import top_k
+from service.learning.parameters import Weights
+from service.prompting.row_formats import Cells, cells
 from shared.features import State, augment
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, SensorId, Step, UavState, Wire

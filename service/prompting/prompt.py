@@ -10,21 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.prompting.demonstrations import (
-    Solved,
-)
-from service.prompting.row_formats import (
-    FORMATS,
-    UNKNOWN,
-    Cells,
-    cells,
-    columns,
-    full_columns,
-    meanings,
-)
-from service.prompting.unpruned_baseline import (
-    Uncompressed,
-)
+from service.prompting.demonstrations import Solved
+from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
+from service.prompting.unpruned_baseline import Uncompressed
 from shared.features import State
 from shared.scenario import Scenario
 from shared.wire import Features, PromptStyle

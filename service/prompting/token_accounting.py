@@ -5,17 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 from service.llm.completion import Completion
-from service.prompting.prompt import (
-    Prompt,
-)
-from service.prompting.tokenizer import (
-    ENCODING,
-    encoding,
-)
+from service.prompting.prompt import Prompt
+from service.prompting.tokenizer import ENCODING, encoding
 from shared.wire import Tokens
 
 

@@ -15,12 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from service.prompting.row_formats import (
-    ALWAYS_KNOWN,
-    UNKNOWN,
-    Cells,
-    full_columns,
-)
+from service.prompting.row_formats import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
 from shared.features import State
 
 # How the tokenizer splits digits: three at a time, from the left, each a token.

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from service.config.settings import (
-    Settings,
-)
-from service.llm.server import (
-    WarmUp,
-)
-from service.prompting.candidates import (
-    GuidedTemplate,
-)
-from service.prompting.prompt import (
-    Template,
-)
+from service.config.settings import Settings
+from service.llm.server import WarmUp
+from service.prompting.candidates import GuidedTemplate
+from service.prompting.prompt import Template
 from shared.scenario import SCENARIOS
 
 

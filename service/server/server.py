@@ -9,15 +9,9 @@ from collections.abc import Callable
 import uvicorn
 from starlette.applications import Starlette
 
-from service.observability import (
-    logs,
-)
-from service.server.connection_limits import (
-    BoundedHttpProtocol,
-)
-from service.server.startup_gate import (
-    StartupGate,
-)
+from service.observability import logs
+from service.server.connection_limits import BoundedHttpProtocol
+from service.server.startup_gate import StartupGate
 
 # The longest that a request takes from its connection's being accepted to its first bytes, when the service ends.
 _ARRIVING_S = 0.25

@@ -11,9 +11,7 @@ from starlette.applications import Starlette
 from starlette.responses import JSONResponse
 from starlette.types import Receive, Scope, Send
 
-from service.server.security_headers import (
-    SecurityHeaders,
-)
+from service.server.security_headers import SecurityHeaders
 from shared.wire import Problem
 
 # As service.api.routes has it: the process lives, and nothing else is said.

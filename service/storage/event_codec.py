@@ -4,25 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from service.learning.trust import (
-    Advice,
-)
-from service.mission.events import (
-    AdviserReport,
-    Decided,
-    Event,
-    Guided,
-    Pending,
-    Reported,
-    Settled,
-)
-from service.mission.idempotency import (
-    Answered,
-)
-from service.storage.serialization import (
-    pack,
-    unpack,
-)
+from service.learning.trust import Advice
+from service.mission.events import AdviserReport, Decided, Event, Guided, Pending, Reported, Settled
+from service.mission.idempotency import Answered
+from service.storage.serialization import pack, unpack
 from shared.wire import Outcome, UavState
 
 # Requests carry more; the outcome that comes with a report is an event of its own, and how it was sent is past.

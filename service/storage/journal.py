@@ -18,31 +18,12 @@ from itertools import islice
 from typing import Any
 from zlib import crc32
 
-from service.mission.events import (
-    Decided,
-    Event,
-    unheard,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.storage.operations import (
-    Change,
-    Checkpoint,
-    Deleted,
-    Entry,
-    Made,
-)
-from service.storage.serialization import (
-    pack,
-)
-from service.storage.store import (
-    Store,
-    cause,
-)
+from service.mission.events import Decided, Event, unheard
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
+from service.storage.serialization import pack
+from service.storage.store import Store, cause
 
 log = logging.getLogger(__name__)
 

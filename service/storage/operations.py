@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.mission.events import (
-    Event,
-)
+from service.mission.events import Event
 from shared.wire import MissionSpec
 
 

@@ -12,19 +12,10 @@ from contextlib import suppress
 
 import msgpack
 
-from service.storage import (
-    sqlite_process,
-)
-from service.storage.operations import (
-    Change,
-)
-from service.storage.sql_statements import (
-    Statements,
-)
-from service.storage.sqlite_process import (
-    LENGTH,
-    framed,
-)
+from service.storage import sqlite_process
+from service.storage.operations import Change
+from service.storage.sql_statements import Statements
+from service.storage.sqlite_process import LENGTH, framed
 from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)

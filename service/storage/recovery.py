@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-from service.config.settings import (
-    Settings,
-)
-from service.mission.events import (
-    Decided,
-    Event,
-    Guided,
-    Reported,
-    Settled,
-)
-from service.mission.idempotency import (
-    Answered,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.storage.store import (
-    StoredMission,
-)
+from service.config.settings import Settings
+from service.mission.events import Decided, Event, Guided, Reported, Settled
+from service.mission.idempotency import Answered
+from service.mission.mission import Mission
+from service.storage.store import StoredMission
 
 
 def restore_mission(mission_id: str, kept: StoredMission, settings: Settings) -> Mission:

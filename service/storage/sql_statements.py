@@ -11,11 +11,7 @@ import sqlalchemy as sa
 
 from service.storage.event_codec import encode
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
-from service.storage.schema import (
-    checkpoints,
-    journal,
-    missions,
-)
+from service.storage.schema import checkpoints, journal, missions
 
 # As the database's driver takes it, and its parameters: a row, or many.
 Statement = tuple[str, list[Any]]

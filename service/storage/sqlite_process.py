@@ -1,7 +1,8 @@
 """The process that writes a SQLite store, so that a commit waits for no interpreter that decides, nor that for it.
 
-Run by :class:`service.storage.process_writer.ProcessWriter`, which is at the other end of a socket. Each way goes MessagePack, after
-its length in four bytes: a list of [SQL, rows], all of which is committed, or none; back nil, or why it was not.
+Run by :class:`service.storage.process_writer.ProcessWriter`, which is at the other end of a socket. Each way goes
+MessagePack, after its length in four bytes: a list of [SQL, rows], all of which is committed, or none; back nil, or why
+it was not.
 
 It ends, the last commit done, when the other end is closed, however the edge ended. It imports next to nothing, so
 that it takes 17 MB and a twentieth of a second.

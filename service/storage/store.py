@@ -12,41 +12,16 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.mission.events import (
-    Event,
-)
+from service.mission.events import Event
 from service.storage.event_codec import decode
-from service.storage.locks import (
-    AdvisoryLock,
-    FileLock,
-    StoreUnusable,
-)
-from service.storage.process_writer import (
-    ProcessWriter,
-)
-from service.storage.schema import (
-    SCHEMA,
-    checkpoints,
-    journal,
-    missions,
-    terms,
-)
-from service.storage.serialization import (
-    unpack,
-)
-from service.storage.sql_statements import (
-    Statements,
-)
-from service.storage.sqlite_process import (
-    BUSY_MS,
-    PRAGMAS,
-)
-from service.storage.thread_writer import (
-    ThreadWriter,
-)
-from service.storage.writer import (
-    Writer,
-)
+from service.storage.locks import AdvisoryLock, FileLock, StoreUnusable
+from service.storage.process_writer import ProcessWriter
+from service.storage.schema import SCHEMA, checkpoints, journal, missions, terms
+from service.storage.serialization import unpack
+from service.storage.sql_statements import Statements
+from service.storage.sqlite_process import BUSY_MS, PRAGMAS
+from service.storage.thread_writer import ThreadWriter
+from service.storage.writer import Writer
 from shared.wire import MissionSpec
 
 # The longest that PostgreSQL is waited for: to connect, for a statement, and for a network that says nothing.

@@ -11,13 +11,8 @@ from queue import SimpleQueue
 
 import sqlalchemy as sa
 
-from service.storage.operations import (
-    Change,
-)
-from service.storage.sql_statements import (
-    Statement,
-    Statements,
-)
+from service.storage.operations import Change
+from service.storage.sql_statements import Statement, Statements
 from service.storage.writer import Done
 
 

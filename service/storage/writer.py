@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from service.storage.operations import (
-    Change,
-)
+from service.storage.operations import Change
 
 # Called on the event loop: with None when all is on disk, or with why nothing is, as far as is known.
 Done = Callable[[Exception | None], None]

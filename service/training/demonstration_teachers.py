@@ -8,21 +8,11 @@ from itertools import groupby
 
 import numpy as np
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.demonstrations import (
-    Demonstration,
-)
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.look_ahead import decide_without_llm
+from service.mission.mission import Mission
+from service.prompting.demonstrations import Demonstration
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State

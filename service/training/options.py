@@ -9,10 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import arg
 
-from service.training.reward import (
-    Speed,
-    Target,
-)
+from service.training.reward import Speed, Target
 from shared.wire import Belief, Features
 
 

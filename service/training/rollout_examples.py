@@ -11,25 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
-from service.learning.sample import (
-    Sample,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.training.reward import (
-    Reward,
-    Speed,
-)
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.look_ahead import decide_without_llm
+from service.learning.sample import Sample
+from service.mission.mission import Mission
+from service.training.reward import Reward, Speed
 from shared.features import State
 from shared.reach import Reach, distances_ahead
 from shared.rollouts import Header, Reference, RolloutStep

@@ -6,16 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.learning.attention import (
-    top_k,
-)
-from service.learning.parameters import (
-    Weights,
-)
-from service.training.rollout_examples import (
-    Example,
-    Taught,
-)
+from service.learning.attention import top_k
+from service.learning.parameters import Weights
+from service.training.rollout_examples import Example, Taught
 
 
 def references(examples: Sequence[Example]) -> dict[str, list[Taught]]:

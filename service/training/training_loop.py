@@ -12,29 +12,12 @@ from rich.table import Table
 from torch import Tensor
 from torch.nn import functional
 
-from service.learning.initial_weights import (
-    initial_weights,
-    save,
-)
-from service.learning.modules import (
-    Modules,
-)
+from service.learning.initial_weights import initial_weights, save
+from service.learning.modules import Modules
 from service.training.options import Pretrain
-from service.training.reward import (
-    Reward,
-)
-from service.training.rollout_examples import (
-    Batch,
-    Choices,
-    Example,
-    replay,
-)
-from service.training.teacher_agreement import (
-    recall,
-    references,
-    velocity_agreement,
-    velocity_error,
-)
+from service.training.reward import Reward
+from service.training.rollout_examples import Batch, Choices, Example, replay
+from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from shared.rollouts import read_rollouts
 
 

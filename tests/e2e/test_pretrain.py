@@ -5,32 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from service.learning import (
-    initial_weights as checkpoints,
-)
-from service.learning.initial_weights import (
-    initial_modules,
-    initial_weights,
-    save,
-)
-from service.learning.modules import (
-    Modules,
-)
-from service.training.reward import (
-    Reward,
-)
-from service.training.rollout_examples import (
-    Batch,
-    Example,
-    replay,
-)
-from service.training.teacher_agreement import (
-    recall,
-    references,
-)
-from service.training.training_loop import (
-    losses,
-)
+from service.learning import initial_weights as checkpoints
+from service.learning.initial_weights import initial_modules, initial_weights, save
+from service.learning.modules import Modules
+from service.training.reward import Reward
+from service.training.rollout_examples import Batch, Example, replay
+from service.training.teacher_agreement import recall, references
+from service.training.training_loop import losses
 from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from shared.wire import Features

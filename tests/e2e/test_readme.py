@@ -9,9 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 from shared.guidance import GuidanceStatus
 from shared.wire import DecideResponse, Reason
 from tests.e2e.processes import serving_edge

@@ -15,27 +15,13 @@ import httpx
 import numpy as np
 import psutil
 
-from service.api.app import (
-    create_app,
-)
-from service.config.settings import (
-    Settings,
-)
-from service.edge.engine import (
-    Engine,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.storage.operations import (
-    Change,
-)
-from service.storage.store import (
-    Store,
-)
-from service.storage.writer import (
-    Writer,
-)
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.edge.engine import Engine
+from service.mission.mission import Mission
+from service.storage.operations import Change
+from service.storage.store import Store
+from service.storage.writer import Writer
 from tests.running import serving
 
 Body = dict[str, Any]
@@ -99,7 +85,7 @@ def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
 def writers(pid: int) -> list[psutil.Process]:
     """The processes that write stores for this one."""
     children = psutil.Process(pid).children()
-    return [child for child in children if any("sqlite_writer" in word for word in child.cmdline())]
+    return [child for child in children if any("sqlite_process" in word for word in child.cmdline())]
 
 
 async def written(writer: Writer, changes: Sequence[Change]) -> None:

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.mission.mission import (
-    Mission,
-)
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.mission.mission import Mission
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, SensorColumns, UavState
 

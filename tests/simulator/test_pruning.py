@@ -12,18 +12,10 @@ import httpx
 import numpy as np
 import pytest
 
-from service.api.attention_weights import (
-    attention_of,
-)
-from service.config.settings import (
-    Settings,
-)
-from service.learning.attention import (
-    top_k,
-)
-from service.mission.mission import (
-    Mission,
-)
+from service.api.attention_weights import attention_of
+from service.config.settings import Settings
+from service.learning.attention import top_k
+from service.mission.mission import Mission
 from shared.features import FEATURES
 from shared.missions import MissionAttention
 from shared.scenario import SCENARIOS

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from alembic import context
 
-from service.storage.schema import (
-    metadata,
-)
+from service.storage.schema import metadata
 
 context.configure(connection=context.config.attributes["connection"], target_metadata=metadata)
 with context.begin_transaction():

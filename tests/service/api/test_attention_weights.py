@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 
 from shared.missions import MissionAttention
-from tests.service.api.test_authentication import (
-    bearer,
-    made,
-)
+from tests.service.api.test_authentication import bearer, made
 from tests.service.keeping import running
 
 Body = dict[str, Any]

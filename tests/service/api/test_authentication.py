@@ -12,16 +12,8 @@ from typing import Any
 import httpx
 import pytest
 
-from service.api.api_keys import (
-    ApiKeys,
-    BadKeys,
-    KeyFile,
-    Scope,
-    editing,
-)
-from service.commands.keys import (
-    main,
-)
+from service.api.api_keys import ApiKeys, BadKeys, KeyFile, Scope, editing
+from service.commands.keys import main
 from shared.wire import DecideRequest
 from simulator.client import EdgeClient, EdgeRefused
 

@@ -17,9 +17,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.api.api_keys import (
-    KeyFile,
-)
+from service.api.api_keys import KeyFile
 from tests.running import listening
 from tests.service.stub_llm import misbehaving, silent, wait_for
 

@@ -14,12 +14,8 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from service.api.app import (
-    create_app,
-)
-from service.config.settings import (
-    Settings,
-)
+from service.api.app import create_app
+from service.config.settings import Settings
 from tests.running import serving
 
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]

@@ -9,17 +9,9 @@ import httpx
 import jsonschema_rs
 import pytest
 
-from service.api.app import (
-    create_app,
-)
-from service.api.openapi import (
-    ANSWERS,
-    DECISION_ID,
-    REQUESTS,
-)
-from service.config.settings import (
-    Settings,
-)
+from service.api.app import create_app
+from service.api.openapi import ANSWERS, DECISION_ID, REQUESTS
+from service.config.settings import Settings
 from tests.e2e.processes import serving_edge
 
 DOCUMENT = create_app(Settings(mode="value")).openapi()

@@ -3,12 +3,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.config.cores import (
-    usable_cores,
-)
-from service.config.settings import (
-    Settings,
-)
+from service.config.cores import usable_cores
+from service.config.settings import Settings
 
 
 @pytest.mark.parametrize(("quota", "cores"), [("100000 100000", 1), ("50000 100000", 1), ("99900000 100000", None)])

@@ -12,35 +12,16 @@ import numpy as np
 import pytest
 from fastapi.responses import Response
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.deliberation import (
-    Deliberation,
-)
-from service.deciding.rollout_evaluator import (
-    Judgement,
-    RolloutState,
-    judge,
-)
-from service.learning.trust import (
-    LLM,
-)
-from service.llm.answer_format import (
-    NoDecision,
-)
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.deliberation import Deliberation
+from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
+from service.learning.trust import LLM
+from service.llm.answer_format import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.candidates import (
-    GuidedTemplate,
-    velocities,
-)
+from service.mission.mission import Mission
+from service.prompting.candidates import GuidedTemplate, velocities
 from shared.actions import Action
 from shared.reach import Reach
 from shared.trajectory import trajectories

@@ -8,9 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from service.storage.journal import (
-    Journal,
-)
+from service.storage.journal import Journal
 from tests.running import listening
 from tests.service.keeping import running
 from tests.service.stub_llm import misbehaving, silent, wait_for

@@ -2,9 +2,7 @@ import math
 
 import pytest
 
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
+from service.deciding.look_ahead import decide_without_llm
 from shared.channel import link_holds
 from shared.features import State
 from shared.trajectory import trajectories

@@ -8,15 +8,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.config.cores import (
-    usable_cores,
-)
-from service.deciding.deliberation import (
-    Deliberation,
-)
-from service.deciding.rollout_evaluator import (
-    Judgement,
-)
+from service.config.cores import usable_cores
+from service.deciding.deliberation import Deliberation
+from service.deciding.rollout_evaluator import Judgement
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, wait_for
 

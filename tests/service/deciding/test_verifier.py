@@ -8,18 +8,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.verifier import (
-    verify,
-)
-from service.llm.answer_format import (
-    NoDecision,
-)
-from service.mission.mission import (
-    Mission,
-)
+from service.deciding.attended_state import AttendedState
+from service.deciding.verifier import verify
+from service.llm.answer_format import NoDecision
+from service.mission.mission import Mission
 from shared.wire import MissionSpec
 from tests.running import serving
 from tests.service.making import attended, mission, uav

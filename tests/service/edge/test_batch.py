@@ -13,31 +13,14 @@ import httpx
 import pytest
 from fastapi.responses import JSONResponse, Response
 
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.deciding.llm_query import (
-    LlmAdvice,
-    LlmQueries,
-)
-from service.llm.answer_format import (
-    constrain_labels,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.candidates import (
-    GuidedTemplate,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
-from service.prompting.row_formats import (
-    FORMATS,
-)
-from service.prompting.unpruned_baseline import (
-    Uncompressed,
-)
+from service.deciding.attended_state import AttendedState
+from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.llm.answer_format import constrain_labels
+from service.mission.mission import Mission
+from service.prompting.candidates import GuidedTemplate
+from service.prompting.prompt import Prompt
+from service.prompting.row_formats import FORMATS
+from service.prompting.unpruned_baseline import Uncompressed
 from shared.actions import Action
 from tests.running import serving
 from tests.service.making import PAPER, attended, mission, uav

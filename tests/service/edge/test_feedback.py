@@ -10,27 +10,13 @@ from typing import Any
 
 import httpx
 
-from service.config.settings import (
-    Settings,
-)
-from service.edge.engine import (
-    Engine,
-)
-from service.edge.feedback import (
-    Outcomes,
-)
-from service.live.broadcaster import (
-    Broadcaster,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.storage.journal import (
-    NullJournal,
-)
+from service.config.settings import Settings
+from service.edge.engine import Engine
+from service.edge.feedback import Outcomes
+from service.live.broadcaster import Broadcaster
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.storage.journal import NullJournal
 from shared.wire import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state
 from tests.service.making import attended, uav

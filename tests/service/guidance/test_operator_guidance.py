@@ -11,48 +11,22 @@ import pytest
 from fastapi.responses import Response
 from numpy.typing import NDArray
 
-from service.config.settings import (
-    Settings,
-)
-from service.deciding.deliberation import (
-    Deliberation,
-)
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
-from service.deciding.rollout_evaluator import (
-    RolloutState,
-    judge,
-)
-from service.guidance.note_orders import (
-    INSTRUCTION,
-    constrain_orders,
-)
-from service.guidance.step_guidance import (
-    StepGuidance,
-)
+from service.config.settings import Settings
+from service.deciding.deliberation import Deliberation
+from service.deciding.look_ahead import decide_without_llm
+from service.deciding.rollout_evaluator import RolloutState, judge
+from service.guidance.note_orders import INSTRUCTION, constrain_orders
+from service.guidance.step_guidance import StepGuidance
 from service.llm.completion import Completion
-from service.llm.server import (
-    LlmServer,
-    Rewriting,
-    WarmUp,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.prompting.candidates import (
-    GuidedTemplate,
-)
-from service.prompting.prompt import (
-    Template,
-)
+from service.llm.server import LlmServer, Rewriting, WarmUp
+from service.mission.mission import Mission
+from service.prompting.candidates import GuidedTemplate
+from service.prompting.prompt import Template
 from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import MissionSpec
 from tests.running import serving
-from tests.service.api.test_routes import (
-    fields,
-)
+from tests.service.api.test_routes import fields
 from tests.service.making import PAPER, attended, mission, uav
 from tests.service.stub_llm import StubLlm, said, wait_for
 

@@ -4,10 +4,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from service.learning.attention import (
-    Attention,
-    top_k,
-)
+from service.learning.attention import Attention, top_k
 
 
 def reference(

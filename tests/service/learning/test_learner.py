@@ -7,21 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from service.learning.backpropagation import (
-    descend,
-)
-from service.learning.initial_weights import (
-    initial_weights,
-)
-from service.learning.learner import (
-    Learner,
-)
-from service.learning.modules import (
-    Modules,
-)
-from service.learning.sample import (
-    Sample,
-)
+from service.learning.backpropagation import descend
+from service.learning.initial_weights import initial_weights
+from service.learning.learner import Learner
+from service.learning.modules import Modules
+from service.learning.sample import Sample
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES
 from shared.wire import Features

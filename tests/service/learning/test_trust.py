@@ -2,10 +2,7 @@ import math
 
 import pytest
 
-from service.learning.trust import (
-    Advice,
-    Trust,
-)
+from service.learning.trust import Advice, Trust
 
 PRIOR = {"llm": 0.5, "value": 0.25, "policy": 0.25}
 

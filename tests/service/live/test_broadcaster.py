@@ -16,34 +16,16 @@ import httpx
 import psutil
 import pytest
 
-from service.api.api_keys import (
-    editing,
-)
-from service.api.live_routes import (
-    STATIC,
-)
-from service.live.broadcaster import (
-    MOST_LISTENERS,
-)
-from service.live.recent_decisions import (
-    RecentDecisions,
-)
-from service.mission.events import (
-    Settled,
-)
-from service.prompting.prompt import (
-    Prompt,
-)
-from service.prompting.row_formats import (
-    FORMATS,
-)
-from service.prompting.unpruned_baseline import (
-    Uncompressed,
-)
+from service.api.api_keys import editing
+from service.api.live_routes import STATIC
+from service.live.broadcaster import MOST_LISTENERS
+from service.live.recent_decisions import RecentDecisions
+from service.mission.events import Settled
+from service.prompting.prompt import Prompt
+from service.prompting.row_formats import FORMATS
+from service.prompting.unpruned_baseline import Uncompressed
 from service.storage.event_codec import decode, encode
-from service.storage.serialization import (
-    pack,
-)
+from service.storage.serialization import pack
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav

@@ -1,10 +1,6 @@
 import pytest
 
-from service.llm.answer_format import (
-    NoDecision,
-    check_answer,
-    constrain,
-)
+from service.llm.answer_format import NoDecision, check_answer, constrain
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ import httpx
 import pytest
 from fastapi.responses import JSONResponse, Response
 
-from service.llm.circuit_breaker import (
-    CircuitBreaker,
-)
+from service.llm.circuit_breaker import CircuitBreaker
 from tests.running import listening, serving
 from tests.service.making import PAPER
 from tests.service.stub_llm import StubLlm, misbehaving, said, saying, silent, wait_for

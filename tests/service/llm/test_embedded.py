@@ -8,15 +8,9 @@ from typing import Any
 import httpx
 import pytest
 
-from service.api.app import (
-    create_app,
-)
-from service.config.cores import (
-    usable_cores,
-)
-from service.config.settings import (
-    Settings,
-)
+from service.api.app import create_app
+from service.config.cores import usable_cores
+from service.config.settings import Settings
 from tests.running import serving
 from tests.service.stub_llm import wait_for
 

@@ -12,9 +12,7 @@ import pytest
 from fastapi.responses import Response
 from pydantic import ValidationError
 
-from service.config.settings import (
-    Settings,
-)
+from service.config.settings import Settings
 from tests.running import listening, serving
 from tests.service.stub_llm import StubLlm, misbehaving, saying, silent, wait_for
 

@@ -1,9 +1,7 @@
 import pytest
 
 from service.errors import Conflict, NotFound
-from service.mission.mission import (
-    Mission,
-)
+from service.mission.mission import Mission
 from shared.wire import Outcome
 from tests.service.making import attended, mission, uav
 

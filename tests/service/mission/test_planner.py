@@ -10,9 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.mission import (
-    planner,
-)
+from service.mission import planner
 from shared.scenario import SCENARIOS, Scenario
 from simulator.mission import decide_request
 from simulator.policies.mpc import RecedingHorizon

@@ -5,22 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.commands.demonstrate import (
-    main,
-)
-from service.deciding.look_ahead import (
-    decide_without_llm,
-)
+from service.commands.demonstrate import main
+from service.deciding.look_ahead import decide_without_llm
 from service.errors import Refused
-from service.prompting.demonstrations import (
-    packaged,
-)
-from service.training.demonstration_teachers import (
-    TEACHERS,
-    farthest_first,
-    likeness,
-    solutions,
-)
+from service.prompting.demonstrations import packaged
+from service.training.demonstration_teachers import TEACHERS, farthest_first, likeness, solutions
 from shared.actions import Action
 from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts

@@ -5,10 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.prompting.experiences import (
-    Experience,
-    Experiences,
-)
+from service.prompting.experiences import Experience, Experiences
 from shared.wire import MissionSpec, Outcome, PromptStyle, Selection
 from tests.service.making import attended, mission, uav
 

@@ -5,10 +5,7 @@ from typing import Any, Literal
 import pytest
 
 from service.errors import Refused
-from service.prompting.prompt import (
-    Prompt,
-    Template,
-)
+from service.prompting.prompt import Prompt, Template
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, Outcome, PromptStyle
 from tests.service.making import PAPER, attended, mission, uav

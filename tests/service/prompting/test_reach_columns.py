@@ -6,12 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from service.deciding.attended_state import (
-    AttendedState,
-)
-from service.prompting.row_formats import (
-    columns,
-)
+from service.deciding.attended_state import AttendedState
+from service.prompting.row_formats import columns
 from shared.channel import link_holds, packets_per_step
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES, distances_ahead

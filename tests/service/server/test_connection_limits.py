@@ -14,9 +14,7 @@ import pytest
 from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
-from service.server import (
-    connection_limits,
-)
+from service.server import connection_limits
 from tests.e2e.processes import serving_edge
 from tests.running import serving
 

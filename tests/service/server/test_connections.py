@@ -14,9 +14,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from service.server import (
-    connection_limits,
-)
+from service.server import connection_limits
 from tests.e2e.processes import serving_edge
 
 LEAST = 16

@@ -15,10 +15,7 @@ from typing import Any
 
 import pytest
 
-from service.storage.store import (
-    Store,
-    StoredMission,
-)
+from service.storage.store import Store, StoredMission
 from tests.running import listening
 from tests.service.keeping import copy_of, fly, running, writers
 from tests.service.stub_llm import misbehaving, saying, wait_for

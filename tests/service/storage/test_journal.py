@@ -15,18 +15,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.config.settings import (
-    Settings,
-)
-from service.storage import (
-    journal,
-)
-from service.storage.recovery import (
-    restore_mission,
-)
-from service.storage.store import (
-    Store,
-)
+from service.config.settings import Settings
+from service.storage import journal
+from service.storage.recovery import restore_mission
+from service.storage.store import Store
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
 
 Body = dict[str, Any]

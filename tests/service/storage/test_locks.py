@@ -14,15 +14,9 @@ import pytest
 from sqlalchemy import create_engine, text
 from sqlalchemy.exc import OperationalError
 
-from service.storage.locks import (
-    StoreUnusable,
-)
-from service.storage.operations import (
-    Deleted,
-)
-from service.storage.store import (
-    Store,
-)
+from service.storage.locks import StoreUnusable
+from service.storage.operations import Deleted
+from service.storage.store import Store
 from tests.e2e.processes import serving_edge
 from tests.service.keeping import fly, running, written
 

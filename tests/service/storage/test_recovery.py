@@ -15,45 +15,18 @@ from typing import Any
 
 import pytest
 
-from service.config.settings import (
-    Settings,
-)
-from service.edge import (
-    feedback,
-)
+from service.config.settings import Settings
+from service.edge import feedback
 from service.errors import Refused, Unavailable
-from service.mission.idempotency import (
-    IdempotentAnswers,
-)
-from service.mission.mission import (
-    Mission,
-)
-from service.observability.metrics import (
-    Metrics,
-)
-from service.storage.journal import (
-    Journal,
-)
-from service.storage.operations import (
-    Change,
-    Checkpoint,
-    Entry,
-)
-from service.storage.recovery import (
-    restore_mission,
-)
-from service.storage.serialization import (
-    pack,
-)
-from service.storage.store import (
-    Store,
-    StoredMission,
-)
-from service.storage.writer import (
-    Done,
-    WriteFailed,
-    Writer,
-)
+from service.mission.idempotency import IdempotentAnswers
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.storage.journal import Journal
+from service.storage.operations import Change, Checkpoint, Entry
+from service.storage.recovery import restore_mission
+from service.storage.serialization import pack
+from service.storage.store import Store, StoredMission
+from service.storage.writer import Done, WriteFailed, Writer
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome
 from tests.running import serving

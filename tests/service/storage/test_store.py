@@ -11,15 +11,9 @@ import pytest
 from alembic.config import Config
 from sqlalchemy import create_engine, text
 
-from service.storage.locks import (
-    StoreUnusable,
-)
-from service.storage.schema import (
-    SCHEMA,
-)
-from service.storage.store import (
-    Store,
-)
+from service.storage.locks import StoreUnusable
+from service.storage.schema import SCHEMA
+from service.storage.store import Store
 from tests.service.keeping import fly, running
 
 Body = dict[str, Any]

@@ -14,21 +14,10 @@ import httpx
 import psutil
 import pytest
 
-from service.storage.locks import (
-    StoreUnusable,
-)
-from service.storage.operations import (
-    Change,
-    Checkpoint,
-    Deleted,
-    Made,
-)
-from service.storage.store import (
-    Store,
-)
-from service.storage.writer import (
-    WriteFailed,
-)
+from service.storage.locks import StoreUnusable
+from service.storage.operations import Change, Checkpoint, Deleted, Made
+from service.storage.store import Store
+from service.storage.writer import WriteFailed
 from shared.wire import MissionSpec
 from tests.e2e.processes import serving_edge
 from tests.service.keeping import fly, running, writers, written

@@ -8,31 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from service.learning.modules import (
-    Modules,
-)
-from service.learning.sample import (
-    Sample,
-)
-from service.training.reward import (
-    Reward,
-    fleet_cost,
-)
-from service.training.rollout_examples import (
-    Batch,
-    Example,
-    Taught,
-    replay,
-)
-from service.training.teacher_agreement import (
-    recall,
-    references,
-    velocity_agreement,
-    velocity_error,
-)
-from service.training.training_loop import (
-    losses,
-)
+from service.learning.modules import Modules
+from service.learning.sample import Sample
+from service.training.reward import Reward, fleet_cost
+from service.training.rollout_examples import Batch, Example, Taught, replay
+from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
+from service.training.training_loop import losses
 from shared.rollouts import Header, Reference, RolloutStep
 from simulator.explore import explore
 from tests.service.making import PAPER

@@ -7,12 +7,8 @@ from collections.abc import Callable
 import httpx
 import pytest
 
-from service.guidance.note_orders import (
-    admissible,
-)
-from service.guidance.order_examples import (
-    EXAMPLES,
-)
+from service.guidance.note_orders import admissible
+from service.guidance.order_examples import EXAMPLES
 from shared.guidance import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire import MissionSpec
 from simulator.client import EdgeClient
@@ -26,9 +22,7 @@ from simulator.experiments.plan import plan
 from simulator.experiments.schemes import OFF, over_edge
 from simulator.site import Site
 from tests.running import serving
-from tests.service.guidance.test_operator_guidance import (
-    Scribe,
-)
+from tests.service.guidance.test_operator_guidance import Scribe
 from tests.service.stub_llm import wait_for
 from tests.simulator.experiments.flying_tiny import TINY, decided, declared, flown, setup
 
