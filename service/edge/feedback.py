@@ -115,8 +115,8 @@ class Outcomes:
         """
         if not isinstance(self._keeper, Journal):
             return
-        track = self._keeper.due(mission) if least is None else self._keeper.due(mission, least)
-        if track is None:
+        mission_log = self._keeper.due(mission) if least is None else self._keeper.due(mission, least)
+        if mission_log is None:
             return
         waiting, self._waiting = self._waiting, deque()
         for lesson in waiting:
@@ -124,7 +124,7 @@ class Outcomes:
                 self._learn(lesson)
             else:
                 self._waiting.append(lesson)
-        self._keeper.checkpoint(track, {**mission.state_dict(), "learner": mission.learner.state_dict()})
+        self._keeper.checkpoint(mission_log, {**mission.state_dict(), "learner": mission.learner.state_dict()})
 
     def finish(self) -> None:
         """Learn what waits, now."""

@@ -189,7 +189,7 @@ def test_what_waits_for_a_store_that_fails_is_bounded(
             for step in range(3, 80):
                 assert client.post("/decide", json=report(step=step)).status_code == 200
             assert isinstance(engine.keeper, journal.Journal)
-            assert len(engine.keeper._queue) < 50
+            assert len(engine.keeper._commits._queue) < 50
         finally:
             other.execute("ROLLBACK")
             other.close()

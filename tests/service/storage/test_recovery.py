@@ -93,7 +93,7 @@ async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_pat
     for step in range(10, 13):
         mission.observe(uav(step=step), step)
     writer.well = True
-    await until(lambda: not journal.failing and not journal._queue)
+    await until(lambda: not journal.failing and not journal._commits._queue)
     tail = writer.written[4:]
     assert [item.seq for item in tail if isinstance(item, Checkpoint | Entry)] == [10, 11, 12, 13]
     assert isinstance(tail[0], Checkpoint)
@@ -133,7 +133,7 @@ async def test_a_journal_that_is_closed_writes_no_more_and_starts_nothing(tmp_pa
 
 
 async def test_large_checkpoints_are_written_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.storage.journal._MOST_BYTES", 50_000)
+    monkeypatch.setattr("service.storage.group_commit._MOST_BYTES", 50_000)
     store = MoodyStore(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
     most: list[int] = []
