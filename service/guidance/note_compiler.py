@@ -19,7 +19,7 @@ from typing import Protocol
 from service.guidance.note_orders import INSTRUCTION, BadOrders, constrain_orders, read, shown
 from service.guidance.operator_guidance import OperatorGuidance
 from service.llm.answer_format import NoDecision
-from service.llm.server import Rewriting
+from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
 from shared.guidance import Guidance, Impossible
 from shared.scenario import Scenario

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from service.llm.answer_format import Constraint, constrain, constrain_labels
@@ -11,6 +12,31 @@ from service.llm.answer_format import Constraint, constrain, constrain_labels
 TOLD_TOKENS = 20
 # The temperature at which several labels are drawn one after the other.
 _COOL = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Rewriting:
+    """A text to be rewritten, after worked examples of texts and what became of them.
+
+    ``constrain`` gives the request fields that hold a server to the form of the answer, by what it obeys.
+    """
+
+    instruction: str
+    examples: Sequence[tuple[str, str]]
+    text: str
+    constrain: Callable[[Constraint], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUp:
+    """A first question, so that the server has read the static block before a decision pays for it.
+
+    ``labels`` are what it is answered by; None where it is answered by a sensor and a velocity.
+    """
+
+    static: str
+    user: str
+    labels: list[str] | None
 
 
 def chat_body(
@@ -105,3 +131,10 @@ def rewriting_body(
 def draw_temperature(lists: Sequence[Sequence[str]]) -> float:
     """At which llama.cpp draws the labels of so many lists."""
     return 1.0 if len(lists) == 1 else _COOL
+
+
+def warm_up_body(model: str | None, first: WarmUp, constraint: Constraint, logprobs: bool) -> dict[str, Any]:
+    """The request body of a server's first question."""
+    if first.labels is None:
+        return chat_body(model, first.static, first.user, constraint, [0], 15)
+    return label_body(model, first.static, first.user, constraint, [first.labels], logprobs)

@@ -12,12 +12,21 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
-from service.llm.answer_format import Constraint, NoDecision, check_labels
+from service.llm.answer_format import Constraint, NoDecision
 from service.llm.circuit_breaker import CircuitBreaker
 from service.llm.completion import Completion, NotUnderstood, Unreachable
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.llm.model_file import ModelMissing, embedded_model
-from service.llm.request_bodies import chat_body, draw_temperature, label_body, rewriting_body
+from service.llm.probing import probe, probe_body
+from service.llm.request_bodies import (
+    Rewriting,
+    WarmUp,
+    chat_body,
+    draw_temperature,
+    label_body,
+    rewriting_body,
+    warm_up_body,
+)
 from shared.wire import Readiness, Reason
 
 if TYPE_CHECKING:
@@ -28,17 +37,12 @@ log = logging.getLogger(__name__)
 _RETRY_S = 5.0
 # Said to a call that is hung up because another server, asked before, has answered: that is no fault of this one.
 LOST = "another answered"
-_PROBE_TIMEOUT_S, _TOGETHER_TIMEOUT_S = 60.0, 15.0
-_ANY_NUMBER = 1000
+_PROBE_TIMEOUT_S = 60.0
 # What is no decision gives way to one so often, and waits so long for so much silence between them: each spoils the
 # other's prefix cache. In a mission decisions come seconds apart.
 _STEPS_BACK = 3
 _SILENCE_S = 0.5
 _PATIENCE_S = 10.0
-# No model says this of its own accord, so a server that answers it has obeyed the constraint.
-_PROBE_TEXT = "Say hello."
-_PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
-_PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
 
 
 @dataclass(slots=True)
@@ -47,31 +51,6 @@ class _Status:
     detail: str | None = None
     # Whether the circuit breaker is open.
     left_alone: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Rewriting:
-    """A text to be rewritten, after worked examples of texts and what became of them.
-
-    ``constrain`` gives the request fields that hold a server to the form of the answer, by what it obeys.
-    """
-
-    instruction: str
-    examples: Sequence[tuple[str, str]]
-    text: str
-    constrain: Callable[[Constraint], dict[str, Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class WarmUp:
-    """A first question, so that the server has read the static block before a decision pays for it.
-
-    ``labels`` are what it is answered by; None where it is answered by a sensor and a velocity.
-    """
-
-    static: str
-    user: str
-    labels: list[str] | None
 
 
 class LlmServer:
@@ -265,7 +244,7 @@ class LlmServer:
             await asyncio.sleep(self._breaker.pause_s)
             try:
                 async with asyncio.timeout(_PROBE_TIMEOUT_S):
-                    await self._client.complete(self._probe_body(self.constraint))
+                    await self._client.complete(probe_body(self.model, self.constraint))
             except (NoDecision, TimeoutError) as error:
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
@@ -309,63 +288,14 @@ class LlmServer:
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
             if self.model is None:
                 self.model = next(iter(await self._client.models()), None)
-            self.constraint = await self._probe(self._client)
-            self.logprobs = await self._probe_logprobs(self._client)
-            self.most_together = _ANY_NUMBER if await self._probe_together(self._client) else 1
+            able = await probe(self._client, self.model)
+            self.constraint, self.logprobs, self.most_together = able.constraint, able.logprobs, able.most_together
         try:
             async with asyncio.timeout(_PROBE_TIMEOUT_S):
-                await self._client.complete(self._first_body())
+                await self._client.complete(warm_up_body(self.model, self._warm_up, self.constraint, self.logprobs))
         except (NoDecision, TimeoutError) as error:
             log.info("the static block was not read beforehand: %s", error)
         return self._client
-
-    def _first_body(self) -> dict[str, Any]:
-        first = self._warm_up
-        if first.labels is None:
-            return chat_body(self.model, first.static, first.user, self.constraint, [0], 15)
-        return label_body(self.model, first.static, first.user, self.constraint, [first.labels], self.logprobs)
-
-    async def _probe(self, client: LLMClient) -> Constraint:
-        """The first way of constraining that the server really obeys: it may ignore an unknown field silently."""
-        refusal: NotUnderstood | None = None
-        for constraint in _PROBES:
-            try:
-                body = self._probe_body(constraint)
-                text = (await client.complete(body)).text
-            except NotUnderstood as failed:
-                refusal = failed
-                continue
-            if str(_PROBE_SENSOR) in text:
-                return constraint
-        if refusal is not None:
-            await client.complete(self._probe_body("none"))
-        return "none"
-
-    async def _probe_logprobs(self, client: LLMClient) -> bool:
-        """Whether the server tells the probabilities of tokens: it may ignore or refuse the field."""
-        body = label_body(self.model, "Answer in words.", _PROBE_TEXT, self.constraint, [["A", "B"]])
-        try:
-            return bool((await client.complete(body)).places)
-        except NotUnderstood:
-            return False
-
-    async def _probe_together(self, client: LLMClient) -> bool:
-        """Whether the server names a label of each of two lists, which only one that obeys a constraint does."""
-        lists = [["A", "B"], ["C", "D"]]
-        body = label_body(self.model, "Answer in words.", _PROBE_TEXT, self.constraint, lists, self.logprobs)
-        try:
-            async with asyncio.timeout(_TOGETHER_TIMEOUT_S):
-                check_labels((await client.complete(body)).text, lists)
-        except NoDecision as error:
-            if isinstance(error, NotUnderstood) or error.reason == "answer_format":
-                return False
-            raise
-        except TimeoutError:
-            return False
-        return True
-
-    def _probe_body(self, constraint: Constraint) -> dict[str, Any]:
-        return chat_body(self.model, "Answer in words.", _PROBE_TEXT, constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)
 
 
 def _http() -> type[LLMClient]:

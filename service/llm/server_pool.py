@@ -15,7 +15,8 @@ from typing import Any, Literal
 from service.config.settings import Settings
 from service.llm.answer_format import NoDecision
 from service.llm.completion import Completion
-from service.llm.server import LOST, LlmServer, Rewriting, WarmUp
+from service.llm.request_bodies import Rewriting, WarmUp
+from service.llm.server import LOST, LlmServer
 from shared.wire import Readiness
 
 Ask = Callable[[LlmServer], Coroutine[Any, Any, Completion]]

@@ -203,7 +203,7 @@ def test_a_batch_that_was_sent_again_meanwhile_does_not_count(edge: Edge, report
 def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.server._TOGETHER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("service.llm.probing._TOGETHER_TIMEOUT_S", 0.2)
     chorus = Chorus(hangs_on="Say hello.")
     with serving(chorus.app) as url:
         client = edge(mode="guided", llm_url=f"{url}/v1")

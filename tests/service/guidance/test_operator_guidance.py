@@ -18,7 +18,8 @@ from service.deciding.rollout_evaluator import RolloutState, judge
 from service.guidance.note_orders import INSTRUCTION, constrain_orders
 from service.guidance.step_guidance import StepGuidance
 from service.llm.completion import Completion
-from service.llm.server import LlmServer, Rewriting, WarmUp
+from service.llm.request_bodies import Rewriting, WarmUp
+from service.llm.server import LlmServer
 from service.mission.mission import Mission
 from service.prompting.candidates import GuidedTemplate
 from service.prompting.prompt import Template
