@@ -15,12 +15,13 @@ from paper_template import EXPERIENCES, Newest, PaperTemplate
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.deliberation import offered
+from service.deciding.deliberation import candidates_of
 from service.deciding.rollout_evaluator import RolloutState
 from service.llm.request_bodies import chat_body, label_body
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet, GuidedTemplate
 from service.prompting.prompt import Prompt
+from shared.actions import Action
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
 from simulator.mission import Choice, LocalPilot, decide_request, fly
@@ -109,24 +110,23 @@ class Scribe(LocalPilot):
                 mission.apply(request.outcome)
             attempt = mission.observe(request, step)
             view = AttendedState.of(mission, request, step)
-            view.attend(mission)
             if view.rows:
                 ways[way] = self._put(mission, view)
             if way == GUIDED:
                 reserved = mission.reserved(step, uav)
                 situation = RolloutState.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
-            mission.commit(view.pending(mission, name, choice.sensor, choice.velocity), attempt)
+            mission.commit(view.pending(name, Action(choice.sensor, choice.velocity)), attempt)
         if situation is not None and len(ways) == len(self._missions):
             self.asked.append(Asked(self._seed, step, uav, ways, situation))
         return choice
 
     def _put(self, mission: Mission, view: AttendedState) -> Put:
-        shown, nearest = view.shown(mission), view.nearest(mission)
+        shown, nearest = view.shown(), view.similar_experiences()
         if not isinstance(mission.template, GuidedTemplate):
-            return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.offered)
-        offer = offered(mission, view)
+            return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.kept_ids)
+        offer = candidates_of(view)
         self._note(mission, mission.template, view, offer)
-        return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.offered, offer)
+        return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.kept_ids, offer)
 
     def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}

@@ -63,11 +63,9 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         try:
             yield {"engine": engine, "llm": llm, "metrics": metrics}
         finally:
-            engine.live.close()
-            await engine.compiler.close()
-            await engine.asking.close()
+            may_close = await engine.close()
             await llm.close()
-            if await engine.close() and store is not None:
+            if may_close and store is not None:
                 store.close()
             await asyncio.to_thread(traces.close)
 

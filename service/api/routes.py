@@ -84,7 +84,7 @@ async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngin
     """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
     mission = await engine.missions.put(mission_id, body)
     engine.compiler.compile(mission)
-    await engine.kept("mission_id")
+    await engine.durable("mission_id")
     return mission.status()
 
 
@@ -102,7 +102,7 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
         engine.live.forget(mission_id)
     finally:
         # One that is gone already may not yet be gone from the disk.
-        await engine.kept("mission_id")
+        await engine.durable("mission_id")
 
 
 @router.get(
@@ -131,7 +131,7 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")
     mission.obey(body)
-    await engine.kept("answer")
+    await engine.durable("answer")
     return mission.guidance.told(mission_id)
 
 

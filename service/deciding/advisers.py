@@ -2,94 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import softmax
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.look_ahead import decide_without_llm
+from service.deciding.look_ahead import look_ahead
 from service.learning.trust import PLANNER
-from service.mission.mission import Mission
 from shared.actions import Action
 from shared.channel import FloatArray
 
 # In units of the value regression's target, minus the cost.
 _VALUE_TEMPERATURE = 0.05
-# What an adviser that names one candidate leaves to all together, so that its logarithm exists.
+# The probability that an adviser of one action leaves to all actions together, so that its logarithm exists.
 SMOOTHING = 0.01
 
 
-class Adviser(Protocol):
-    """An adviser. ``name`` is its key in the trust, the response and the metrics."""
+class Preference(Protocol):
+    """An adviser's preference in one state. ``action`` is its own proposal, to be among the candidates."""
 
-    name: str
-
-    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
-        """What it would do itself, to be among the candidates; None where it has nothing to say."""
+    @property
+    def action(self) -> Action:
+        """The sensor and the velocity that the adviser prefers to all others."""
         ...
 
-    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
-        """How it would choose among the candidates, ``(n,)``, summing to 1; only where it has a proposal."""
+    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
+        """How the adviser would choose among the candidates, ``(n,)``, summing to 1."""
         ...
 
 
-class PlannerAdviser:
-    """The receding-horizon plan, where there is one of this step."""
+@dataclass(frozen=True, slots=True)
+class OneAction:
+    """Nearly all probability for one action."""
 
-    name = PLANNER
+    action: Action
 
-    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
-        """The plan's action."""
-        if mission.planner is None:
-            return None
-        return mission.planner.action(view.uav_id, mission.reserved(view.step, view.uav_id))
-
-    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
-        """Nearly all for the plan's action."""
-        return one_hot(self.proposal(mission, view), actions)
+    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
+        """0.99 for the action, if it is there, and the rest for all alike."""
+        probabilities = np.full(len(actions), SMOOTHING / len(actions))
+        if self.action in actions:
+            probabilities[actions.index(self.action)] += 1.0 - SMOOTHING
+        return np.asarray(probabilities / probabilities.sum())
 
 
-class ValueAdviser:
-    """The learned values, ``softmax((s_j + u_jv - max_v u_jv) / 0.05)``: likeliest is what mode ``value`` would do."""
+@dataclass(frozen=True, slots=True)
+class LearnedValues:
+    """``softmax((s_j + u_jv - max_v u_jv) / 0.05)``: the likeliest action is the decision of mode ``value``."""
 
-    name = "value"
+    action: Action
+    values: Mapping[int, NDArray[np.float32]]
 
-    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
-        """The best-scored sensor and the best velocity for it."""
-        return view.by_value(mission)
-
-    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
-        """A sensor that attention did not see scores as low as the lowest."""
-        values = view.values(mission)
-        lowest = min((float(levels.min()) for levels in values.values()), default=0.0)
-        scores = np.array([float(values[s][v]) if s in values else lowest for s, v in actions])
+    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
+        """A sensor that attention did not keep scores as low as the lowest."""
+        lowest = min((float(levels.min()) for levels in self.values.values()), default=0.0)
+        scores = np.array([float(self.values[s][v]) if s in self.values else lowest for s, v in actions])
         return np.asarray(softmax(scores / _VALUE_TEMPERATURE))
 
 
-class PolicyAdviser:
-    """The LLM-free policy: one step of look-ahead."""
-
-    name = "policy"
-
-    def proposal(self, mission: Mission, view: AttendedState) -> Action | None:
-        """Its decision."""
-        reserved = mission.reserved(view.step, view.uav_id)
-        return decide_without_llm(view.state, view.uav_id, mission.scenario, reserved, view.asked)
-
-    def probabilities(self, mission: Mission, view: AttendedState, actions: Sequence[Action]) -> FloatArray:
-        """Nearly all for its decision."""
-        return one_hot(self.proposal(mission, view), actions)
+def _by_plan(state: AttendedState) -> Preference | None:
+    """The receding-horizon plan's action, where there is a plan of this step."""
+    planner = state.mission.planner
+    planned = None if planner is None else planner.action(state.uav_id, state.reserved)
+    return None if planned is None else OneAction(planned)
 
 
-# In the order of the response.
-ADVISERS: tuple[Adviser, ...] = (PlannerAdviser(), ValueAdviser(), PolicyAdviser())
+def _by_value(state: AttendedState) -> Preference:
+    """The learned values."""
+    return LearnedValues(state.best_by_value(), state.values())
 
 
-def one_hot(action: Action | None, actions: Sequence[Action]) -> FloatArray:
-    """0.99 for one action, if it is there, and the rest for all alike, ``(n,)``."""
-    probabilities = np.full(len(actions), SMOOTHING / len(actions))
-    if action in actions:
-        probabilities[actions.index(action)] += 1.0 - SMOOTHING
-    return np.asarray(probabilities / probabilities.sum())
+def _by_look_ahead(state: AttendedState) -> Preference:
+    """The LLM-free policy's action."""
+    return OneAction(look_ahead(state.state, state.reach, state.reserved, state.guidance))
+
+
+# By their names in the trust, the response and the metrics, in the order of the response.
+ADVISERS: dict[str, Callable[[AttendedState], Preference | None]] = {
+    PLANNER: _by_plan,
+    "value": _by_value,
+    "policy": _by_look_ahead,
+}

@@ -1,8 +1,9 @@
-"""One decision in the making: a UAV's augmented state, and what the attention module made of it."""
+"""What the edge knows as one UAV decides: its augmented state, and the sensors that attention keeps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -15,115 +16,139 @@ from service.learning.attention import top_k
 from service.learning.sample import Sample
 from service.mission.events import Pending
 from service.mission.mission import Mission
+from service.observability.stopwatch import Stopwatch
 from service.prompting.row_formats import cells
 from shared.actions import Action
 from shared.features import State, augment
+from shared.reach import Reach
 from shared.wire import Candidate, UavState
 
-_NO_FEATURES = np.empty((0, 0), np.float32)
-_NO_CONTEXTS = torch.empty(0)
 
-
-@dataclass(slots=True)
+@dataclass(frozen=True)
 class AttendedState:
-    """A UAV's view at one step. ``rows`` index the state's arrays: the k sensors kept, best first.
+    """One UAV's state at one step of its mission, J sensors in the request's order.
 
-    Without attention ``rows`` are all that is admissible, in the request's order. ``asked`` is what the operator's
-    guidance asks of this step, if it asks for anything.
+    Attributes:
+        reserved: IDs of the sensors that other UAVs have in this step.
+        guidance: what the operator's guidance asks of this step, if it asks for anything.
+        admissible: rows of the state that may be chosen, n of them.
+        features: shape ``(n, d)``, the attention module's input.
+        contexts: shape ``(n, d')``, its output ``z_j``.
+        rows: rows of the state that attention keeps, best first; without attention all that are admissible.
+        candidates: the same sensors with their scores ``s_j``.
     """
 
+    mission: Mission
     uav_id: int
     step: int
     state: State
-    asked: StepGuidance | None = None
-    rows: list[int] = field(default_factory=list)
-    candidates: list[Candidate] = field(default_factory=list)
-    _admissible: list[int] = field(default_factory=list)
-    _features: NDArray[np.float32] = field(default_factory=lambda: _NO_FEATURES)
-    _contexts: Tensor = field(default_factory=lambda: _NO_CONTEXTS)
+    reserved: frozenset[int]
+    guidance: StepGuidance | None
+    admissible: list[int]
+    features: NDArray[np.float32]
+    contexts: Tensor
+    rows: list[int]
+    candidates: list[Candidate]
+    _velocity_values: dict[int, Tensor] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, mission: Mission, uav: UavState, step: int) -> Self:
-        """Augment what the UAV reported with what its mission knows."""
+    def of(cls, mission: Mission, uav: UavState, step: int, watch: Stopwatch | None = None) -> Self:
+        """Augment a UAV's report with what its mission knows, and keep the mission's top k of the sensors.
+
+        Args:
+            watch: takes the times of the stages ``augment`` and ``attend``.
+        """
+        watch = watch or Stopwatch()
+        reserved, obeyed, scenario = mission.reserved(step, uav.uav_id), mission.guidance.obeyed, mission.scenario
         state = augment(
             uav,
             step,
-            mission.scenario,
+            scenario,
             visits=mission.visits,
             rates=mission.rates,
-            reserved=mission.reserved(step, uav.uav_id),
+            reserved=reserved,
             preset=mission.features,
             belief=mission.belief if mission.decides_from == "fleet" else None,
         )
-        guidance, scenario = mission.guidance.obeyed, mission.scenario
-        asked = StepGuidance.of(guidance, state, step, mission.visits, uav.uav_id, scenario)
-        return cls(uav_id=uav.uav_id, step=step, state=state, asked=asked)
+        guidance = None
+        if obeyed:
+            reach = state.reach_ahead(uav.uav_id, scenario)
+            guidance = StepGuidance.of(obeyed, state, reach, step, mission.visits, scenario)
+        watch.lap("augment")
+        admissible: list[int] = np.flatnonzero(state.admissible).tolist()
+        features = state.features(scenario)
+        kept, scores, contexts = _attend(mission, features, admissible, guidance)
+        rows = [admissible[i] for i in kept]
+        candidates = [
+            Candidate(sensor_id=sensor, score=round(scores[i], 6))
+            for sensor, i in zip(state.ids[rows].tolist(), kept, strict=True)
+        ]
+        watch.lap("attend")
+        return cls(
+            mission=mission,
+            uav_id=uav.uav_id,
+            step=step,
+            state=state,
+            reserved=reserved,
+            guidance=guidance,
+            admissible=admissible,
+            features=features,
+            contexts=contexts,
+            rows=rows,
+            candidates=candidates,
+        )
+
+    @cached_property
+    def reach(self) -> Reach:
+        """The UAV's reach after the next step, whatever the mission's features are."""
+        return self.state.reach_ahead(self.uav_id, self.mission.scenario)
 
     @property
-    def offered(self) -> list[int]:
-        """IDs of the sensors kept, in the order of ``rows``."""
+    def kept_ids(self) -> list[int]:
+        """IDs of the sensors that attention keeps, best first."""
         return [candidate.sensor_id for candidate in self.candidates]
 
-    def attend(self, mission: Mission) -> None:
-        """Score the admissible sensors and keep the mission's top k, or all of them where it goes without attention."""
-        self._admissible = np.flatnonzero(self.state.admissible).tolist()
-        self._features = self.state.features(mission.scenario)
-        if not self._admissible:
-            return
-        scores, self._contexts = mission.learner.score(self._features)
-        if self.asked is not None:
-            # A score is minus a cost, and what counts in a cost are packets / W.
-            added = self.asked.worth[:, self._admissible].max(axis=0) / mission.scenario.queue_capacity
-            scores = scores + torch.from_numpy(added.astype(np.float32))
-        kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(self._admissible)))
-        self.rows = [self._admissible[i] for i in kept]
-        ids, told = self.state.ids[self.rows].tolist(), scores.tolist()
-        self.candidates = [
-            Candidate(sensor_id=sensor, score=round(told[i], 6)) for sensor, i in zip(ids, kept, strict=True)
-        ]
-
-    def shown(self, mission: Mission) -> list[int]:
+    def shown(self) -> list[int]:
         """``rows`` in the order of the prompt: as they are, or shuffled by the mission's seed, the step and the UAV."""
-        if mission.spec.prompt.order == "score":
+        spec = self.mission.spec
+        if spec.prompt.order == "score":
             return self.rows
-        shuffle = np.random.default_rng([mission.spec.seed, self.step, self.uav_id])
+        shuffle = np.random.default_rng([spec.seed, self.step, self.uav_id])
         return [self.rows[i] for i in shuffle.permutation(len(self.rows))]
 
-    def nearest(self, mission: Mission) -> list[str]:
+    def similar_experiences(self) -> list[str]:
         """Past decisions most like the rows kept, for the prompt's last block, as the mission's selection has it."""
         if not self.rows:
             return []
-        return mission.memory.nearest(self._features[[self._admissible.index(row) for row in self.rows]])
+        return self.mission.memory.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
 
-    def by_value(self, mission: Mission) -> Action:
+    def best_by_value(self) -> Action:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]
-        approach = self.state.approach(row, mission.scenario)
-        values = mission.learner.velocities(self._contexts[self._admissible.index(row)], approach)
-        level = int(values.argmax())
-        if self.asked is not None:
-            level = self.asked.nearest(row, level)
+        level = int(self._values_of_velocities(row).argmax())
+        if self.guidance is not None:
+            level = self.guidance.nearest(row, level)
         return Action(int(self.state.ids[row]), level)
 
-    def values(self, mission: Mission) -> dict[int, NDArray[np.float32]]:
-        """What the modules think of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v."""
+    def values(self) -> dict[int, NDArray[np.float32]]:
+        """The learned values of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v, (V,)."""
         found = {}
         for row, candidate in zip(self.rows, self.candidates, strict=True):
-            approach = self.state.approach(row, mission.scenario)
-            levels = mission.learner.velocities(self._contexts[self._admissible.index(row)], approach).numpy()
+            levels = self._values_of_velocities(row).numpy()
             found[candidate.sensor_id] = candidate.score + levels - levels.max()
         return found
 
-    def pending(self, mission: Mission, decision_id: str, sensor_id: int, velocity: int) -> Pending:
-        """The decision, as its outcome will need it."""
+    def pending(self, decision_id: str, action: Action) -> Pending:
+        """The decision, with what its outcome will be learned from."""
+        sensor_id, velocity = action
         rows = np.flatnonzero(self.state.ids == sensor_id)
         row = int(rows[0]) if len(rows) else None
         sample = None
-        if row is not None and row in self._admissible:
+        if row is not None and row in self.admissible:
             sample = Sample(
-                features=self._features,
-                chosen=self._admissible.index(row),
-                approach=self.state.approach(row, mission.scenario),
+                features=self.features,
+                chosen=self.admissible.index(row),
+                approach=self.state.approach(row, self.mission.scenario),
                 velocity=velocity,
             )
         return Pending(
@@ -132,6 +157,29 @@ class AttendedState:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            seen=mission.template.unknown(sensor_id) if row is None else cells(self.state, [row])[0],
+            seen=self.mission.template.unknown(sensor_id) if row is None else cells(self.state, [row])[0],
             sample=sample,
         )
+
+    def _values_of_velocities(self, row: int) -> Tensor:
+        """``u_jv`` of the sensor in that row, ``(V,)``; once a state, for two advisers ask."""
+        if row not in self._velocity_values:
+            context = self.contexts[self.admissible.index(row)]
+            approach = self.state.approach(row, self.mission.scenario)
+            self._velocity_values[row] = self.mission.learner.velocities(context, approach)
+        return self._velocity_values[row]
+
+
+def _attend(
+    mission: Mission, features: NDArray[np.float32], admissible: list[int], guidance: StepGuidance | None
+) -> tuple[list[int], list[float], Tensor]:
+    """Places in ``admissible`` of the sensors to keep, best first, the scores of all ``(n,)``, and their contexts."""
+    if not admissible:
+        return [], [], torch.empty(0)
+    scores, contexts = mission.learner.score(features)
+    if guidance is not None:
+        # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
+        added = guidance.worth[:, admissible].max(axis=0) / mission.scenario.queue_capacity
+        scores = scores + torch.from_numpy(added.astype(np.float32))
+    kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(admissible)))
+    return kept, scores.tolist(), contexts

@@ -1,18 +1,18 @@
-"""Mode ``guided``: advisers weighed by learned trust, and a critic that sees what this decision would lose.
+"""Mode ``guided``: advisers weighed by learned trust, and a rollout evaluator that sees what a decision would lose.
 
-The candidates are the rows' sensors at a few velocities each, and what the advisers would do themselves. Adviser e (the
-LLM, the planner, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight
-w_e, and the critic expects a candidate to lose m(a) packets above the best, or above the plan's. What is flown is
+The candidates are the rows' sensors at a few velocities each, and the advisers' own proposals. Adviser e (the LLM, the
+planner, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight w_e, and
+the rollout evaluator expects a candidate to lose m(a) packets above the best, or above the plan's. The UAV flies
 
     argmax_a  ln(sum_e w_e p_e(a)) - rate min(m(a), cap),    rate = 0.6 a packet, cap = 8 packets
 
-This is Hedge over pairs of an adviser and a candidate, with the critic's judgement as the prediction of this very
-decision's loss: optimistic Hedge (Rakhlin and Sridharan 2013), whose regret shrinks with the prediction's error. So an
-adviser is overruled where the critic sees a disaster, even before trust has learned; and as trust grows, its word
-counts for more than the critic's small differences. The best is taken rather than a draw: losses are estimated for
-every candidate, so that exploring would teach nothing, and cost packets.
+This is Hedge over pairs of an adviser and a candidate, with the evaluation as the prediction of this very decision's
+loss: optimistic Hedge (Rakhlin and Sridharan 2013), whose regret shrinks with the prediction's error. So an adviser is
+overruled where the evaluator sees a disaster, even before trust has learned; and as trust grows, an adviser's
+preference counts for more than the evaluator's small differences. The best is taken rather than a draw: losses are
+estimated for every candidate, so that exploring would teach nothing, and cost packets.
 
-The weights and what they guarantee are in :mod:`service.learning.trust`; the critic is
+The weights and their guarantee are in :mod:`service.learning.trust`; the evaluator is
 :mod:`service.deciding.rollout_evaluator`.
 """
 
@@ -35,71 +35,58 @@ from shared.actions import Action
 from shared.channel import FloatArray
 from shared.wire import Guided, Weighed
 
-_TOLD = 5
+# Candidates that a response names.
+_REPORTED = 5
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What is flown, what the response tells of it, and what trust is to learn from it."""
+    """The action to fly, what the response tells of it, and what trust is to learn from it."""
 
     action: Action
-    told: Guided
+    report: Guided
     advice: Advice
 
 
 @dataclass(frozen=True, slots=True)
 class Deliberation:
-    """One decision's candidates, the LLM-free advisers' probabilities of them ``(n,)`` by name, and the situation.
+    """One decision's candidates, n of them, and the LLM-free advisers' probabilities of them ``(n,)`` by name.
 
-    Taken at once from what the mission knows then; ``judge`` may run in another thread.
+    It is taken at once from what the mission knows then; ``evaluate`` may run in another thread.
     """
 
-    offer: CandidateSet
+    candidates: CandidateSet
     prompt: Prompt
     advised: dict[str, FloatArray]
-    situation: RolloutState
+    rollout: RolloutState
 
     @classmethod
-    def of(cls, mission: Mission, view: AttendedState) -> Self:
-        """For a mission of mode ``guided`` and a view with at least one row."""
-        template = template_of(mission)
-        shown = offered(mission, view)
-        proposed = {expert: action for expert in ADVISERS if (action := expert.proposal(mission, view)) is not None}
-        offer = shown.with_actions(list(proposed.values()))
-        reserved = mission.reserved(view.step, view.uav_id)
-        situation = RolloutState.of(
+    def of(cls, state: AttendedState) -> Self:
+        """For a state of a mission of mode ``guided`` with at least one row."""
+        mission = state.mission
+        preferences = {name: found for name, advise in ADVISERS.items() if (found := advise(state)) is not None}
+        candidates = candidates_of(state).with_actions([found.action for found in preferences.values()])
+        rollout = RolloutState.of(
             mission.belief,
             mission.scenario,
-            view.step,
-            view.uav_id,
+            state.step,
+            state.uav_id,
             seed=mission.spec.seed,
-            reserved=reserved,
+            reserved=state.reserved,
             course=None if mission.planner is None else mission.planner.course(),
             guidance=mission.guidance.obeyed,
         )
+        template = template_of(mission)
         return cls(
-            offer=offer,
-            prompt=template.offer(offer, view.state, mission.experiences, view.nearest(mission)),
-            advised={expert.name: expert.probabilities(mission, view, offer.actions) for expert in proposed},
-            situation=situation,
+            candidates=candidates,
+            prompt=template.offer(candidates, state.state, mission.experiences, state.similar_experiences()),
+            advised={name: found.probabilities(candidates.actions) for name, found in preferences.items()},
+            rollout=rollout,
         )
 
-    def judge(self) -> Judgement:
-        """What the critic expects of every candidate."""
-        return judge(self.situation, self.offer.actions)
-
-    def _regret(self, lost: FloatArray) -> FloatArray:
-        """Packets lost above the best candidate, or above the plan's unless that is a disaster.
-
-        The plan looks further than the critic, which flies look-ahead after the candidates and stops where it stops:
-        faulted for less than the cap, the planner was overruled in 3 of 46 worlds of scenario `paper`, each time while
-        most sensors were unheard of. One of these lost 96 packets instead of 22, one 0 instead of 7.
-        """
-        least = lost.min()
-        if PLANNER in self.advised:
-            planned = lost[self.advised[PLANNER].argmax()]
-            least = planned if planned - least < CAP else least
-        return np.asarray(np.maximum(lost - least, 0.0))
+    def evaluate(self) -> Judgement:
+        """What the rollout evaluator expects of every candidate."""
+        return judge(self.rollout, self.candidates.actions)
 
     def conclude(
         self,
@@ -108,62 +95,84 @@ class Deliberation:
         llm: FloatArray | None,
         *,
         calibrated: bool,
-        gone: Collection[int] = (),
+        reserved: Collection[int] = (),
     ) -> Verdict | None:
-        """Weigh the advice; None where every candidate's sensor is gone.
+        """Weigh the advice; None where every candidate's sensor is reserved.
 
         Args:
-            llm: the LLM's probabilities of the offer's actions, ``(n,)``; None where it was silent.
-            gone: sensors that others were given meanwhile.
+            llm: the LLM's probabilities of the candidates, ``(n,)``; None where it gave none.
+            calibrated: whether the LLM's bias towards labels is known.
+            reserved: sensors that other UAVs have by now.
         """
-        spoken = dict(self.advised)
+        heard = dict(self.advised)
         if llm is not None:
-            # What no label names is as likely as what the LLM ruled out.
-            spoken[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
-        weights = trust.among(spoken)
-        mixture = np.sum([weights[name] * p for name, p in spoken.items()], axis=0)
+            # An action without a label is as likely as one that the LLM rules out.
+            heard[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
+        weights = trust.among(heard)
+        mixture = np.sum([weights[name] * p for name, p in heard.items()], axis=0)
         regret = self._regret(judgement.lost)
         score = np.log(mixture) - RATE * np.minimum(regret, CAP)
-        free = ~np.isin([sensor for sensor, _ in self.offer.actions], list(gone))
+        free = ~np.isin([sensor for sensor, _ in self.candidates.actions], list(reserved))
         if not free.any():
             return None
-        best = int(np.where(free, score, -np.inf).argmax())
+        score = np.where(free, score, -np.inf)
+        best = int(score.argmax())
         advice = Advice(
-            regret={name: float(p @ np.minimum(regret, CAP)) for name, p in spoken.items()},
-            flown={name: float(p[best]) for name, p in spoken.items()},
+            regret={name: float(p @ np.minimum(regret, CAP)) for name, p in heard.items()},
+            flown={name: float(p[best]) for name, p in heard.items()},
             expected_cost=float(judgement.cost[best]),
         )
-        llm_told = spoken.get(LLM)
-        weighed = [
+        report = Guided(
+            trust={name: round(weight, 4) for name, weight in trust.weights.items()},
+            calibrated=calibrated,
+            candidates=self._reported(score, mixture, regret, heard.get(LLM)),
+        )
+        return Verdict(self.candidates.actions[best], report, advice)
+
+    def _regret(self, lost: FloatArray) -> FloatArray:
+        """Packets lost above the best candidate, or above the plan's unless that is a disaster.
+
+        The plan looks further than the evaluator, which flies look-ahead after the candidates and ends with its
+        horizon. Faulted for less than the cap, the planner was overruled in 3 of 46 worlds of scenario `paper`, each
+        time while most sensors were unheard. One of these lost 96 packets instead of 22, one 0 instead of 7.
+        """
+        least = lost.min()
+        if PLANNER in self.advised:
+            planned = lost[self.advised[PLANNER].argmax()]
+            least = planned if planned - least < CAP else least
+        return np.asarray(np.maximum(lost - least, 0.0))
+
+    def _reported(
+        self, score: FloatArray, mixture: FloatArray, regret: FloatArray, llm: FloatArray | None
+    ) -> list[Weighed]:
+        """The best candidates whose sensors are free, best first."""
+        best = np.argsort(-score, kind="stable")[:_REPORTED].tolist()
+        return [
             Weighed(
-                sensor_id=self.offer.actions[i][0],
-                velocity=self.offer.actions[i][1],
-                llm=None if llm_told is None else round(float(llm_told[i]), 4),
+                sensor_id=self.candidates.actions[i].sensor_id,
+                velocity=self.candidates.actions[i].velocity,
+                llm=None if llm is None else round(float(llm[i]), 4),
                 mixture=round(float(mixture[i]), 4),
                 regret=round(float(regret[i]), 3),
                 score=round(float(score[i]), 4),
             )
-            for i in np.argsort(-np.where(free, score, -np.inf), kind="stable")[:_TOLD].tolist()
-            if free[i]
+            for i in best
+            if score[i] > -np.inf
         ]
-        shares = {name: round(weight, 4) for name, weight in trust.weights.items()}
-        return Verdict(
-            self.offer.actions[best], Guided(trust=shares, calibrated=calibrated, candidates=weighed), advice
-        )
 
 
 def template_of(mission: Mission) -> GuidedTemplate:
-    """The mission's prompt; raises ``TypeError`` where it flies in another mode."""
+    """The mission's prompt template; raises ``TypeError`` where it flies in another mode."""
     if not isinstance(mission.template, GuidedTemplate):
         raise TypeError(f"mission {mission.mission_id} flies in mode {mission.mode}, not guided")
     return mission.template
 
 
-def offered(mission: Mission, view: AttendedState) -> CandidateSet:
-    """What the LLM may choose from, at velocities that the operator allows; the view has at least one row."""
-    shown = CandidateSet.of(view.state, view.shown(mission), view.uav_id, template_of(mission), mission.scenario)
-    asked = view.asked
-    if asked is None:
-        return shown
-    rows = {int(sensor): row for row, sensor in enumerate(view.state.ids)}
-    return shown.flown_as(lambda sensor, velocity: asked.nearest(rows[sensor], velocity))
+def candidates_of(state: AttendedState) -> CandidateSet:
+    """The LLM's candidates, at velocities that the operator allows; the state has at least one row."""
+    candidates = CandidateSet.of(state.state, state.reach, state.shown(), template_of(state.mission))
+    guidance = state.guidance
+    if guidance is None:
+        return candidates
+    rows = {int(sensor): row for row, sensor in enumerate(state.state.ids)}
+    return candidates.flown_as(lambda sensor, velocity: guidance.nearest(rows[sensor], velocity))

@@ -1,11 +1,10 @@
-"""Asking the LLM, within a deadline: of one UAV's decision, or of all UAVs of a step at once."""
+"""Queries to the LLM, within a deadline: about one UAV's decision, or about all UAVs of a step at once."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import math
-import time
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.deliberation import offered, template_of
+from service.deciding.deadline import Deadline
+from service.deciding.deliberation import candidates_of, template_of
 from service.llm.answer_format import NoDecision
 from service.llm.calibration import LabelReader
 from service.llm.completion import Completion
@@ -28,47 +28,51 @@ from shared.wire import Reason
 
 log = logging.getLogger(__name__)
 
-# After SIGTERM, so that every UAV is answered before the process is killed.
-_HURRY_S = 4.0
-# Calls about several UAVs that may run late in a row before they are asked about one by one.
+# The most that a query may take after SIGTERM, so that every UAV is answered before the process is killed.
+_CLOSING_S = 4.0
+# Queries about a whole fleet that may be late in a row before the LLM is asked about one UAV at a time.
 _LATE = 2
 
 
 @dataclass(frozen=True, slots=True)
 class LlmAdvice:
-    """What the LLM said of one UAV's candidates in mode ``guided``.
+    """The LLM's preference among one UAV's candidates in mode ``guided``.
 
-    ``told`` holds the probabilities of the actions that it was asked about; None where it was silent, for the
-    ``reason``; ``model`` is whose word it is. Where several UAVs were asked about at once, ``prompt`` is this one's
-    share, and the whole call's static block, experiences and ``completion`` are with the first.
+    Attributes:
+        prompt: of a query about several UAVs, this UAV's share of it; the first UAV's share has the static block and
+            the experiences too, and the whole query's ``completion``.
+        probabilities: by action; None where the LLM gave none, for the ``reason``.
+        calibrated: whether the LLM's bias towards labels is known.
+        model: the LLM's name, if it is known.
     """
 
     prompt: Prompt
-    told: dict[Action, float] | None
+    probabilities: dict[Action, float] | None
     reason: Reason | None
     completion: Completion | None
     calibrated: bool
     model: str | None
 
-    def of(self, actions: Sequence[Action]) -> FloatArray | None:
-        """Its probabilities of these actions, ``(n,)``; None where it said nothing of any.
+    def over(self, actions: Sequence[Action]) -> FloatArray | None:
+        """The probabilities of these actions, ``(n,)``; None where the LLM gave none for any of them.
 
-        A velocity that is not among them, because the operator forbade it meanwhile, counts as the sensor's nearest.
+        The probability of a velocity that is not among them goes to the sensor's nearest: the operator may have
+        forbidden it since.
         """
         found = np.zeros(len(actions))
-        for (sensor, velocity), probability in (self.told or {}).items():
-            there = [i for i, action in enumerate(actions) if action[0] == sensor]
-            if there:
-                found[min(there, key=lambda i: abs(actions[i][1] - velocity))] += probability
+        for (sensor, velocity), probability in (self.probabilities or {}).items():
+            same = [i for i, action in enumerate(actions) if action.sensor_id == sensor]
+            if same:
+                found[min(same, key=lambda i: abs(actions[i].velocity - velocity))] += probability
         return found / found.sum() if found.sum() > 0.0 else None
 
 
 class LlmQueries:
-    """Asks one LLM for every mission of a service, ``most`` decisions at once."""
+    """Asks one LLM for every mission of a service, a bounded number of decisions at a time."""
 
-    def __init__(self, llm: ServerPool, metrics: Metrics, most: int) -> None:
+    def __init__(self, llm: ServerPool, metrics: Metrics, limit: int) -> None:
         self._llm = llm
-        self._most = most
+        self._limit = limit
         self._metrics = metrics
         self._labels = LabelReader(llm)
         self._late = 0
@@ -76,107 +80,119 @@ class LlmQueries:
         self._closing = False
 
     def hurry(self) -> None:
-        """Closing time: who still waits for the LLM does so for a few seconds more."""
+        """The service is closing: a query that waits for the LLM gets a few seconds more."""
         self._closing = True
-        ends = asyncio.get_running_loop().time() + _HURRY_S
+        ends = asyncio.get_running_loop().time() + _CLOSING_S
         for limit in self._waiting:
-            # One that has just expired is on its way out, and cannot be changed.
+            # A limit that has just expired cannot be changed.
             if not limit.expired():
                 limit.reschedule(min(limit.when() or ends, ends))
 
     async def close(self) -> None:
-        """Give up what goes on in the background."""
+        """Give up the queries in the background."""
         await self._labels.close()
 
-    async def pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: float) -> Completion:
-        """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``. Deadlines are of ``time.perf_counter``."""
+    async def ask_for_pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: Deadline) -> Completion:
+        """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``."""
         return await self._within(self._llm.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
 
-    async def word(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: float) -> LlmAdvice:
-        """Mode ``guided``: what the LLM says of one UAV's candidates."""
+    async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
+        """Mode ``guided``: the LLM's preference among one UAV's candidates."""
+        if not mission.promptable:
+            return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
         template = template_of(mission)
-        lists = [list(offer.labels)]
-        completion, told, reason = await self._heard(mission, prompt.static, prompt.user, lists, deadline)
-        calibrated, model = self._knows(completion, prompt.static, lists), self._model(completion)
-        if told is None:
+        labels = [list(candidates.labels)]
+        completion, by_label, reason = await self._query(mission, prompt.static, prompt.user, labels, deadline)
+        calibrated, model = self._calibrated(completion, prompt.static, labels), self._model(completion)
+        if by_label is None:
             return LlmAdvice(prompt, None, reason, completion, calibrated, model)
         self._labels.calibrate(model, prompt.static, template.content_free(), [template.labels])
-        return LlmAdvice(prompt, by_action(offer, told[0]), None, completion, calibrated, model)
+        return LlmAdvice(prompt, by_action(candidates, by_label[0]), None, completion, calibrated, model)
 
-    def may_ask_together(self, mission: Mission, uavs: int) -> bool:
-        """Whether one call can decide for so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
+    def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
+        """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
         able = self._llm.status == "ready" and uavs <= self._llm.most_together
         return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
 
-    async def words(self, mission: Mission, views: Sequence[AttendedState], deadline: float) -> dict[int, LlmAdvice]:
-        """Mode ``guided``: what the LLM says of every UAV's candidates, by UAV, asked in one call.
+    async def ask_for_fleet(
+        self, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
+    ) -> dict[int, LlmAdvice]:
+        """Mode ``guided``: the LLM's preferences for several UAVs, by UAV, in one query.
 
-        Where that fails before the deadline, nothing is returned, and the LLM is asked about so many UAVs no more until
-        it is probed again; after two timeouts in a row neither.
+        Where the query fails before the deadline, the result is empty, and the LLM is asked about so many UAVs no more
+        until it is probed again; after two timeouts in a row neither.
         """
         template = template_of(mission)
-        asked = {view.uav_id: (view, offered(mission, view)) for view in views if view.rows}
+        asked = {state.uav_id: (state, candidates_of(state)) for state in states if state.rows}
         if not asked:
             return {}
-        nearest = dict.fromkeys(line for view, _ in asked.values() for line in view.nearest(mission))
+        similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())
         prompts = template.together(
-            {uav: (offer, view.state) for uav, (view, offer) in asked.items()}, mission.experiences, list(nearest)
+            {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
+            mission.experiences,
+            list(similar),
         )
         static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())
-        lists = [list(offer.labels) for _, offer in asked.values()]
-        completion, told, reason = await self._heard(mission, static, user, lists, deadline)
-        self._late = self._late + 1 if reason == "llm_timeout" else 0
-        if reason is not None and (self._late == 0 or self._late >= _LATE):
-            log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", len(asked), reason)
-            self._llm.most_together = len(asked) - 1
-            self._late = 0
+        labels = [list(candidates.labels) for _, candidates in asked.values()]
+        completion, by_label, reason = await self._query(mission, static, user, labels, deadline)
+        self._note_lateness(len(asked), reason)
         if reason is not None and reason != "llm_timeout":
             return {}
-        calibrated, model = self._knows(completion, static, lists), self._model(completion)
-        if told is not None:
+        calibrated, model = self._calibrated(completion, static, labels), self._model(completion)
+        if by_label is not None:
             self._labels.calibrate(model, static, template.content_free(list(asked)), [template.labels] * len(asked))
-        words = {}
-        for place, (uav, (_, offer)) in enumerate(asked.items()):
-            heard = None if told is None else by_action(offer, told[place])
-            words[uav] = LlmAdvice(prompts[uav], heard, reason, None if place else completion, calibrated, model)
-        return words
+        advice = {}
+        for index, (uav, (_, candidates)) in enumerate(asked.items()):
+            probabilities = None if by_label is None else by_action(candidates, by_label[index])
+            whole = None if index else completion
+            advice[uav] = LlmAdvice(prompts[uav], probabilities, reason, whole, calibrated, model)
+        return advice
 
-    async def _heard(
-        self, mission: Mission, static: str, user: str, lists: Sequence[Sequence[str]], deadline: float
+    def _note_lateness(self, uavs: int, reason: Reason | None) -> None:
+        """Ask about fewer UAVs at once where the LLM failed, or is late again."""
+        self._late = self._late + 1 if reason == "llm_timeout" else 0
+        if reason is not None and (self._late == 0 or self._late >= _LATE):
+            log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
+            self._llm.most_together = uavs - 1
+            self._late = 0
+
+    async def _query(
+        self, mission: Mission, static: str, user: str, labels: Sequence[Sequence[str]], deadline: Deadline
     ) -> tuple[Completion | None, list[dict[str, float]] | None, Reason | None]:
-        completion, told, reason = None, None, None
+        """The completion and the probabilities of each UAV's labels, or the reason why there are none."""
+        completion, by_label, reason = None, None, None
         try:
-            completion = await self._within(self._labels.ask(static, user, lists), deadline)
-            told = self._labels.read(completion, static, lists)
+            completion = await self._within(self._labels.ask(static, user, labels), deadline)
+            by_label = self._labels.read(completion, static, labels)
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()
-        return completion, told, reason
+        return completion, by_label, reason
 
     def _model(self, completion: Completion | None) -> str | None:
-        """Who said it, or would have."""
+        """The LLM that answered, or would have."""
         return self._llm.model if completion is None else completion.model
 
-    def _knows(self, completion: Completion | None, static: str, lists: Sequence[Sequence[str]]) -> bool:
-        known = self._labels.bias(self._model(completion), static, len(lists)) is not None
+    def _calibrated(self, completion: Completion | None, static: str, labels: Sequence[Sequence[str]]) -> bool:
+        known = self._labels.bias(self._model(completion), static, len(labels)) is not None
         return known and completion is not None and bool(completion.places)
 
-    async def _within(self, asked: Coroutine[Any, Any, Completion], deadline: float) -> Completion:
-        if len(self._waiting) >= self._most:
-            asked.close()
-            raise NoDecision("llm_busy", f"{self._most} decisions wait for it already")
-        limit = asyncio.timeout(min(deadline - time.perf_counter(), _HURRY_S if self._closing else math.inf))
+    async def _within(self, query: Coroutine[Any, Any, Completion], deadline: Deadline) -> Completion:
+        if len(self._waiting) >= self._limit:
+            query.close()
+            raise NoDecision("llm_busy", f"{self._limit} decisions wait for it already")
+        limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))
         try:
             async with limit:
                 self._waiting.add(limit)
-                return await asked
+                return await query
         except TimeoutError:
             raise NoDecision("llm_timeout", "no answer within the deadline") from None
         finally:
             self._waiting.discard(limit)
 
 
-def by_action(offer: CandidateSet, told: dict[str, float]) -> dict[Action, float]:
-    """Probabilities of an offer's labels as those of its actions."""
-    return dict(zip(offer.actions, offer.spread(told).tolist(), strict=True))
+def by_action(candidates: CandidateSet, by_label: dict[str, float]) -> dict[Action, float]:
+    """Probabilities of the candidates' labels as those of their actions."""
+    return dict(zip(candidates.actions, candidates.spread(by_label).tolist(), strict=True))

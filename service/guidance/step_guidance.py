@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from shared.channel import FloatArray, link_holds
 from shared.features import State
 from shared.guidance import Guidance
-from shared.reach import Reach, distances_ahead
+from shared.reach import Reach
 from shared.scenario import Scenario
 
 
@@ -32,20 +32,16 @@ class StepGuidance:
 
     @classmethod
     def of(
-        cls, guidance: Guidance, state: State, step: int, visits: NDArray[np.int64], uav: int, scenario: Scenario
-    ) -> Self | None:
-        """Of a UAV's state at a step; None where the guidance asks for nothing.
+        cls, guidance: Guidance, state: State, reach: Reach, step: int, visits: NDArray[np.int64], scenario: Scenario
+    ) -> Self:
+        """Of a UAV's state and its reach at a step.
 
         Args:
             visits: step of each sensor's last visit, by sensor ID; -1 for never.
         """
-        if not guidance:
-            return None
         allowed = guidance.allowed(scenario.max_velocity + 1)
-        distance = distances_ahead(uav, state.position, state.progress_m, state.places, scenario)
-        reach = Reach.of(distance, np.where(state.able, state.queue, 0.0), state.urgency, scenario)
         overdue = guidance.overdue(step, visits)[state.ids] > 0
-        due = overdue & state.able & link_holds(distance, scenario) & allowed[:, None]
+        due = overdue & state.able & link_holds(reach.distance, scenario) & allowed[:, None]
         weights = guidance.weights(scenario.sensors)[state.ids]
         worth = (weights - 1.0) * state.urgency * reach.packets + scenario.queue_capacity * due
         return cls(allowed, due, np.where(allowed[:, None], worth, -np.inf))

@@ -137,14 +137,9 @@ class Broadcaster:
         self._sending: set[asyncio.Timeout] = set()
         self._closing = False
 
-    def drafted(self, mission: Mission, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
-        """A decision was made by this prompt, whether the LLM was asked or not."""
-        position = uav.position[0], uav.position[1]
-        self.history.drafted(mission.mission_id, position, prompt, answer)
-
-    def answered(self, answer: DecideResponse) -> None:
-        """It went out."""
-        self.history.answered(answer)
+    def decided(self, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
+        """Show an answered decision with its prompt, whether an LLM got the prompt or not."""
+        self.history.decided((uav.position[0], uav.position[1]), prompt, answer)
         self._change(answer.mission_id)
 
     def settled(self, mission: Mission, outcome: Outcome) -> None:

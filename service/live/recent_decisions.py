@@ -28,14 +28,14 @@ class Blocks:
 class RecentDecision:
     """One decision: where its UAV was, m, what was asked, what was answered, and what came of it.
 
-    ``order`` counts up as decisions are answered, 0 until then; ``settled`` is the order at which the outcome came.
+    ``order`` counts up with every answer and every outcome; ``settled`` is the order at which the outcome came.
     """
 
     mission_id: str
     position: tuple[float, float]
     prompt: Blocks | None
     answer: DecideResponse
-    order: int = 0
+    order: int
     outcome: Outcome | None = None
     settled: int = 0
 
@@ -58,10 +58,11 @@ class RecentDecisions:
         self.order = 0
         self.edge = uuid.uuid4().hex
 
-    def drafted(self, mission_id: str, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
-        """A decision was made; it is shown once it is answered."""
+    def decided(self, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
+        """Take a decision that is answered."""
+        self.order += 1
         blocks = Blocks(prompt.static, prompt.experiences, prompt.state)
-        kept = RecentDecision(mission_id, position, blocks, answer)
+        kept = RecentDecision(answer.mission_id, position, blocks, answer, self.order)
         self._kept[answer.decision_id] = kept
         self._characters += kept.characters
         while len(self._kept) > _MOST:
@@ -70,12 +71,6 @@ class RecentDecisions:
         if self._characters > _MOST_CHARACTERS:
             self._shed_prompts()
 
-    def answered(self, answer: DecideResponse) -> None:
-        """It went out, with these times."""
-        if (kept := self._kept.get(answer.decision_id)) is not None:
-            self.order += 1
-            kept.answer, kept.order = answer, self.order
-
     def settled(self, outcome: Outcome) -> None:
         """This came of it."""
         if (kept := self._kept.get(outcome.decision_id)) is not None:
@@ -83,9 +78,8 @@ class RecentDecisions:
             kept.outcome, kept.settled = outcome, self.order
 
     def of(self, mission_id: str) -> list[RecentDecision]:
-        """A mission's answered decisions, in the order answered."""
-        found = (kept for kept in self._kept.values() if kept.mission_id == mission_id and kept.order)
-        return sorted(found, key=lambda kept: kept.order)
+        """A mission's decisions, in the order of their answers."""
+        return [kept for kept in self._kept.values() if kept.mission_id == mission_id]
 
     def find(self, mission_id: str, decision_id: str) -> RecentDecision | None:
         """The mission's decision, if it is still kept."""

@@ -21,7 +21,7 @@ from service.prompting.unpruned_baseline import Uncompressed
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State
-from shared.reach import Reach, distances_ahead
+from shared.reach import Reach
 from shared.scenario import Scenario
 
 # OpenAI and vLLM tell the probabilities of at most 20 tokens.
@@ -167,9 +167,8 @@ class CandidateSet:
     rows: str
 
     @classmethod
-    def of(cls, state: State, shown: Sequence[int], uav: int, template: GuidedTemplate, scenario: Scenario) -> Self:
+    def of(cls, state: State, reach: Reach, shown: Sequence[int], template: GuidedTemplate) -> Self:
         """Of the rows of a state, in the order to show them; no more than the template has letters for."""
-        reach = state.reach or _reach(state, uav, scenario)
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
         text = []
@@ -231,8 +230,3 @@ def _list(uav: int, rows: str) -> str:
 def _span(speeds: Sequence[int]) -> str:
     # Two tokens a row less where the slowest is 0, as for most.
     return f"{speeds[0]}-{speeds[-1]}" if 0 < speeds[0] < speeds[-1] else str(speeds[-1])
-
-
-def _reach(state: State, uav: int, scenario: Scenario) -> Reach:
-    distance = distances_ahead(uav, state.position, state.progress_m, state.places, scenario)
-    return Reach.of(distance, np.where(state.able, state.queue, 0.0), state.urgency, scenario)

@@ -10,7 +10,6 @@ import numpy as np
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.look_ahead import decide_without_llm
 from service.mission.mission import Mission
 from service.prompting.demonstrations import Demonstration
 from shared.actions import Action
@@ -26,7 +25,7 @@ Teacher = Callable[[RolloutStep, State, Scenario, Collection[int]], Action | Non
 
 
 def _look_ahead(step: RolloutStep, state: State, scenario: Scenario, reserved: Collection[int]) -> Action | None:
-    return decide_without_llm(state, step.request.uav_id, scenario, reserved)
+    return look_ahead(state, state.reach_ahead(step.request.uav_id, scenario), reserved)
 
 
 def _recorded(
@@ -65,7 +64,7 @@ def solutions(
                 if answer is not None and _collects(view.state, *answer):
                     demonstration = _demonstration(mission, uav, uav.step, answer)
                     yield demonstration, likeness(view.state, *answer, mission.scenario)
-            mission.commit(view.pending(mission, decision_id, step.sensor_id, step.velocity))
+            mission.commit(view.pending(decision_id, Action(step.sensor_id, step.velocity)))
             mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
 
 

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.look_ahead import decide_without_llm
 from service.learning.sample import Sample
 from service.mission.mission import Mission
 from service.training.reward import Reward, Speed
+from shared.actions import Action
 from shared.features import State
 from shared.reach import Reach, distances_ahead
 from shared.rollouts import Header, Reference, RolloutStep
@@ -81,9 +81,8 @@ def replay(
             decision_id = f"{number:032x}"
             mission.observe(step.request, step.request.step)
             view = AttendedState.of(mission, step.request, step.request.step)
-            view.attend(mission)
             taught = _taught(mission, view, step.reference)
-            mission.commit(view.pending(mission, decision_id, step.sensor_id, step.velocity))
+            mission.commit(view.pending(decision_id, Action(step.sensor_id, step.velocity)))
             sample = mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
             worth = next(rewards[step.request.uav_id])
             if sample is not None and worth is not None:
@@ -93,12 +92,11 @@ def replay(
 
 def _taught(mission: Mission, view: AttendedState, reference: Reference | None) -> Taught | None:
     if reference is None:
-        reserved = mission.reserved(view.step, view.uav_id)
-        sensor_id, velocity = decide_without_llm(view.state, view.uav_id, mission.scenario, reserved)
+        sensor_id, velocity = look_ahead(view.state, view.reach, view.reserved)
         teacher = "look_ahead"
     else:
         sensor_id, velocity, teacher = reference.sensor_id, reference.velocity, reference.teacher
-    sample = view.pending(mission, "reference", sensor_id, velocity).sample
+    sample = view.pending("reference", Action(sensor_id, velocity)).sample
     if sample is None:
         return None
     reach = _reach(view.state, view.uav_id, sensor_id, mission.scenario)

@@ -1,5 +1,6 @@
 import numpy as np
 
+from shared.actions import Action
 from shared.channel import channel_gain_db
 from shared.features import FEATURES
 from shared.urgency import urgency
@@ -26,23 +27,23 @@ def test_a_stale_gain_is_the_channel_models_from_here() -> None:
 
 def test_unheard_and_reserved_sensors_never_reach_the_softmax() -> None:
     m = mission()
-    m.commit(attended(m, uav(uav_id=1)).pending(m, "a" * 32, 3, 5))
+    m.commit(attended(m, uav(uav_id=1)).pending("a" * 32, Action(3, 5)))
     view = attended(m, uav(queue=[10.0, None, 20.0, 30.0, None, 40.0]))
-    assert sorted(view.offered) == [0, 2, 5]
+    assert sorted(view.kept_ids) == [0, 2, 5]
     assert len(view.state.features(PAPER)) == 3
     # Only this step's reservations count, and only other UAVs'.
-    assert 3 in attended(m, uav(step=1), step=1).offered
-    assert 3 in attended(m, uav(uav_id=1)).offered
+    assert 3 in attended(m, uav(step=1), step=1).kept_ids
+    assert 3 in attended(m, uav(uav_id=1)).kept_ids
 
 
 def test_a_sensor_with_a_flat_battery_never_reaches_the_softmax() -> None:
     state = uav(queue=[10.0, 20.0, 30.0])
     sensors = state.sensors.model_copy(update={"battery": [50.0, 0.0, 50.0]})
-    assert sorted(attended(mission(), state.model_copy(update={"sensors": sensors})).offered) == [0, 2]
+    assert sorted(attended(mission(), state.model_copy(update={"sensors": sensors})).kept_ids) == [0, 2]
 
 
 def test_top_k_is_the_missions() -> None:
     view = attended(mission(top_k=2), uav())
     assert len(view.rows) == 2
     scores, _ = mission().learner.score(view.state.features(PAPER))
-    assert view.offered == np.argsort(-scores.numpy())[:2].tolist()
+    assert view.kept_ids == np.argsort(-scores.numpy())[:2].tolist()

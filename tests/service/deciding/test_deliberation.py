@@ -47,7 +47,7 @@ def deliberation(mission: Mission, step: int = 0) -> tuple[AttendedState, Delibe
     )
     mission.observe(state, step)
     view = attended(mission, state, step)
-    return view, Deliberation.of(mission, view)
+    return view, Deliberation.of(view)
 
 
 def completion(text: str, **first_token: float) -> Completion:
@@ -56,12 +56,12 @@ def completion(text: str, **first_token: float) -> Completion:
 
 def test_every_row_has_four_letters_whose_velocities_rise() -> None:
     view, made = deliberation(guided())
-    offer = made.offer
+    offer = made.candidates
     assert list(offer.labels) == list("ABCDEFGHIJKLMNOPQRST")
     rows = offer.rows.splitlines()
     assert [row[0] for row in rows] == list("AEIMQ")
     assert all(re.fullmatch(r"[A-Z]\d+,\d+,\d+(-\d+)?", row) for row in rows)
-    for place, sensor in enumerate(view.offered):
+    for place, sensor in enumerate(view.kept_ids):
         pairs = [offer.actions[offer.labels[chr(65 + 4 * place + i)]] for i in range(4)]
         assert {s for s, _ in pairs} == {sensor}
         assert [v for _, v in pairs] == sorted(v for _, v in pairs)
@@ -79,7 +79,7 @@ def test_the_static_block_never_changes_and_the_rest_is_short() -> None:
     view, first = deliberation(mission)
     for number in range(12):
         decision_id = f"{number:032x}"
-        mission.commit(view.pending(mission, decision_id, 1, 7))
+        mission.commit(view.pending(decision_id, Action(1, 7)))
         mission.apply(Outcome(decision_id=decision_id, cost=0.3))
     _, later = deliberation(mission, step=3)
     assert later.prompt.static.encode() == first.prompt.static.encode()
@@ -208,9 +208,9 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
     mission = guided(planner="on")
     view, _ = deliberation(mission)
     plan = planned(mission, view)
-    made = Deliberation.of(mission, view)
-    place = made.offer.actions.index(plan)
-    losses = np.zeros(len(made.offer.actions))
+    made = Deliberation.of(view)
+    place = made.candidates.actions.index(plan)
+    losses = np.zeros(len(made.candidates.actions))
     losses[place] = lost
     verdict = made.conclude(mission.trust_in("stub"), Judgement(losses, losses), None, calibrated=False)
     assert verdict is not None
@@ -224,15 +224,15 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
     for step in range(6):
         view, _ = deliberation(mission, step)
         plan = planned(mission, view)
-        made = Deliberation.of(mission, view)
-        judgement = made.judge()
-        labels = made.offer.labels
+        made = Deliberation.of(view)
+        judgement = made.evaluate()
+        labels = made.candidates.labels
         worst = max(labels, key=lambda name: judgement.lost[labels[name]])
         told = worst if answer == "worst" else str(random.choice(list(labels)))
-        word = made.offer.spread({name: float(name == told) for name in labels})
+        word = made.candidates.spread({name: float(name == told) for name in labels})
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None and verdict.action == plan
-        assert set(verdict.told.trust) == {"llm", "planner", "value", "policy"}
+        assert set(verdict.report.trust) == {"llm", "planner", "value", "policy"}
 
 
 def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
@@ -240,9 +240,9 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
     trust = mission.trust_in("stub")
     for step in range(15):
         view, made = deliberation(mission, step)
-        judgement = made.judge()
+        judgement = made.evaluate()
         label = answer(made, judgement.lost)
-        word = made.offer.spread({name: float(name == label) for name in made.offer.labels})
+        word = made.candidates.spread({name: float(name == label) for name in made.candidates.labels})
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None
         decision_id = f"{step:032x}"
@@ -253,10 +253,10 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
 
 def test_trust_falls_for_the_worst_and_not_for_the_best() -> None:
     def worst(made: Deliberation, lost: np.ndarray) -> str:
-        return max(made.offer.labels, key=lambda name: lost[made.offer.labels[name]])
+        return max(made.candidates.labels, key=lambda name: lost[made.candidates.labels[name]])
 
     def best(made: Deliberation, lost: np.ndarray) -> str:
-        return min(made.offer.labels, key=lambda name: lost[made.offer.labels[name]])
+        return min(made.candidates.labels, key=lambda name: lost[made.candidates.labels[name]])
 
     assert learned(worst) < 0.05
     assert learned(best) > 0.5
@@ -265,25 +265,25 @@ def test_trust_falls_for_the_worst_and_not_for_the_best() -> None:
 def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     mission = guided()
     view, made = deliberation(mission)
-    judgement = made.judge()
-    worst = max(made.offer.labels, key=lambda name: judgement.lost[made.offer.labels[name]])
+    judgement = made.evaluate()
+    worst = max(made.candidates.labels, key=lambda name: judgement.lost[made.candidates.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
-    told = made.offer.spread({name: float(name == worst) for name in made.offer.labels})
+    told = made.candidates.spread({name: float(name == worst) for name in made.candidates.labels})
     verdict = made.conclude(mission.trust_in("stub"), judgement, told, calibrated=False)
     assert verdict is not None
-    assert verdict.action != made.offer.actions[made.offer.labels[worst]]
+    assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]
 
 
 def test_what_others_got_meanwhile_is_not_flown() -> None:
     mission = guided()
     view, made = deliberation(mission)
-    trust, judgement = mission.trust_in("stub"), made.judge()
+    trust, judgement = mission.trust_in("stub"), made.evaluate()
     first = made.conclude(trust, judgement, None, calibrated=False)
     assert first is not None
-    second = made.conclude(trust, judgement, None, calibrated=False, gone={first.action[0]})
+    second = made.conclude(trust, judgement, None, calibrated=False, reserved={first.action[0]})
     assert second is not None and second.action[0] != first.action[0]
-    everything = {sensor for sensor, _ in made.offer.actions}
-    assert made.conclude(trust, judgement, None, calibrated=False, gone=everything) is None
+    everything = {sensor for sensor, _ in made.candidates.actions}
+    assert made.conclude(trust, judgement, None, calibrated=False, reserved=everything) is None
 
 
 class Chooser(StubLlm):

@@ -27,9 +27,9 @@ def test_closing_time_at_the_moment_of_a_deadline_fails_nobody(tmp_path: Path, r
 
         async def every_turn_of_the_loop() -> None:
             while not late.done():
-                engine.asking.hurry()
+                engine.queries.hurry()
                 await asyncio.sleep(0)
 
-        assert isinstance(engine.keeper, Journal)
-        asyncio.run_coroutine_threadsafe(every_turn_of_the_loop(), engine.keeper._loop).result(timeout=30)
+        assert isinstance(engine.journal, Journal)
+        asyncio.run_coroutine_threadsafe(every_turn_of_the_loop(), engine.journal._loop).result(timeout=30)
         assert (late.result().status_code, late.result().json()["reason"]) == (200, "llm_timeout")

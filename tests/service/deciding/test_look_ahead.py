@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from service.deciding.look_ahead import decide_without_llm
+from service.deciding.look_ahead import look_ahead
 from shared.channel import link_holds
 from shared.features import State
 from shared.trajectory import trajectories
@@ -22,7 +22,7 @@ def test_the_sensor_is_in_reach_after_the_move() -> None:
     ahead = PATH.at(480.0)
     view = attended(mission(), uav(position=ON_LAP, x=[float(ahead[0])], queue=[60.0]))
     view.state.places[0] = ahead
-    sensor, velocity = decide_without_llm(view.state, 0, PAPER, frozenset())
+    sensor, velocity = look_ahead(view.state, view.reach, frozenset())
     arrived = PATH.at(velocity * PAPER.step_s)
     assert sensor == 0
     assert velocity > 0
@@ -34,7 +34,7 @@ def test_it_slows_down_for_a_full_queue_that_it_would_leave_behind() -> None:
     behind = PATH.at(-300.0)
     s = state(position=ON_LAP, x=[float(behind[0])], queue=[60.0])
     s.places[0] = behind
-    _, velocity = decide_without_llm(s, 0, PAPER, frozenset())
+    _, velocity = look_ahead(s, s.reach_ahead(0, PAPER), frozenset())
     arrived = PATH.at(velocity * PAPER.step_s)
     assert velocity < PAPER.max_velocity
     assert link_holds(math.dist(arrived, behind), PAPER)
@@ -42,15 +42,15 @@ def test_it_slows_down_for_a_full_queue_that_it_would_leave_behind() -> None:
 
 def test_on_an_unknown_trajectory_the_most_urgent_in_range_at_full_speed() -> None:
     s = state(queue=[10.0, 40.0, 50.0, 20.0, 60.0, None])
-    assert decide_without_llm(s, 0, PAPER, frozenset()) == (2, 14)
-    assert decide_without_llm(s, 0, PAPER, frozenset({2})) == (1, 14)
+    assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset()) == (2, 14)
+    assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset({2})) == (1, 14)
     # Sensors 4 and 5 are 400 and 500 m away: the nearest free one.
-    assert decide_without_llm(s, 0, PAPER, frozenset({0, 1, 2, 3})) == (4, 14)
-    assert decide_without_llm(s, 0, PAPER, frozenset(range(6)))[0] == 2
+    assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset({0, 1, 2, 3})) == (4, 14)
+    assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset(range(6)))[0] == 2
 
 
 @pytest.mark.parametrize("position", [ON_LAP, (500.0, 500.0)])
 def test_an_empty_battery_sends_nothing(position: tuple[float, float]) -> None:
     s = state(queue=[10.0, 60.0], position=position, x=[position[0] - 50, position[0] - 60])
     s.battery[1] = 0.0
-    assert decide_without_llm(s, 0, PAPER, frozenset())[0] == 0
+    assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset())[0] == 0

@@ -26,18 +26,18 @@ class Stuck:
     def __init__(self) -> None:
         self.begun = 0
         self.go = threading.Event()
-        self._judge = Deliberation.judge
+        self._evaluate = Deliberation.evaluate
 
-    def judge(self, deliberation: Deliberation) -> Judgement:
+    def evaluate(self, deliberation: Deliberation) -> Judgement:
         self.begun += 1
         self.go.wait(5)
-        return self._judge(deliberation)
+        return self._evaluate(deliberation)
 
 
 @pytest.fixture
 def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
     critic = Stuck()
-    monkeypatch.setattr(Deliberation, "judge", lambda deliberation: critic.judge(deliberation))
+    monkeypatch.setattr(Deliberation, "evaluate", lambda deliberation: critic.evaluate(deliberation))
     yield critic
     critic.go.set()
 

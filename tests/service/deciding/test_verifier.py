@@ -12,6 +12,7 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.verifier import verify
 from service.llm.answer_format import NoDecision
 from service.mission.mission import Mission
+from shared.actions import Action
 from shared.wire import MissionSpec
 from tests.running import serving
 from tests.service.making import attended, mission, uav
@@ -32,37 +33,37 @@ def ready(**spec: Any) -> tuple[Mission, AttendedState]:
 @pytest.mark.parametrize(("sensor", "velocity"), [(0, 0), (3, 14), (1, 7)])
 def test_what_is_in_reach_is_left_alone(sensor: int, velocity: int) -> None:
     m, view = ready()
-    verify(m, view, sensor, velocity)
+    verify(view, Action(sensor, velocity))
 
 
 def test_out_of_reach_breaks_a_rule_unless_everything_is() -> None:
     m, view = ready()
     with pytest.raises(NoDecision) as broken:
-        verify(m, view, 5, 14)
+        verify(view, Action(5, 14))
     assert broken.value.reason == "rule_reach"
     lonely = mission()
     far = uav(x=[5000.0, 6000.0], queue=[10.0, 20.0])
     lonely.observe(far, 0)
-    verify(lonely, attended(lonely, far), 1, 7)
+    verify(attended(lonely, far), Action(1, 7))
 
 
 def test_a_battery_that_another_uav_found_flat_breaks_a_rule() -> None:
     m, view = ready()
     m.belief.battery[2] = 0.0
     with pytest.raises(NoDecision) as broken:
-        verify(m, view, 2, 7)
+        verify(view, Action(2, 7))
     assert broken.value.reason == "rule_battery"
 
 
 def test_without_the_verifier_only_a_reservation_counts() -> None:
     m, view = ready(verify="off")
     m.belief.battery[2] = 0.0
-    verify(m, view, 2, 7)
-    verify(m, view, 5, 14)
+    verify(view, Action(2, 7))
+    verify(view, Action(5, 14))
     other = attended(m, uav(uav_id=1))
-    m.commit(other.pending(m, "a" * 32, 2, 7))
+    m.commit(other.pending("a" * 32, Action(2, 7)))
     with pytest.raises(NoDecision) as broken:
-        verify(m, view, 2, 7)
+        verify(view, Action(2, 7))
     assert broken.value.reason == "answer_reserved"
 
 

@@ -14,6 +14,7 @@ import pytest
 from fastapi.responses import JSONResponse, Response
 
 from service.deciding.attended_state import AttendedState
+from service.deciding.deadline import Deadline
 from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.llm.answer_format import constrain_labels
 from service.mission.mission import Mission
@@ -150,15 +151,15 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Eight UAVs' candidates are weighed after the LLM's time is over: that must fit into the deadline too."""
-    words, given_s = LlmQueries.words, list[float]()
+    ask_for_fleet, given_s = LlmQueries.ask_for_fleet, list[float]()
 
     async def timed(
-        self: LlmQueries, mission: Mission, views: Sequence[AttendedState], deadline: float
+        self: LlmQueries, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
     ) -> dict[int, LlmAdvice]:
-        given_s.append(deadline - time.perf_counter())
-        return await words(self, mission, views, deadline)
+        given_s.append(deadline.left())
+        return await ask_for_fleet(self, mission, states, deadline)
 
-    monkeypatch.setattr(LlmQueries, "words", timed)
+    monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
     chorus = Chorus(hangs_on="UAV")
     with serving(chorus.app) as url:
         client = edge(mode="guided", llm_url=f"{url}/v1")
@@ -218,10 +219,10 @@ def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     word = LlmAdvice(
         prompt, {Action(1, 9): 0.3, Action(1, 2): 0.1, Action(4, 7): 0.6}, None, None, calibrated=False, model=None
     )
-    left = word.of([Action(1, 3), Action(1, 7), Action(2, 7)])
+    left = word.over([Action(1, 3), Action(1, 7), Action(2, 7)])
     assert left is not None
     assert left.tolist() == pytest.approx([0.25, 0.75, 0.0])
-    assert word.of([Action(2, 7), Action(3, 7)]) is None
+    assert word.over([Action(2, 7), Action(3, 7)]) is None
 
 
 def test_what_all_asked_for_is_told_as_given_away(edge: Edge, report: Report) -> None:

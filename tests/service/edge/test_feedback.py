@@ -17,6 +17,7 @@ from service.live.broadcaster import Broadcaster
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import NullJournal
+from shared.actions import Action
 from shared.wire import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state
 from tests.service.making import attended, uav
@@ -70,7 +71,7 @@ def test_as_many_lessons_are_learned_as_outcomes_come() -> None:
         for turn in range(turns):
             for mission in fleets:
                 name = uuid.uuid4().hex
-                mission.commit(attended(mission, uav(), turn).pending(mission, name, 1, 7))
+                mission.commit(attended(mission, uav(), turn).pending(name, Action(1, 7)))
                 outcomes.apply(mission, Outcome(decision_id=name, cost=0.5))
             await asyncio.sleep(0)
         outcomes.finish()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from service.config.settings import Settings
 from service.deciding.deliberation import Deliberation
-from service.deciding.look_ahead import decide_without_llm
+from service.deciding.look_ahead import look_ahead
 from service.deciding.rollout_evaluator import RolloutState, judge
 from service.guidance.note_orders import INSTRUCTION, constrain_orders
 from service.guidance.step_guidance import StepGuidance
@@ -269,27 +269,27 @@ def test_a_heavier_sensor_is_scored_higher_and_others_are_as_before() -> None:
 
 def test_guidance_that_asks_for_nothing_changes_nothing() -> None:
     view, other = attended(mission(), uav()), attended(guided_by(Guidance()), uav())
-    assert other.asked is None
+    assert other.guidance is None
     assert view.candidates == other.candidates
 
 
 def test_the_policy_prefers_an_overdue_sensor_in_reach_at_a_velocity_that_is_allowed() -> None:
     made = guided_by(Guidance(sensors=[SensorWish(sensor_id=0, visit_every=2)], min_velocity=2, max_velocity=4))
     view = attended(made, uav(step=6), 6)
-    free = decide_without_llm(view.state, 0, PAPER, frozenset())
-    asked = decide_without_llm(view.state, 0, PAPER, frozenset(), view.asked)
+    free = look_ahead(view.state, view.reach, frozenset())
+    asked = look_ahead(view.state, view.reach, frozenset(), view.guidance)
     assert free[0] != 0 and asked[0] == 0 and 2 <= asked[1] <= 4
     # Not if another UAV is on its way to it.
-    assert decide_without_llm(view.state, 0, PAPER, frozenset({0}), view.asked)[0] != 0
+    assert look_ahead(view.state, view.reach, frozenset({0}), view.guidance)[0] != 0
 
 
 def test_mode_value_flies_the_allowed_velocity_nearest_to_the_one_it_wants() -> None:
     """The best of the learned values among few levels would hover where the best of all flies on."""
     state = uav(step=3)
-    wanted = attended(mission(), state, 3).by_value(mission())[1]
+    wanted = attended(mission(), state, 3).best_by_value()[1]
     for low, high in ((0, 2), (5, 6), (12, 14)):
         made = guided_by(Guidance(min_velocity=low, max_velocity=high))
-        assert attended(made, state, 3).by_value(made)[1] == min(max(wanted, low), high)
+        assert attended(made, state, 3).best_by_value()[1] == min(max(wanted, low), high)
 
 
 @pytest.mark.parametrize("asked", [{"visit_every": 1}, {"weight": 10.0}])
@@ -308,7 +308,7 @@ def test_guided_offers_no_forbidden_velocity() -> None:
     made = guided_by(Guidance(min_velocity=3, max_velocity=5), mode="guided")
     state = uav()
     made.observe(state, 0)
-    offer = Deliberation.of(made, attended(made, state)).offer
+    offer = Deliberation.of(attended(made, state)).candidates
     assert {velocity for _, velocity in offer.actions} <= {3, 4, 5}
     assert set(offer.labels.values()) <= set(range(len(offer.actions)))
 
@@ -316,8 +316,7 @@ def test_guided_offers_no_forbidden_velocity() -> None:
 def test_an_overdue_sensor_out_of_reach_is_not_waited_for() -> None:
     state = attended(mission(), uav(x=[500.0, 5000.0], queue=[10.0, 50.0]), 0).state
     wish = Guidance(sensors=[SensorWish(sensor_id=1, visit_every=1)])
-    asked = StepGuidance.of(wish, state, 9, np.full(10, -1), 0, PAPER)
-    assert asked is not None
+    asked = StepGuidance.of(wish, state, state.reach_ahead(0, PAPER), 9, np.full(10, -1), PAPER)
     assert not asked.due.any()
     assert (asked.worth == 0).all()
 

@@ -291,8 +291,7 @@ def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
     prompt = prompt_of("x" * 20_000)
     for number in range(2000):
         answer = answer_of(f"{number:032x}", f"m{number % 2}")
-        history.drafted(answer.mission_id, (0.0, 0.0), prompt, answer)
-        history.answered(answer)
+        history.decided((0.0, 0.0), prompt, answer)
     kept = history.of("m0") + history.of("m1")
     assert len(kept) == 600
     assert kept[-1].answer.decision_id == f"{1999:032x}"
@@ -304,12 +303,9 @@ def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
     assert history.of("m0") == history.of("m1") == []
 
 
-def test_a_decision_is_shown_once_it_is_answered() -> None:
+def test_a_decision_is_shown_with_its_outcome() -> None:
     history = RecentDecisions()
-    answer = answer_of("a" * 32)
-    history.drafted("test", (1.0, 2.0), prompt_of(""), answer)
-    assert history.of("test") == []
-    history.answered(answer)
+    history.decided((1.0, 2.0), prompt_of(""), answer_of("a" * 32))
     history.settled(Outcome(decision_id="a" * 32, cost=1.0))
     history.settled(Outcome(decision_id="b" * 32, cost=1.0))
     assert [(one.order, one.settled) for one in history.of("test")] == [(1, 2)]

@@ -2,13 +2,14 @@ import pytest
 
 from service.errors import Conflict, NotFound
 from service.mission.mission import Mission
+from shared.actions import Action
 from shared.wire import Outcome
 from tests.service.making import attended, mission, uav
 
 
 def decide(m: Mission, number: int, *, step: int = 0, uav_id: int = 0, sensor: int = 1) -> str:
     decision_id = f"{number:032x}"
-    m.commit(attended(m, uav(step=step, uav_id=uav_id), step).pending(m, decision_id, sensor, 7))
+    m.commit(attended(m, uav(step=step, uav_id=uav_id), step).pending(decision_id, Action(sensor, 7)))
     return decision_id
 
 
@@ -84,7 +85,7 @@ def test_a_failure_takes_back_only_its_own_visit() -> None:
 def test_a_decision_outside_the_modules_view_teaches_nothing() -> None:
     m = mission()
     view = attended(m, uav(queue=[10.0, None]))
-    m.commit(view.pending(m, "b" * 32, 1, 14))
+    m.commit(view.pending("b" * 32, Action(1, 14)))
     assert m.apply(outcome("b" * 32)) is None
 
 
@@ -116,9 +117,9 @@ def test_an_answer_to_an_earlier_attempt_does_not_undo_a_later_one() -> None:
     m = mission()
     slow, fast = m.turns.attempt(1, 0), m.turns.attempt(1, 0)
     view = attended(m, uav(step=1), 1)
-    m.commit(view.pending(m, "a" * 32, 4, 7), fast)
+    m.commit(view.pending("a" * 32, Action(4, 7)), fast)
     with pytest.raises(Conflict):
-        m.commit(view.pending(m, "b" * 32, 1, 7), slow)
+        m.commit(view.pending("b" * 32, Action(1, 7)), slow)
     assert m.reserved(1, uav_id=1) == {4}
     assert m.status().visits == {4: 1}
 

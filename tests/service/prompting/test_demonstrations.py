@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.commands.demonstrate import main
-from service.deciding.look_ahead import decide_without_llm
+from service.deciding.look_ahead import look_ahead
 from service.errors import Refused
 from service.prompting.demonstrations import packaged
 from service.training.demonstration_teachers import TEACHERS, farthest_first, likeness, solutions
@@ -79,11 +79,11 @@ def test_the_static_block_stays_as_it_is_while_the_modules_learn() -> None:
     before = m.template.static
     for step in range(4):
         view = attended(m, uav(step=step), step)
-        m.commit(view.pending(m, f"{step:032x}", 1, 7))
+        m.commit(view.pending(f"{step:032x}", Action(1, 7)))
         sample = m.apply(Outcome(decision_id=f"{step:032x}", cost=1.0))
         assert sample is not None
         m.learner.update(sample, 1.0)
-        assert m.template.prompt(view.state, view.shown(m), m.experiences).static == before
+        assert m.template.prompt(view.state, view.shown(), m.experiences).static == before
 
 
 def test_a_slower_fleet_sees_no_velocity_past_its_limit() -> None:
@@ -109,7 +109,10 @@ def test_the_shipped_ones_are_the_planners_and_each_collects_something_that_was_
         row = state.ids.tolist().index(d.sensor_id)
         assert state.admissible[row]
         assert state.reach.packets[d.velocity, row] >= 1
-        short_sighted += decide_without_llm(state, d.uav.uav_id, pool.scenario, d.reserved) == (d.sensor_id, d.velocity)
+        short_sighted += look_ahead(state, state.reach_ahead(d.uav.uav_id, pool.scenario), d.reserved) == (
+            d.sensor_id,
+            d.velocity,
+        )
     assert short_sighted < 0.7 * len(pool.demonstrations), "the planner sees further than one step"
 
 

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.prompting.experiences import Experience, Experiences
+from shared.actions import Action
 from shared.wire import MissionSpec, Outcome, PromptStyle, Selection
 from tests.service.making import attended, mission, uav
 
@@ -118,9 +119,9 @@ def flown(selection: Selection, steps: int, **style: Any) -> list[tuple[str, str
     m, prompts = mission(spec), []
     for step in range(steps):
         view = attended(m, uav(step=step, position=(400.0 + 20 * step, 500.0)), step)
-        prompt = m.template.prompt(view.state, view.shown(m), m.experiences, view.nearest(m))
+        prompt = m.template.prompt(view.state, view.shown(), m.experiences, view.similar_experiences())
         prompts.append((prompt.static, prompt.experiences, prompt.state))
-        m.commit(view.pending(m, f"{step:032x}", view.offered[step % 3], 7))
+        m.commit(view.pending(f"{step:032x}", Action(view.kept_ids[step % 3], 7)))
         m.apply(Outcome(decision_id=f"{step:032x}", cost=step % 5 / 2))
     return prompts
 

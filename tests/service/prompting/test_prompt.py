@@ -6,6 +6,7 @@ import pytest
 
 from service.errors import Refused
 from service.prompting.prompt import Prompt, Template
+from shared.actions import Action
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, Outcome, PromptStyle
 from tests.service.making import PAPER, attended, mission, uav
@@ -20,8 +21,8 @@ def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> l
     prompts = []
     for step in range(steps):
         view = attended(m, uav(step=step, position=(500.0 + step, 500.0)), step)
-        prompts.append(m.template.prompt(view.state, view.shown(m), m.experiences))
-        m.commit(view.pending(m, f"{step:032x}", 1, 7))
+        prompts.append(m.template.prompt(view.state, view.shown(), m.experiences))
+        m.commit(view.pending(f"{step:032x}", Action(1, 7)))
         m.apply(Outcome(decision_id=f"{step:032x}", cost=0.125))
     return prompts
 
@@ -52,8 +53,8 @@ def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
     m = mission(top_k=2)
     m.visits[0] = 4
     view = attended(m, uav(step=6, queue=[30.0, None, 60.0, 15.0]), 6)
-    prompt = m.template.prompt(view.state, view.shown(m), [])
-    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.offered
+    prompt = m.template.prompt(view.state, view.shown(), [])
+    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids
     assert prompt.uncompressed.text.splitlines() == [
         "0,30,50,-90,2,0",
         "1,?,?,?,6,100",
@@ -90,7 +91,7 @@ def test_json_is_an_object_a_line() -> None:
 def test_json_has_null_for_what_was_never_heard() -> None:
     m = mission(MissionSpec(prompt=PromptStyle(format="json")))
     view = attended(m, uav(queue=[30.0, None]))
-    whole = m.template.prompt(view.state, view.shown(m), []).uncompressed.text.splitlines()
+    whole = m.template.prompt(view.state, view.shown(), []).uncompressed.text.splitlines()
     unheard = {"sensor_id": 1, "queue": None, "battery": None, "gain": None, "age": 0, "distance": 100}
     assert json.loads(whole[1]) == unheard
     assert json.loads(whole[0])["battery"] == 50
@@ -128,9 +129,9 @@ def test_shuffled_rows_are_the_same_rows_in_an_order_of_seed_step_and_uav() -> N
     def order(seed: int, step: int, uav_id: int) -> list[int]:
         m = mission(MissionSpec(prompt=PromptStyle(order="shuffled"), seed=seed))
         view = attended(m, uav(step=step, uav_id=uav_id), step)
-        prompt = m.template.prompt(view.state, view.shown(m), [])
+        prompt = m.template.prompt(view.state, view.shown(), [])
         shown = [int(line.split(",")[0]) for line in prompt.state.splitlines()]
-        assert sorted(shown) == sorted(view.offered)
+        assert sorted(shown) == sorted(view.kept_ids)
         return shown
 
     cases = [(seed, step, uav_id) for seed in range(2) for step in range(3) for uav_id in range(2)]
@@ -143,20 +144,20 @@ def test_shuffling_changes_the_prompt_and_nothing_else() -> None:
     shuffled = mission(MissionSpec(prompt=PromptStyle(order="shuffled")))
     view, plain = attended(shuffled, uav()), attended(mission(), uav())
     assert view.candidates == plain.candidates
-    assert view.by_value(shuffled) == plain.by_value(mission())
+    assert view.best_by_value() == plain.best_by_value()
 
 
 def test_without_attention_every_admissible_sensor_is_shown_in_the_requests_order() -> None:
     m = mission(MissionSpec(attention="off", top_k=2, mode="llm"))
     view = attended(m, uav(queue=[30.0, None, 60.0, 15.0]))
-    prompt = m.template.prompt(view.state, view.shown(m), [])
-    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.offered == [0, 2, 3]
+    prompt = m.template.prompt(view.state, view.shown(), [])
+    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids == [0, 2, 3]
     assert "in no particular order" in prompt.static
 
 
 def test_mode_value_keeps_attention_which_is_all_that_it_has() -> None:
     m = mission(MissionSpec(attention="off", top_k=2))
-    assert len(attended(m, uav()).offered) == 2
+    assert len(attended(m, uav()).kept_ids) == 2
 
 
 def test_as_many_as_there_are_sensors_are_offered_best_first_or_shuffled() -> None:
@@ -166,7 +167,7 @@ def test_as_many_as_there_are_sensors_are_offered_best_first_or_shuffled() -> No
         scores = [candidate.score for candidate in view.candidates]
         assert len(scores) == 6
         assert scores == sorted(scores, reverse=True)
-        assert (view.shown(m) == view.rows) == (order == "score")
+        assert (view.shown() == view.rows) == (order == "score")
 
 
 def test_no_experiences_means_no_block_and_no_word_of_it() -> None:

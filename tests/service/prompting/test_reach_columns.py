@@ -133,7 +133,7 @@ def test_the_velocity_scorer_is_told_what_each_level_brings() -> None:
 
 def test_the_shipped_start_slows_down_for_a_full_queue_and_hurries_past_an_empty_one() -> None:
     m = mission(REACH)
-    full, little = (attended(m, on_lap([at(-300.0)], [queue])).by_value(m)[1] for queue in (60.0, 1.0))
+    full, little = (attended(m, on_lap([at(-300.0)], [queue])).best_by_value()[1] for queue in (60.0, 1.0))
     assert link_holds(math.dist(PATH.at(10.0 * full), at(-300.0)), PAPER)
     assert little > full
 
@@ -144,7 +144,7 @@ def test_a_row_tells_the_best_velocity_and_what_it_collects() -> None:
     view = attended(m, state)
     assert view.state.reach is not None
     best, movable = int(view.state.reach.best[0]), int(view.state.reach.best_packets[0])
-    prompt = m.template.prompt(view.state, view.shown(m), [])
+    prompt = m.template.prompt(view.state, view.shown(), [])
     assert "with seven numbers:\nsensor_id,queue,gain,age,distance,best,movable\n" in prompt.static
     assert prompt.state.endswith(f",{best},{movable}\n")
     assert prompt.uncompressed.text.splitlines()[0].startswith("0,60,50,-90,0,")
@@ -157,7 +157,7 @@ def test_a_row_tells_the_best_velocity_and_what_it_collects() -> None:
 def test_a_row_in_json_has_the_same_columns() -> None:
     m = mission(MissionSpec(features="reach", prompt=PromptStyle(format="json")))
     view = attended(m, on_lap([at(-300.0)], [60.0]))
-    row = json.loads(m.template.prompt(view.state, view.shown(m), []).state)
+    row = json.loads(m.template.prompt(view.state, view.shown(), []).state)
     assert tuple(row) == columns("reach")
 
 
@@ -165,7 +165,7 @@ def test_a_row_in_json_has_the_same_columns() -> None:
 def test_every_scenario_flies_with_it(scenario: str) -> None:
     m = mission(MissionSpec(scenario=scenario, features="reach"))
     view = attended(m, uav())
-    sensor, velocity = view.by_value(m)
+    sensor, velocity = view.best_by_value()
     assert sensor in range(6)
     assert 0 <= velocity <= 14
     assert m.status().features == "reach"

@@ -165,7 +165,7 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
             other.execute("ROLLBACK")
             other.close()
         ends = time.monotonic() + 20
-        while engine.keeper.failing and time.monotonic() < ends:
+        while engine.journal.failing and time.monotonic() < ends:
             time.sleep(0.1)
         # What was told with a decision has been written meanwhile; what was refused was not applied.
         first_again = client.post("/feedback", json={"mission_id": "test", **owed[0]})
@@ -188,8 +188,8 @@ def test_what_waits_for_a_store_that_fails_is_bounded(
         try:
             for step in range(3, 80):
                 assert client.post("/decide", json=report(step=step)).status_code == 200
-            assert isinstance(engine.keeper, journal.Journal)
-            assert len(engine.keeper._commits._queue) < 50
+            assert isinstance(engine.journal, journal.Journal)
+            assert len(engine.journal._commits._queue) < 50
         finally:
             other.execute("ROLLBACK")
             other.close()
@@ -244,9 +244,9 @@ def test_missions_that_begin_together_are_not_checkpointed_all_at_once(tmp_path:
     with running(tmp_path / "m.db") as (client, engine):
         for n in range(20):
             assert client.put(f"/missions/fleet{n}", json={"mode": "value"}).status_code == 200
-        assert isinstance(engine.keeper, journal.Journal)
+        assert isinstance(engine.journal, journal.Journal)
         least = {
-            next(n for n in range(journal._EVENTS, -1, -1) if engine.keeper.due(mission, n) is not None)
+            next(n for n in range(journal._EVENTS, -1, -1) if engine.journal.due(mission, n) is not None)
             for mission in engine.missions.awake
         }
     assert len(least) > 10

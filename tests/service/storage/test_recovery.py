@@ -27,6 +27,7 @@ from service.storage.recovery import restore_mission
 from service.storage.serialization import pack
 from service.storage.store import Store, StoredMission
 from service.storage.writer import Done, WriteFailed, Writer
+from shared.actions import Action
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome
 from tests.running import serving
@@ -238,7 +239,7 @@ def test_while_the_store_fails_nothing_is_deleted_made_or_confirmed(tmp_path: Pa
             client.post("/decide", json=report(step=2))
             # Only what the edge knows can it refuse: a DELETE that comes before is carried out, and told as a 503.
             ends = time.monotonic() + 30
-            while not engine.keeper.failing:
+            while not engine.journal.failing:
                 assert time.monotonic() < ends
                 time.sleep(0.01)
             structure = {"guidance": {"max_velocity": 5}}
@@ -282,7 +283,7 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
 
 def test_a_lesson_that_fails_leaves_the_mission_readable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
-    sample = attended(mission, uav()).pending(mission, "a" * 32, 1, 7).sample
+    sample = attended(mission, uav()).pending("a" * 32, Action(1, 7)).sample
     assert sample is not None
 
     def broken(*_: object) -> float:

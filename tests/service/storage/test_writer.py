@@ -44,7 +44,7 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
         first.kill()
         # Nobody is told: another process writes what this one was to write.
         assert client.post("/decide", json=report(step=3, deadline_ms=60_000)).json()["stored"]
-        assert not engine.keeper.failing
+        assert not engine.journal.failing
         again = client.post("/feedback", json={"mission_id": "test", **owed[0]})
         assert (again.status_code, again.json()["result"]) == (200, "duplicate")
         assert "has ended (exit code -9)" in caplog.text
