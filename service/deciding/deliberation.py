@@ -29,7 +29,8 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.mission.mission import Mission
-from service.prompting.candidates import CandidateSet, GuidedTemplate
+from service.prompting.candidates import CandidateSet
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
@@ -161,7 +162,8 @@ def template_of(mission: Mission) -> GuidedTemplate:
 
 def offered(mission: Mission, view: AttendedState) -> CandidateSet:
     """What the LLM may choose from, at velocities that the operator allows; the view has at least one row."""
-    shown = CandidateSet.of(view.state, view.shown(mission), view.uav_id, template_of(mission), mission.scenario)
+    letters = template_of(mission).letters
+    shown = CandidateSet.of(view.state, view.shown(mission), view.uav_id, letters, mission.scenario)
     asked = view.asked
     if asked is None:
         return shown

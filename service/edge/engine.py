@@ -20,7 +20,7 @@ from service.deciding.deliberation import Deliberation
 from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.deciding.look_ahead import decide_without_llm
 from service.deciding.verifier import verify
-from service.edge.feedback import Outcomes
+from service.edge.feedback import Feedback
 from service.edge.mission_registry import MissionRegistry
 from service.errors import Unavailable
 from service.guidance.note_compiler import NoteCompiler
@@ -88,7 +88,7 @@ class Engine:
         self._own_s = _OWN_S
         self.keeper: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self.live = Broadcaster()
-        self._outcomes = Outcomes(metrics, self.keeper, self.live)
+        self._outcomes = Feedback(metrics, self.keeper, self.live)
         self.missions = MissionRegistry(settings, metrics, self.keeper, store, self.compiler.compile)
 
     def hurry(self) -> None:

@@ -19,7 +19,7 @@ from shared.wire import Outcome
 log = logging.getLogger(__name__)
 
 
-class Outcomes:
+class Feedback:
     """Applies outcomes, each once, and checkpoints what was learned of them."""
 
     def __init__(self, metrics: Metrics, keeper: Journal | NullJournal, live: Broadcaster) -> None:
