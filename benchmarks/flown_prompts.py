@@ -19,7 +19,8 @@ from service.deciding.deliberation import candidates_of
 from service.deciding.rollout_evaluator import RolloutState
 from service.llm.request_bodies import chat_body, label_body
 from service.mission.mission import Mission
-from service.prompting.candidates import CandidateSet, GuidedTemplate
+from service.prompting.candidates import CandidateSet
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.scenario import Scenario

@@ -28,9 +28,7 @@ from service.config.settings import Settings
 from service.deciding.deadline import Deadline
 from service.deciding.llm_query import LlmAdvice, by_action
 from service.edge.engine import Engine
-from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
-from service.observability.metrics import Metrics
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.scenario import Scenario, scenario_named

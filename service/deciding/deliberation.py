@@ -29,7 +29,8 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.mission.mission import Mission
-from service.prompting.candidates import CandidateSet, GuidedTemplate
+from service.prompting.candidates import CandidateSet
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
@@ -170,7 +171,7 @@ def template_of(mission: Mission) -> GuidedTemplate:
 
 def candidates_of(state: AttendedState) -> CandidateSet:
     """The LLM's candidates, at velocities that the operator allows; the state has at least one row."""
-    candidates = CandidateSet.of(state.state, state.reach, state.shown(), template_of(state.mission))
+    candidates = CandidateSet.of(state.state, state.reach, state.shown(), template_of(state.mission).letters)
     guidance = state.guidance
     if guidance is None:
         return candidates

@@ -14,7 +14,7 @@ from service.deciding.decision_task import RESERVE_S, DecisionTask
 from service.deciding.llm_query import LlmQueries
 from service.deciding.pipeline import Decided, Pipeline
 from service.edge.batch import BatchDecider
-from service.edge.feedback import Outcomes
+from service.edge.feedback import Feedback
 from service.edge.mission_registry import MissionRegistry
 from service.errors import Unavailable
 from service.guidance.note_compiler import NoteCompiler
@@ -65,7 +65,7 @@ class Engine:
         self.pipeline = Pipeline(settings, self.queries, counter)
         self._batches = BatchDecider(self.pipeline, self.queries)
         self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
-        self._outcomes = Outcomes(metrics, self.journal, self.live)
+        self._feedback = Feedback(metrics, self.journal, self.live)
         self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile)
 
     def hurry(self) -> None:
@@ -82,10 +82,10 @@ class Engine:
         self.live.close()
         await self.compiler.close()
         await self.queries.close()
-        self._outcomes.finish()
+        self._feedback.finish()
         await self.pipeline.close()
         self.missions.close()
-        await self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
+        await self._feedback.close(self.missions.awake, _LAST_CHECKPOINTS_S)
         return await self.journal.close(_LAST_COMMIT_S)
 
     async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
@@ -119,7 +119,7 @@ class Engine:
         async def make() -> list[Decided]:
             # Every outcome, before the first decision: none is forgotten while the UAVs wait for the LLM.
             for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
-                self._outcomes.take(mission, outcome)
+                self._feedback.take(mission, outcome)
             return await self._batches.decide(mission, reports, watch, deadline)
 
         return await self._respond(mission, request, key, make, deadline)
@@ -134,7 +134,7 @@ class Engine:
         """
         mission = await self.missions.get(request.mission_id)
         self.missions.refuse_if_failing("decision_id")
-        result = self._outcomes.apply(mission, request)
+        result = self._feedback.apply(mission, request)
         try:
             await self.durable("decision_id")
         finally:
@@ -155,7 +155,7 @@ class Engine:
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
     ) -> Decided:
         if request.outcome is not None:
-            self._outcomes.take(mission, request.outcome)
+            self._feedback.take(mission, request.outcome)
         attempt = mission.observe(request, request.step)
         plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, deadline)
         deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, deadline.earlier_by(RESERVE_S)
@@ -233,7 +233,7 @@ class Engine:
 
     def _checkpoint_later(self, mission: Mission) -> None:
         """Where a checkpoint is due, write it once the event loop has sent the answer."""
-        asyncio.get_running_loop().call_soon(self._outcomes.checkpoint, mission)
+        asyncio.get_running_loop().call_soon(self._feedback.checkpoint, mission)
 
 
 def _stored(answer: DecideResponse, stored: bool, waited_ms: float) -> DecideResponse:

@@ -19,12 +19,12 @@ from shared.wire import Outcome
 log = logging.getLogger(__name__)
 
 
-class Outcomes:
+class Feedback:
     """Applies outcomes, each once, and checkpoints what was learned of them."""
 
-    def __init__(self, metrics: Metrics, keeper: Journal | NullJournal, live: Broadcaster) -> None:
+    def __init__(self, metrics: Metrics, journal: Journal | NullJournal, live: Broadcaster) -> None:
         self._metrics = metrics
-        self._keeper = keeper
+        self._journal = journal
         self._live = live
         self._lessons = LearningQueue(metrics)
 
@@ -70,13 +70,13 @@ class Outcomes:
         Args:
             least: events since the last checkpoint that make one due; the journal's own number unless given.
         """
-        if not isinstance(self._keeper, Journal):
+        if not isinstance(self._journal, Journal):
             return
-        mission_log = self._keeper.due(mission) if least is None else self._keeper.due(mission, least)
+        mission_log = self._journal.due(mission) if least is None else self._journal.due(mission, least)
         if mission_log is None:
             return
         self._lessons.catch_up(mission)
-        self._keeper.checkpoint(mission_log, {**mission.state_dict(), "learner": mission.learner.state_dict()})
+        self._journal.checkpoint(mission_log, {**mission.state_dict(), "learner": mission.learner.state_dict()})
 
     def finish(self) -> None:
         """Learn what waits, now."""

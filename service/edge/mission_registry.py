@@ -37,13 +37,13 @@ class MissionRegistry:
         self,
         settings: Settings,
         metrics: Metrics,
-        keeper: Journal | NullJournal,
+        journal: Journal | NullJournal,
         store: Store | None,
         on_wake: Callable[[Mission], None],
     ) -> None:
         self._settings = settings
         self._metrics = metrics
-        self._keeper = keeper
+        self._journal = journal
         self._store = store
         self._on_wake = on_wake
         self._missions: dict[str, Mission] = {}
@@ -134,12 +134,12 @@ class MissionRegistry:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         self._missions.pop(mission_id, None)
         self._asleep.discard(mission_id)
-        self._keeper.end(mission_id)
+        self._journal.end(mission_id)
         self._count()
 
     def refuse_if_failing(self, field: str) -> None:
         """Raises :class:`Unavailable` while the store fails, before anything is recorded."""
-        if self._keeper.failing:
+        if self._journal.failing:
             raise Unavailable(field, "the store fails: nothing was recorded, send it again")
 
     def close(self) -> None:
@@ -161,7 +161,7 @@ class MissionRegistry:
 
     async def _wake(self, mission_id: str) -> Mission:
         """Read a mission back, beside the decisions for others."""
-        assert self._store is not None and isinstance(self._keeper, Journal)
+        assert self._store is not None and isinstance(self._journal, Journal)
         store = self._store
         try:
             loop = asyncio.get_running_loop()
@@ -182,7 +182,7 @@ class MissionRegistry:
                 mission_id,
                 limit,
             )
-        self._keeper.follow(mission, kept.seq, kept.events)
+        self._journal.follow(mission, kept.seq, kept.events)
         self._missions[mission_id] = mission
         self._asleep.discard(mission_id)
         self._on_wake(mission)
@@ -196,7 +196,7 @@ class MissionRegistry:
             limit = self._settings.max_missions
             raise Conflict("mission_id", f"{limit} missions are held already: DELETE one, or raise AICVDS_MAX_MISSIONS")
         self._missions[mission.mission_id] = mission
-        self._keeper.begin(mission)
+        self._journal.begin(mission)
         self._count()
 
     def _count(self) -> None:

@@ -11,32 +11,26 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any
 
 from pydantic import ValidationError
 
 from service.guidance.order_examples import EXAMPLES
-from service.llm.answer_format import Constraint
 from shared.guidance import Guidance, SensorWish
 
 INSTRUCTION = "Rewrite the operator's note as orders for the UAVs."
 NOTHING = "nothing"
-_SEPARATOR = ", "
-_MOST_ORDERS = 6
-_MOST_NUMBERS = 10
-_MOST_RULES = 60
+SEPARATOR = ", "
+MOST_ORDERS = 6
 # The most alike of the examples, the nearest last. A model of 135M parameters gets 22 of 30 held-out notes right with
 # them, where the nearest example's orders with this note's numbers are right 17 times (benchmarks/notes.py).
 _SHOWN = 8
 
-_VISIT, _WEIGHT = "visit sensor # every # steps", "sensor # counts # times"
-_FASTEST, _SLOWEST, _FORBIDDEN = "fly at most # m/s", "fly at least # m/s", "do not fly at # m/s"
+VISIT, WEIGHT = "visit sensor # every # steps", "sensor # counts # times"
+FASTEST, SLOWEST, FORBIDDEN = "fly at most # m/s", "fly at least # m/s", "do not fly at # m/s"
 _PATTERNS = {
     words: re.compile(re.escape(words).replace(r"\#", "([0-9]{1,4})"))
-    for words in (_VISIT, _WEIGHT, _FASTEST, _SLOWEST, _FORBIDDEN)
+    for words in (VISIT, WEIGHT, FASTEST, SLOWEST, FORBIDDEN)
 }
 
 # fmt: off
@@ -65,105 +59,8 @@ def numbers_in(note: str) -> Counter[int]:
     return Counter(number for number in named if number is not None)
 
 
-def admissible(note: str) -> list[str]:
-    """Every order that has only numbers of the note, none more often than the note, in the order of its words.
-
-    Raises:
-        BadOrders: the note names too many numbers, or none.
-    """
-    named = numbers_in(note)
-    numbers = list(named)
-    if not numbers:
-        raise BadOrders("the note names no number, and no order goes without one: it stands in the prompt alone")
-    if len(numbers) > _MOST_NUMBERS:
-        raise BadOrders(f"the note names more than {_MOST_NUMBERS} different numbers")
-    one = [_filled(words, (number,)) for words in (_FASTEST, _SLOWEST, _FORBIDDEN) for number in numbers]
-    pairs = [(first, second) for first in numbers for second in numbers if first != second or named[first] > 1]
-    return [_filled(words, pair) for words in (_VISIT, _WEIGHT) for pair in pairs] + one
-
-
-def constrain_orders(constraint: Constraint, note: str) -> dict[str, Any]:
-    """The request fields that hold a server to orders that the note's numbers allow, or ``nothing``.
-
-    Raises:
-        BadOrders: as :func:`admissible`.
-    """
-    orders = admissible(note)
-    if constraint == "grammar":
-        return {"grammar": _grammar(orders, numbers_in(note))}
-    if constraint == "structured_outputs":
-        one = f"({'|'.join(map(re.escape, orders))})"
-        return {"structured_outputs": {"regex": f"({NOTHING}|{one}({_SEPARATOR}{one}){{0,{_MOST_ORDERS - 1}}})"}}
-    if constraint == "json_schema":
-        schema = {
-            "type": "object",
-            "properties": {"orders": {"type": "array", "items": {"type": "string", "enum": list(orders)}}},
-            "required": ["orders"],
-            "additionalProperties": False,
-        }
-        return {
-            "response_format": {
-                "type": "json_schema",
-                "json_schema": {"name": "orders", "strict": True, "schema": schema},
-            }
-        }
-    return {}
-
-
-def _grammar(orders: Sequence[str], named: Counter[int]) -> str:
-    """GBNF in which no number is used more often than it is named, as :func:`read` wants it.
-
-    A rule is what may follow, where these numbers are left and these sensors have had an order; where a note has so
-    many numbers that there would be too many rules, a few fixed ones allow more, and :func:`read` refuses it.
-    """
-    places = {_State.at_first(named): 0}
-    rules = []
-    for state in (waiting := list(places)):
-        following: dict[_State, list[str]] = {}
-        for order in orders:
-            if (after := state.after(order)) is not None:
-                following.setdefault(after, []).append(f'"{order}"')
-        for after in following:
-            if after not in places and any(after.after(order) is not None for order in orders):
-                places[after] = len(places)
-                waiting.append(after)
-        if len(places) > _MOST_RULES:
-            words = " | ".join(f'"{order}"' for order in orders)
-            several = f'order ("{_SEPARATOR}" order){{0,{_MOST_ORDERS - 1}}}'
-            return f'root ::= "{NOTHING}" | {several}\norder ::= {words}'
-        ways = [
-            f"({' | '.join(told)})" + (f' ("{_SEPARATOR}" s{places[after]})?' if after in places else "")
-            for after, told in following.items()
-        ]
-        rules.append(f"s{places[state]} ::= {' | '.join(ways)}")
-    return "\n".join([f'root ::= "{NOTHING}" | s0', *rules])
-
-
-@dataclass(frozen=True, slots=True)
-class _State:
-    """What orders so far leave: numbers and how often they may yet be used, and the sensors named."""
-
-    left: frozenset[tuple[int, int]]
-    sensors: frozenset[int] = frozenset()
-
-    @classmethod
-    def at_first(cls, named: Counter[int]) -> _State:
-        return cls(frozenset(named.items()))
-
-    def after(self, order: str) -> _State | None:
-        """What one more order leaves; None where a number would be used too often."""
-        words, numbers = _parsed(order)
-        sensors = frozenset(numbers[:1]) if words in (_VISIT, _WEIGHT) else frozenset[int]()
-        # A sensor may be named in several orders, of which each says something else about it.
-        used = Counter(numbers) - Counter(sensors & self.sensors)
-        left = Counter(dict(self.left))
-        if used - left:
-            return None
-        return _State(frozenset((left - used).items()), self.sensors | sensors)
-
-
 def read(text: str, note: str) -> Guidance:
-    """The structure that orders are, from plain text or the JSON object of :func:`constrain_orders`.
+    """The structure that orders are, from plain text or the JSON object of ``constrain_orders``.
 
     Raises:
         BadOrders: extra text, an order given twice, or a number that the note does not name, or not so often.
@@ -171,18 +68,18 @@ def read(text: str, note: str) -> Guidance:
     wishes: dict[int, dict[str, int]] = {}
     limits: dict[str, int] = {}
     forbidden: list[int] = []
-    for words, numbers in map(_parsed, _listed(text)):
-        if words in (_VISIT, _WEIGHT):
+    for words, numbers in map(parsed, _listed(text)):
+        if words in (VISIT, WEIGHT):
             told, key, value = (
                 wishes.setdefault(numbers[0], {}),
-                "visit_every" if words == _VISIT else "weight",
+                "visit_every" if words == VISIT else "weight",
                 numbers[1],
             )
-        elif words == _FORBIDDEN:
+        elif words == FORBIDDEN:
             forbidden.append(numbers[0])
             continue
         else:
-            told, key, value = limits, "max_velocity" if words == _FASTEST else "min_velocity", numbers[0]
+            told, key, value = limits, "max_velocity" if words == FASTEST else "min_velocity", numbers[0]
         if key in told:
             raise BadOrders(f"{key} is ordered twice")
         told[key] = value
@@ -214,13 +111,8 @@ def number_of(token: str) -> int | None:
     return int(token[:6]) if token.isdigit() else _NUMBER_WORDS.get(token)
 
 
-def _filled(words: str, numbers: Sequence[int]) -> str:
-    for number in numbers:
-        words = words.replace("#", str(number), 1)
-    return words
-
-
-def _parsed(order: str) -> tuple[str, list[int]]:
+def parsed(order: str) -> tuple[str, list[int]]:
+    """Which order it is, and its numbers; raises ``BadOrders`` for what is none."""
     for words, pattern in _PATTERNS.items():
         if found := pattern.fullmatch(order):
             return words, [int(number) for number in found.groups()]
@@ -236,8 +128,8 @@ def _listed(text: str) -> list[str]:
             raise BadOrders(f"{text[:80]!r} is not what was asked for") from None
         if not isinstance(orders, list) or not all(isinstance(order, str) for order in orders):
             raise BadOrders(f"{text[:80]!r} is not what was asked for")
-        return orders[:_MOST_ORDERS]
-    return [] if stripped == NOTHING else stripped.split(_SEPARATOR)[:_MOST_ORDERS]
+        return orders[:MOST_ORDERS]
+    return [] if stripped == NOTHING else stripped.split(SEPARATOR)[:MOST_ORDERS]
 
 
 @lru_cache(maxsize=256)

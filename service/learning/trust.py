@@ -29,11 +29,12 @@ are never flown, nothing corrects it. That is the price of not exploring; a draw
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp
 from typing import Any
+
+from shared.bounded import BoundedDict
 
 # Of the weight, a decision: an adviser that turns good after it was given up is back in some ten decisions.
 _SHARE = 0.01
@@ -82,8 +83,7 @@ class Trust:
     """
 
     def __init__(self, prior: Mapping[str, float], most_open: int = 64) -> None:
-        self._open: OrderedDict[str, Advice] = OrderedDict()
-        self._most_open = most_open
+        self._open = BoundedDict[str, Advice](most_open)
         total = sum(prior.values())
         self._prior = {name: weight / total for name, weight in prior.items()}
         self._weights = dict(self._prior)
@@ -103,12 +103,10 @@ class Trust:
     def note(self, decision_id: str, advice: Advice) -> None:
         """Remember the advice until the decision's outcome is known."""
         self._open[decision_id] = advice
-        while len(self._open) > self._most_open:
-            self._open.popitem(last=False)
 
     def settle(self, decision_id: str, cost: float) -> None:
         """Learn from a decision's realised cost, if its advice is remembered."""
-        advice = self._open.pop(decision_id, None)
+        advice = self._open.take(decision_id)
         if advice is not None:
             self.update(advice.regret, advice.flown, self._excess(cost, advice.expected_cost))
 
@@ -155,4 +153,6 @@ class Trust:
         if state["weights"].keys() != self._prior.keys():
             return
         self._weights, self._surprise, self.updates = state["weights"], state["surprise"], state["updates"]
-        self._open = OrderedDict((name, Advice(**advice)) for name, advice in state["open"])
+        self._open.clear()
+        for name, advice in state["open"]:
+            self._open[name] = Advice(**advice)

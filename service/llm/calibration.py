@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 
 from service.llm.answer_format import NoDecision, check_labels
 from service.llm.completion import Completion
 from service.llm.server_pool import ServerPool
+from shared.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class LabelReader:
 
     def __init__(self, llm: ServerPool) -> None:
         self._llm = llm
-        self._bias: OrderedDict[_Question, list[dict[str, float]]] = OrderedDict()
+        self._bias = BoundedDict[_Question, list[dict[str, float]]](_KEPT)
         self._attempts: dict[_Question, int] = {}
         self._task: asyncio.Task[None] | None = None
 
@@ -133,8 +133,6 @@ class LabelReader:
             {label: sum(answer[at][label] for answer in told) / len(told) for label in labels}
             for at, labels in enumerate(lists)
         ]
-        while len(self._bias) > _KEPT:
-            self._bias.popitem(last=False)
         if len(self._attempts) > 16 * _KEPT:
             self._attempts.clear()
 

@@ -2,45 +2,38 @@
 
 from __future__ import annotations
 
-import math
+from shared.bounded import BoundedDict
 
 
 class AppliedOutcomes:
-    """The newest outcomes by decision, a hundred bytes each: an edge remembers hundreds of each of its missions.
+    """The newest outcomes by decision: its cost, and whether the transmission failed.
 
     Args:
         most: how many are remembered.
     """
 
     def __init__(self, most: int) -> None:
-        self._most = most
-        # The oldest first. The cost of a transmission that failed has the sign, 0 too.
-        self._costs: dict[bytes, float] = {}
+        # By the ID's bytes, half as large as its text: an edge remembers hundreds of each of its missions.
+        self._outcomes = BoundedDict[bytes, tuple[float, bool]](most)
 
     def __contains__(self, decision_id: str) -> bool:
-        return bytes.fromhex(decision_id) in self._costs
+        return bytes.fromhex(decision_id) in self._outcomes
 
     def __getitem__(self, decision_id: str) -> tuple[float, bool]:
         """Its cost, and whether the transmission failed."""
-        signed = self._costs[bytes.fromhex(decision_id)]
-        return abs(signed), math.copysign(1.0, signed) < 0
+        return self._outcomes[bytes.fromhex(decision_id)]
 
     def add(self, decision_id: str, cost: float, failed: bool) -> None:
         """Remember one; the oldest of too many is forgotten."""
-        self._costs[bytes.fromhex(decision_id)] = math.copysign(cost, -1.0 if failed else 1.0)
-        while len(self._costs) > self._most:
-            del self._costs[next(iter(self._costs))]
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._costs.clear()
+        # Of a cost of -0.0, the 0.
+        self._outcomes[bytes.fromhex(decision_id)] = abs(cost), failed
 
     def state_dict(self) -> list[tuple[str, float, bool]]:
         """By decision, cost and whether it failed, the oldest first."""
-        return [(key.hex(), *self[key.hex()]) for key in self._costs]
+        return [(key.hex(), *outcome) for key, outcome in self._outcomes.items()]
 
     def load_state_dict(self, state: list[tuple[str, float, bool]]) -> None:
         """As it was when the state was taken."""
-        self.clear()
+        self._outcomes.clear()
         for told in state:
             self.add(*told)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
 from service.errors import Refused, Unavailable
+from shared.bounded import BoundedDict
 
 # Quotes within a text are escaped, so no text has this.
 _A_DECISION = '"decision_id":'
@@ -37,9 +37,7 @@ class IdempotentAnswers:
     """
 
     def __init__(self, most: int) -> None:
-        self._most = most
-        self._decisions = 0
-        self._answers: OrderedDict[str, Answered] = OrderedDict()
+        self._answers = BoundedDict[str, Answered](most, lambda answered: answered.decisions)
         self._underway: dict[str, tuple[str, asyncio.Future[str]]] = {}
 
     async def once(
@@ -88,10 +86,6 @@ class IdempotentAnswers:
     def remember(self, answered: Answered) -> None:
         """Keep an answer; the oldest of too many is forgotten."""
         self._answers[answered.key] = answered
-        self._decisions += answered.decisions
-        while self._decisions > self._most and len(self._answers) > 1:
-            _, oldest = self._answers.popitem(last=False)
-            self._decisions -= oldest.decisions
 
     def state_dict(self) -> list[Any]:
         """The answers, oldest first."""
@@ -99,6 +93,6 @@ class IdempotentAnswers:
 
     def load_state_dict(self, state: list[Any]) -> None:
         """As they were when the state was taken."""
-        self._answers, self._decisions = OrderedDict(), 0
+        self._answers.clear()
         for told in state:
             self.remember(Answered(*told))

@@ -24,10 +24,10 @@ from service.mission.events import AdviserReport, Decided, Event, Guided, Pendin
 from service.mission.idempotency import IdempotentAnswers
 from service.mission.planner import Planner, can_plan
 from service.mission.reservations import STEPS_APART, Reservation, Reservations
-from service.mission.resolved_spec import in_full, required
-from service.prompting.candidates import GuidedTemplate
+from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.demonstrations import solved
 from service.prompting.experiences import NEAREST, Experience, Experiences
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Template, note_block
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
@@ -62,23 +62,23 @@ class Mission:
     """
 
     def __init__(
-        self, mission_id: str, asked_for: MissionSpec, settings: Settings, spec: MissionSpec | None = None
+        self, mission_id: str, asked_for: MissionSpec, settings: Settings, spec: ResolvedSpec | None = None
     ) -> None:
         self.mission_id = mission_id
         self.asked_for = asked_for
-        flown, spec = spec is not None, spec or in_full(asked_for, settings)
+        flown, spec = spec is not None, spec or ResolvedSpec.of(asked_for, settings)
         self.spec = spec
         try:
             named = spec.scenario
             self.scenario: Scenario = scenario_named(named) if isinstance(named, str) else named
         except ValueError as error:
             raise Refused("scenario", str(error)) from None
-        self.mode: Mode = required(spec.mode)
-        self.features: Features = required(spec.features)
-        self.decides_from: Belief = required(spec.belief)
-        self.top_k = required(spec.top_k)
-        self._experience_limit = required(spec.prompt.experiences)
-        self._selection: Selection = required(spec.prompt.selection)
+        self.mode: Mode = spec.mode
+        self.features: Features = spec.features
+        self.decides_from: Belief = spec.belief
+        self.top_k = spec.top_k
+        self._experience_limit = spec.prompt.experiences
+        self._selection: Selection = spec.prompt.selection
         # Mode `value` has nothing else to decide by.
         self.attends = spec.attention == "on" or self.mode == "value"
         weights = initial_weights(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
@@ -394,7 +394,7 @@ class Mission:
             features=self.features,
             belief=self.decides_from,
             planner="off" if self.planner is None else "on",
-            verify=required(self.spec.verify),
+            verify=self.spec.verify,
             prompt=self.spec.prompt,
             init=self.spec.init,
             seed=self.spec.seed,

@@ -2,39 +2,50 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Literal, Self
+
+from pydantic import Field
 
 from service.config.settings import Settings
-from shared.wire import MissionSpec
-
-T = TypeVar("T")
+from shared.wire import Belief, Features, MissionSpec, Mode, PromptStyle, Selection
 
 
-def in_full(spec: MissionSpec, settings: Settings) -> MissionSpec:
-    """A spec with the service's settings, and what follows from its mode, where it says nothing."""
-    mode = spec.mode or settings.mode
-    # The paper's method as it is written, unless asked otherwise.
-    written = mode == "llm"
-    told = spec.prompt.experiences
-    prompt = {
-        "experiences": settings.experiences if told is None else told,
-        "selection": spec.prompt.selection or settings.selection,
-    }
-    return spec.model_copy(
-        update={
+class ResolvedPromptStyle(PromptStyle):
+    """A prompt's style in which nothing is left open."""
+
+    experiences: int = Field(ge=0)
+    selection: Selection
+
+
+class ResolvedSpec(MissionSpec):
+    """A spec in which nothing is left open. The store keeps it, so its fields are a file format."""
+
+    mode: Mode
+    top_k: int = Field(ge=1)
+    features: Features
+    belief: Belief
+    planner: Literal["on", "off"]
+    verify: Literal["on", "off"]
+    prompt: ResolvedPromptStyle
+
+    @classmethod
+    def of(cls, spec: MissionSpec, settings: Settings) -> Self:
+        """A spec with the service's settings, and what follows from its mode, where it says nothing."""
+        mode = spec.mode or settings.mode
+        # The paper's method as it is written, unless asked otherwise.
+        written = mode == "llm"
+        told = spec.prompt.experiences
+        prompt = {
+            "experiences": settings.experiences if told is None else told,
+            "selection": spec.prompt.selection or settings.selection,
+        }
+        settled = {
             "mode": mode,
             "features": spec.features or ("paper" if written else "reach"),
             "belief": spec.belief or ("reported" if written else "fleet"),
             "top_k": spec.top_k or settings.top_k,
             "planner": spec.planner or settings.planner,
             "verify": spec.verify or settings.verify,
-            "prompt": spec.prompt.model_copy(update=prompt),
+            "prompt": ResolvedPromptStyle.model_validate(dict(spec.prompt) | prompt),
         }
-    )
-
-
-def required(value: T | None) -> T:
-    """A field that a spec in full has; raises ``TypeError`` for one that has not."""
-    if value is None:
-        raise TypeError("this spec is not in full")
-    return value
+        return cls.model_validate(dict(spec) | settled)

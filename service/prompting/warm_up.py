@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.config.settings import Settings
 from service.llm.request_bodies import WarmUp
-from service.prompting.candidates import GuidedTemplate
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Template
 from shared.scenario import SCENARIOS
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.mission.events import Event
+from service.mission.resolved_spec import ResolvedSpec
 from shared.wire import MissionSpec
 
 
@@ -14,7 +15,7 @@ class Made:
 
     mission_id: str
     asked_for: MissionSpec
-    spec: MissionSpec
+    spec: ResolvedSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.mission.events import Event
+from service.mission.resolved_spec import ResolvedSpec
 from service.storage.event_codec import decode
 from service.storage.locks import AdvisoryLock, FileLock, StoreUnusable
 from service.storage.process_writer import ProcessWriter
@@ -34,7 +35,7 @@ class StoredMission:
     """A mission as the store has it: its last checkpoint, and the events since; ``seq`` is the newest's."""
 
     asked_for: MissionSpec
-    spec: MissionSpec
+    spec: ResolvedSpec
     seq: int
     state: dict[str, Any] | None
     events: list[Event]
@@ -96,7 +97,7 @@ class Store:
             raise ValueError(f"mission {mission_id}: events are missing after {since}")
         return StoredMission(
             asked_for=MissionSpec.model_validate_json(found.asked_for),
-            spec=MissionSpec.model_validate_json(found.spec),
+            spec=ResolvedSpec.model_validate_json(found.spec),
             seq=since + len(rows),
             state=None if last is None else unpack(last.state),
             events=[decode(row.kind, row.body) for row in rows],

@@ -10,6 +10,7 @@ import numpy as np
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
+from service.deciding.look_ahead import look_ahead
 from service.mission.mission import Mission
 from service.prompting.demonstrations import Demonstration
 from shared.actions import Action

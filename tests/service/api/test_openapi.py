@@ -10,7 +10,7 @@ import jsonschema_rs
 import pytest
 
 from service.api.app import create_app
-from service.api.openapi import ANSWERS, DECISION_ID, REQUESTS
+from service.api.openapi_examples import ANSWERS, DECISION_ID, REQUESTS
 from service.config.settings import Settings
 from tests.e2e.processes import serving_edge
 

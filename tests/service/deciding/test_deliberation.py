@@ -21,7 +21,8 @@ from service.llm.answer_format import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
 from service.mission.mission import Mission
-from service.prompting.candidates import GuidedTemplate, velocities
+from service.prompting.candidates import velocities
+from service.prompting.guided_prompt import GuidedTemplate
 from shared.actions import Action
 from shared.reach import Reach
 from shared.trajectory import trajectories
@@ -67,10 +68,10 @@ def test_every_row_has_four_letters_whose_velocities_rise() -> None:
         assert [v for _, v in pairs] == sorted(v for _, v in pairs)
 
 
-@pytest.mark.parametrize(("rows", "paces"), [(1, 4), (5, 4), (6, 3), (10, 2), (20, 1), (100, 1)])
-def test_twenty_letters_do_for_any_k(rows: int, paces: int) -> None:
+@pytest.mark.parametrize(("rows", "velocities_a_row"), [(1, 4), (5, 4), (6, 3), (10, 2), (20, 1), (100, 1)])
+def test_twenty_letters_do_for_any_k(rows: int, velocities_a_row: int) -> None:
     template = GuidedTemplate(PAPER, rows=rows, experiences=0, ranked=True)
-    assert template.paces == paces
+    assert template.letters.velocities == velocities_a_row
     assert len(template.labels) <= 20
 
 

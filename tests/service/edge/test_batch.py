@@ -18,7 +18,7 @@ from service.deciding.deadline import Deadline
 from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.llm.answer_format import constrain_labels
 from service.mission.mission import Mission
-from service.prompting.candidates import GuidedTemplate
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
 from service.prompting.unpruned_baseline import Uncompressed

@@ -12,7 +12,7 @@ import httpx
 
 from service.config.settings import Settings
 from service.edge.engine import Engine
-from service.edge.feedback import Outcomes
+from service.edge.feedback import Feedback
 from service.live.broadcaster import Broadcaster
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -66,7 +66,7 @@ def test_as_many_lessons_are_learned_as_outcomes_come() -> None:
     turns = 30
 
     async def flown() -> list[int]:
-        outcomes = Outcomes(Metrics(), NullJournal(), Broadcaster())
+        outcomes = Feedback(Metrics(), NullJournal(), Broadcaster())
         fleets = [Mission(f"fleet{n}", MissionSpec(mode="value"), Settings(mode="value")) for n in range(40)]
         for turn in range(turns):
             for mission in fleets:

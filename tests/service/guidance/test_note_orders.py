@@ -6,8 +6,9 @@ from contextlib import suppress
 
 import pytest
 
-from service.guidance.note_orders import BadOrders, admissible, constrain_orders, numbers_in, read, shown
+from service.guidance.note_orders import BadOrders, numbers_in, read, shown
 from service.guidance.order_examples import EXAMPLES
+from service.guidance.order_grammar import admissible, constrain_orders
 from shared.guidance import Guidance, SensorWish
 
 NOTE = "Suspected leak at sensor 4: visit it every third step, not over 9 m/s."

@@ -15,13 +15,14 @@ from service.config.settings import Settings
 from service.deciding.deliberation import Deliberation
 from service.deciding.look_ahead import look_ahead
 from service.deciding.rollout_evaluator import RolloutState, judge
-from service.guidance.note_orders import INSTRUCTION, constrain_orders
+from service.guidance.note_orders import INSTRUCTION
+from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
 from service.llm.completion import Completion
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import LlmServer
 from service.mission.mission import Mission
-from service.prompting.candidates import GuidedTemplate
+from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Template
 from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish

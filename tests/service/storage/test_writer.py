@@ -14,6 +14,8 @@ import httpx
 import psutil
 import pytest
 
+from service.config.settings import Settings
+from service.mission.resolved_spec import ResolvedSpec
 from service.storage.locks import StoreUnusable
 from service.storage.operations import Change, Checkpoint, Deleted, Made
 from service.storage.store import Store
@@ -23,6 +25,11 @@ from tests.e2e.processes import serving_edge
 from tests.service.keeping import fly, running, writers, written
 
 Report = Callable[..., dict[str, Any]]
+
+
+def made(mission_id: str) -> Made:
+    spec = MissionSpec()
+    return Made(mission_id, spec, ResolvedSpec.of(spec, Settings()))
 
 
 def _ended(process: psutil.Process, within_s: float = 20.0) -> bool:
@@ -106,7 +113,7 @@ async def test_a_writer_that_cannot_be_started_is_tried_again(tmp_path: Path, mo
     with pytest.raises(FileNotFoundError):
         await written(writer, [Deleted("nobody")])
     monkeypatch.undo()
-    await written(writer, [Made("test", MissionSpec(), MissionSpec())])
+    await written(writer, [made("test")])
     assert store.missions() == ["test"]
     writer.close()
     store.close()
@@ -124,7 +131,7 @@ async def test_a_writer_that_ends_again_and_again_is_told_with_what_it_said(
         with pytest.raises(WriteFailed, match="this disk is on fire"):
             await written(writer, [Deleted("nobody")])
     monkeypatch.undo()
-    await written(writer, [Made("test", MissionSpec(), MissionSpec())])
+    await written(writer, [made("test")])
     assert store.missions() == ["test"]
     writer.close()
     store.close()
@@ -134,11 +141,11 @@ async def test_what_is_larger_than_the_socket_takes_at_once_arrives_whole(tmp_pa
     store = Store(str(tmp_path / "m.db"))
     writer = store.writer()
     states, kept = [os.urandom(5_000_000), os.urandom(9)], "SELECT seq, state FROM checkpoints"
-    changes: list[Change] = [Made("test", MissionSpec(), MissionSpec()), Checkpoint("test", 7, states[0])]
+    changes: list[Change] = [made("test"), Checkpoint("test", 7, states[0])]
     await written(writer, changes)
     with store._engine.connect() as db:
         assert db.exec_driver_sql(kept).all() == [(7, states[0])]
-    await written(writer, [Checkpoint("test", 8, states[1]), Made("other", MissionSpec(), MissionSpec())])
+    await written(writer, [Checkpoint("test", 8, states[1]), made("other")])
     assert sorted(store.missions()) == ["other", "test"]
     with store._engine.connect() as db:
         assert db.exec_driver_sql(kept).all() == [(8, states[1])]
@@ -152,11 +159,11 @@ async def test_a_transaction_is_written_whole_or_not_at_all_and_the_next_one_is(
     with store._engine.begin() as db:
         db.exec_driver_sql("CREATE TRIGGER t BEFORE INSERT ON checkpoints BEGIN SELECT RAISE(ABORT, 'not today'); END")
     with pytest.raises(WriteFailed, match="not today"):
-        await written(writer, [Made("test", MissionSpec(), MissionSpec()), Checkpoint("test", 1, b"")])
+        await written(writer, [made("test"), Checkpoint("test", 1, b"")])
     assert store.missions() == []
-    await written(writer, [Made("test", MissionSpec(), MissionSpec())])
+    await written(writer, [made("test")])
     # Nor does it matter that it was written already.
-    await written(writer, [Made("test", MissionSpec(), MissionSpec())])
+    await written(writer, [made("test")])
     assert store.missions() == ["test"]
     await asyncio.sleep(0)
     writer.close()

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import httpx
 import pytest
 
-from service.guidance.note_orders import admissible
 from service.guidance.order_examples import EXAMPLES
+from service.guidance.order_grammar import admissible
 from shared.guidance import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire import MissionSpec
 from simulator.client import EdgeClient
