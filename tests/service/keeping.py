@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import shutil
 import sqlite3
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +22,7 @@ from service.settings import Settings
 from service.store import Store
 from service.writers import Writer
 from tests.running import serving
+from tests.waiting import PATIENCE_S, until
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
@@ -30,8 +30,8 @@ Report = Callable[..., Body]
 
 @contextmanager
 def running(path: Path | str, **settings: Any) -> Iterator[tuple[httpx.Client, Engine]]:
-    app = create_app(Settings(**{"mode": "value", **settings}), Store(str(path)))
-    with serving(app) as url, httpx.Client(base_url=url, timeout=30) as client:
+    app = create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), Store(str(path)))
+    with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         yield client, app.state.engine
 
 
@@ -75,9 +75,7 @@ def copy_of(path: Path, to: Path) -> Path:
 
 
 def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
-    ends = time.monotonic() + 10
-    while mission.learner.updates < updates and time.monotonic() < ends:
-        time.sleep(0.01)
+    until(lambda: mission.learner.updates >= updates, lambda: mission.learner.updates)
     assert mission.learner.updates == updates
     return mission
 
@@ -92,7 +90,7 @@ async def written(writer: Writer, changes: Sequence[Change]) -> None:
     """Write, wait until that has ended, and raise what it failed by."""
     ended = asyncio.get_running_loop().create_future()
     writer.write(changes, ended.set_result)
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(PATIENCE_S):
         if (error := await ended) is not None:
             raise error
 
