@@ -47,7 +47,9 @@ def edge(tmp_path: Path) -> Iterator[Edge]:
 
         def start(**settings: Any) -> httpx.Client:
             store = Store(str(tmp_path / f"missions-{next(count)}.db"))
-            url = stack.enter_context(serving(create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), store)))
+            url = stack.enter_context(
+                serving(create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), store))
+            )
             return stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S))
 
         yield start

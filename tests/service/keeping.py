@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 import sqlite3
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ import psutil
 from service.app import create_app
 from service.changes import Change
 from service.engine import Engine
+from service.journal import Journal
 from service.mission import Mission
 from service.settings import Settings
 from service.store import Store
@@ -78,6 +80,28 @@ def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
     until(lambda: mission.learner.updates >= updates, lambda: mission.learner.updates)
     assert mission.learner.updates == updates
     return mission
+
+
+def on_disk(engine: Engine) -> None:
+    """Wait until all that happened so far is."""
+    keeper = engine.keeper
+    assert isinstance(keeper, Journal)
+    until(lambda: keeper._written >= keeper._added)
+
+
+def kept(client: httpx.Client, body: Body) -> Body:
+    """The decision of a report, which is sent again, as the same request, until that is on disk."""
+    key = {"Idempotency-Key": uuid.uuid4().hex}
+    answers: list[Body] = []
+
+    def stored() -> bool:
+        answer = client.post("/decide", json=body, headers=key)
+        assert answer.status_code == 200, answer.text
+        answers.append(answer.json())
+        return bool(answers[-1]["stored"])
+
+    until(stored)
+    return answers[-1]
 
 
 def writers(pid: int) -> list[psutil.Process]:

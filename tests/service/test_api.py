@@ -3,13 +3,14 @@
 import gzip
 import json
 import socket
-import time
 from collections.abc import Callable
 from typing import Any
 
 import httpx
 import pytest
 import zstandard
+
+from tests.waiting import until
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
