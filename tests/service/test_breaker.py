@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import httpx
@@ -123,6 +124,11 @@ def test_a_fleet_that_shares_a_deadline_opens_it_too(
         assert client.get("/readyz").json()["llm"] == "unavailable"
 
 
+def all_came(queue: Gate, many: int, asked: list[Future[httpx.Response]]) -> bool:
+    """Whether so many stand in the queue, or nobody does any more."""
+    return queue.came == many or all(one.done() for one in asked)
+
+
 def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
     """One slot, and more UAVs than it serves within the deadline: the last of every step are late, the LLM is well."""
     clock = Striding(0.0)
@@ -147,7 +153,7 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
             before = queue.came
             hasty = [report(step=step, uav_id=i, deadline_ms=500) for i in range(1, 10)]
             late = [pool.submit(client.post, "/decide", json=body) for body in hasty]
-            until(lambda: queue.came == before + 9 or all(asked.done() for asked in late))
+            until(partial(all_came, queue, before + 9, late))
             # Longer than a deadline: who is still in the queue has been waiting for that long.
             clock.now_s += 100.0
             slot.open()

@@ -2,6 +2,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -15,6 +16,8 @@ from service.learner import Learner, Modules
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
+
+Scores = tuple[float, ...]
 
 PRESETS: list[Features] = ["paper", "reach"]
 
@@ -148,13 +151,14 @@ def test_what_other_modules_learned_is_refused() -> None:
             learner.load_state_dict(Learner(other.weights(), learning_rate=5e-4).state_dict())
 
 
-def at_every_line(lesson: Callable[[], object], look: Callable[[], object]) -> None:
-    """Look before each line of the service that a lesson runs, as another thread may."""
+def at_every_line(lesson: Callable[[], object], look: Callable[[], Scores]) -> list[Scores]:
+    """What is seen before each line of the service that a lesson runs, as another thread may look."""
+    seen: list[Scores] = []
 
     def trace(frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
         if "/service/" not in frame.f_code.co_filename or frame.f_code.co_name.startswith("<"):
             return None
-        look()
+        seen.append(look())
         return trace
 
     before = sys.gettrace()
@@ -163,19 +167,19 @@ def at_every_line(lesson: Callable[[], object], look: Callable[[], object]) -> N
         lesson()
     finally:
         sys.settrace(before)
+    return seen
 
 
 def test_a_decision_never_sees_half_a_step() -> None:
     features = sample("reach", 99).features
     learner = Learner(Modules("reach", 15, seed=1).weights(), learning_rate=0.1)
 
-    def scores() -> tuple[float, ...]:
+    def scores() -> Scores:
         return tuple(learner.score(features)[0].tolist())
 
     for seed in range(3):
-        seen: list[tuple[float, ...]] = []
         in_hand, before = learner._weights, scores()
-        at_every_line(lambda seed=seed: learner.update(sample("reach", seed), cost=0.3), lambda: seen.append(scores()))
+        seen = at_every_line(partial(learner.update, sample("reach", seed), cost=0.3), scores)
         after = scores()
         assert before != after
         assert len(seen) > 10 and {before, after} == {*seen, after}

@@ -43,7 +43,8 @@ LLM = Literal["loading", "ready", "unavailable", "off"]
 class EdgeStub:
     """``script`` is how the next requests to /decide are met, one entry each; then ``otherwise``.
 
-    Who is met with ``slow`` waits at the ``gate``. ``decides``, ``feedbacks`` and ``missions`` are what arrived and was understood.
+    Who is met with ``slow`` waits at the ``gate``. ``decides``, ``feedbacks`` and ``missions`` are what arrived and was
+    understood.
     """
 
     url: str = ""
