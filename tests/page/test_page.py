@@ -225,7 +225,7 @@ def test_the_page_asks_for_a_key_where_the_edge_does(visit: Open, start: Start, 
     key = run("keys", "add", "fleet", "--file", keys, "--scopes", "decide", "admin").stdout.strip()
     reader = run("keys", "add", "reader", "--file", keys, "--scopes", "decide").stdout.strip()
     url, _ = start(AICVDS_MODE="value", AICVDS_KEYS=keys)
-    httpx.post(f"{url}/decide", json=report(), timeout=60, headers={"Authorization": f"Bearer {key}"})
+    httpx.post(f"{url}/decide", json=report(), timeout=PATIENCE_S, headers={"Authorization": f"Bearer {key}"})
     page = visit(url, expected=REFUSED)
     asked = page.get_by_role("dialog", name="This edge asks for a key")
     expect(asked).to_be_visible()
