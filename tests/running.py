@@ -12,6 +12,7 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from service.server.connection_limits import BoundedHttpProtocol
+from tests.waiting import PATIENCE_S
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
@@ -32,7 +33,7 @@ def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
         yield f"http://127.0.0.1:{port}"
     finally:
         server.should_exit = True
-        thread.join(timeout=30)
+        thread.join(PATIENCE_S)
 
 
 @contextmanager
@@ -66,10 +67,10 @@ def listening(handler: Handler) -> Iterator[str]:
     stop = asyncio.Event()
     thread = threading.Thread(target=lambda: loop.run_until_complete(until_stopped()), daemon=True)
     thread.start()
-    started.wait(timeout=10)
+    assert started.wait(PATIENCE_S)
     try:
         yield address[0]
     finally:
         loop.call_soon_threadsafe(stop.set)
-        thread.join(timeout=10)
+        thread.join(PATIENCE_S)
         loop.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import threading
 import time
@@ -34,6 +33,7 @@ from shared.wire import (
     Tokens,
 )
 from tests.running import serving
+from tests.waiting import PATIENCE_S, Gate
 
 Behaviour = Literal["ok", "busy", "busy_retry_after", "garbage", "invalid", "crash", "html", "slow", "forgot", "wrong"]
 LLM = Literal["loading", "ready", "unavailable", "off"]
@@ -43,7 +43,8 @@ LLM = Literal["loading", "ready", "unavailable", "off"]
 class EdgeStub:
     """``script`` is how the next requests to /decide are met, one entry each; then ``otherwise``.
 
-    ``decides``, ``feedbacks`` and ``missions`` are what arrived and was understood.
+    Who is met with ``slow`` waits at the ``gate``. ``decides``, ``feedbacks`` and ``missions`` are what arrived and was
+    understood.
     """
 
     url: str = ""
@@ -51,7 +52,7 @@ class EdgeStub:
     otherwise: Behaviour = "ok"
     readiness: list[tuple[bool, LLM]] = field(default_factory=lambda: [(True, "ready")])
     model: str = "stub-1"
-    slow_s: float = 0.3
+    gate: Gate = field(default_factory=Gate)
     asked: int = 0
     polled: int = 0
     at_once: int = 0
@@ -71,7 +72,7 @@ class EdgeStub:
         if behaviour == "slow":
             self.at_once += 1
             self.most_at_once = max(self.most_at_once, self.at_once)
-            await asyncio.sleep(self.slow_s)
+            await self.gate.passed()
             self.at_once -= 1
         refusal = _misbehave(behaviour, asked)
         return refusal or Response(self._answer(asked, behaviour).model_dump_json())
@@ -206,7 +207,7 @@ def _problem(
 def stub_edge() -> Iterator[EdgeStub]:
     """A stub on a port of its own."""
     stub = EdgeStub()
-    with serving(stub.app()) as url:
+    with serving(stub.app()) as url, stub.gate:
         stub.url = url
         yield stub
 
@@ -233,4 +234,4 @@ def stub_edge_at(port: int) -> Iterator[EdgeStub]:
         yield stub
     finally:
         server.should_exit = True
-        thread.join(timeout=30)
+        thread.join(PATIENCE_S)

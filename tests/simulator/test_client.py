@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -22,6 +24,7 @@ from simulator.uplink import LossyTransport
 from simulator.world import PipelineWorld
 from tests.running import listening
 from tests.simulator.edge_stub import EdgeStub, stub_edge
+from tests.waiting import PATIENCE_S, Clock, Gate, soon, until
 
 
 @pytest.fixture
@@ -58,21 +61,46 @@ class Awaited:
 Opened = Callable[..., EdgeClient]
 
 
+@pytest.fixture(autouse=True)
+def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The seconds that a client of either kind would have paused: none of them is waited for."""
+    told: list[float] = []
+
+    async def awaited(seconds: float) -> None:
+        told.append(seconds)
+        await asyncio.sleep(0)
+
+    monkeypatch.setattr("simulator.client.time", SimpleNamespace(sleep=told.append))
+    monkeypatch.setattr("simulator.client.asyncio", SimpleNamespace(sleep=awaited))
+    return told
+
+
 @pytest.fixture(params=[EdgeClient, Awaited])
 def client(request: pytest.FixtureRequest) -> Opened:
-    def opened(url: str, timeout_s: float = 5.0, attempts: int = 3, api_key: str | None = None) -> EdgeClient:
+    def opened(url: str, timeout_s: float = PATIENCE_S, attempts: int = 3, api_key: str | None = None) -> EdgeClient:
         made: EdgeClient = request.param(url, timeout_s=timeout_s, attempts=attempts, api_key=api_key)
         return made
 
     return opened
 
 
-def test_an_exchange_is_measured(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
+def test_an_exchange_is_measured(
+    stub: EdgeStub, request_: DecideRequest, client: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    monkeypatch.setattr("simulator.calls.time", clock)
     stub.script = ["slow"]
-    with client(stub.url, api_key="k3y") as edge:
+
+    def take_an_hour() -> None:
+        until(lambda: stub.gate.came)
+        clock.ahead_s = 3600.0
+        stub.gate.open()
+
+    with client(stub.url, api_key="k3y") as edge, ThreadPoolExecutor(1) as beside:
+        beside.submit(take_an_hour)
         exchange = edge.decide(request_)
     assert exchange.response.step == 0 and exchange.response.uav_id == 1
-    assert exchange.rtt_ms >= 1000 * stub.slow_s
+    assert exchange.rtt_ms >= 3_600_000
     assert exchange.attempts == 1
     assert exchange.request_bytes == len(request_.model_dump_json())
     assert exchange.response_bytes > 100
@@ -92,10 +120,11 @@ def test_a_busy_edge_is_asked_again(stub: EdgeStub, request_: DecideRequest, cli
         assert edge.decide(request_).attempts == 3
 
 
-def test_retry_after_is_honoured(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
+def test_retry_after_is_honoured(stub: EdgeStub, request_: DecideRequest, client: Opened, pauses: list[float]) -> None:
     stub.script = ["busy_retry_after"]
     with client(stub.url) as edge:
-        assert edge.decide(request_).rtt_ms >= 200
+        assert edge.decide(request_).attempts == 2
+    assert len(pauses) == 1 and pauses[0] >= 0.2
 
 
 def test_retries_are_bounded_and_the_error_says_what_happened(
@@ -149,7 +178,7 @@ async def _reset(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 
 async def _silence(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     await reader.readuntil(b"\r\n\r\n")
-    await asyncio.sleep(3)
+    await reader.read()
 
 
 async def _redirect(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -172,7 +201,7 @@ def test_a_reset_edge_is_unreachable(request_: DecideRequest, client: Opened) ->
 
 def test_a_silent_edge_is_unreachable(request_: DecideRequest, client: Opened) -> None:
     again = pytest.raises(EdgeUnreachable, match="tried 2 times: ReadTimeout")
-    with listening(_silence) as url, client(url, timeout_s=0.2, attempts=2) as edge, again:
+    with listening(_silence) as url, client(url, timeout_s=0.5, attempts=2) as edge, again:
         edge.decide(request_)
 
 
@@ -187,7 +216,7 @@ def test_waiting_for_the_llm(stub: EdgeStub, client: Opened) -> None:
     stub.readiness = [(False, "loading"), (True, "loading"), (True, "ready")]
     heard: list[str] = []
     with client(stub.url) as edge:
-        assert edge.wait_ready(30, on_wait=heard.append).llm == "ready"
+        assert edge.wait_ready(PATIENCE_S, on_wait=heard.append).llm == "ready"
     assert len(heard) == 2 and heard[1] == "the LLM is loading"
 
 
@@ -195,7 +224,7 @@ def test_an_edge_whose_llm_still_loads_can_be_flown(stub: EdgeStub, client: Open
     stub.readiness = [(True, "loading")]
     with client(stub.url) as edge:
         assert edge.wait_ready(0).llm == "loading"
-        assert edge.wait_ready(30, wait_out=()).llm == "loading"
+        assert edge.wait_ready(PATIENCE_S, wait_out=()).llm == "loading"
     assert stub.polled == 2
 
 
@@ -218,20 +247,34 @@ async def test_decisions_are_awaited_beside_each_other(stub: EdgeStub, request_:
     stub.otherwise = "slow"
     async with AsyncEdgeClient(stub.url) as edge:
         asked = [edge.decide(request_.model_copy(update={"uav_id": uav})) for uav in range(4)]
-        exchanges = await asyncio.gather(*asked)
+        together = asyncio.gather(*asked)
+        # Each is answered when all of them have come.
+        await soon(lambda: stub.gate.came == 4)
+        stub.gate.open()
+        exchanges = await together
     assert [exchange.response.uav_id for exchange in exchanges] == [0, 1, 2, 3]
     assert stub.most_at_once == 4
 
 
-async def test_a_cancelled_call_is_not_sent_again(stub: EdgeStub, request_: DecideRequest) -> None:
+async def test_a_cancelled_call_is_not_sent_again(
+    stub: EdgeStub, request_: DecideRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pause = Gate()
+
+    async def held(seconds: float) -> None:
+        await pause.passed()
+
+    monkeypatch.setattr("simulator.client.asyncio", SimpleNamespace(sleep=held))
     stub.otherwise = "busy"
     async with AsyncEdgeClient(stub.url, attempts=100) as edge:
-        with pytest.raises(TimeoutError):
-            async with asyncio.timeout(0.5):
-                await edge.decide(request_)
-        asked = stub.asked
-        await asyncio.sleep(0.5)
-    assert 0 < stub.asked == asked
+        call = asyncio.create_task(edge.decide(request_))
+        await soon(lambda: pause.came)
+        call.cancel()
+        await asyncio.gather(call, return_exceptions=True)
+        pause.open()
+        # Nobody is left who could.
+        assert call.cancelled() and asyncio.all_tasks() == {asyncio.current_task()}
+        assert stub.asked == 1
 
 
 def test_a_mission_and_feedback(stub: EdgeStub, client: Opened) -> None:
@@ -270,7 +313,7 @@ def test_a_lossy_uplink_loses_the_same_requests_again() -> None:
 
 def test_a_lossy_uplink_is_retried(stub: EdgeStub, request_: DecideRequest) -> None:
     transport = LossyTransport(httpx.HTTPTransport(), drop=0.5, jitter_ms=5, seed=0)
-    with EdgeClient(stub.url, timeout_s=5, attempts=12, transport=transport) as edge:
+    with EdgeClient(stub.url, timeout_s=PATIENCE_S, attempts=12, transport=transport) as edge:
         attempts = [edge.decide(request_).attempts for _ in range(6)]
     assert max(attempts) > 1
     assert stub.asked == 6

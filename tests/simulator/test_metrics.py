@@ -18,6 +18,7 @@ import pytest
 from simulator import simulate
 from simulator.record import Summary
 from tests.simulator.edge_stub import EdgeStub, free_port, stub_edge
+from tests.waiting import PATIENCE_S, until
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def stub() -> Iterator[EdgeStub]:
 def numbers(port: int) -> dict[str, float]:
     """The numbers at the port by series; none where nobody listens."""
     try:
-        text = httpx.get(f"http://127.0.0.1:{port}/metrics", timeout=10).text
+        text = httpx.get(f"http://127.0.0.1:{port}/metrics", timeout=PATIENCE_S).text
     except httpx.TransportError:
         return {}
     lines = (line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
@@ -90,11 +91,11 @@ def test_who_is_never_scraped_does_not_wait(stub: EdgeStub, tmp_path: Path) -> N
 
 @pytest.mark.usefixtures("for_ever")
 def test_an_interrupted_flight_waits_for_no_scrape(stub: EdgeStub, tmp_path: Path) -> None:
-    stub.otherwise, stub.slow_s, port = "slow", 0.1, free_port()
+    # The second step is never flown.
+    stub.script, stub.otherwise, port = ["ok"] * 3, "slow", free_port()
 
     def interrupt() -> None:
-        while not numbers(port).get("aicvds_flight_steps_flown"):
-            time.sleep(0.1)
+        until(lambda: stub.gate.came and numbers(port).get("aicvds_flight_steps_flown"))
         os.kill(os.getpid(), signal.SIGTERM)
 
     scraper = threading.Thread(target=interrupt, daemon=True)

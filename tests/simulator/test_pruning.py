@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from typing import Any, get_args
 
@@ -14,6 +13,7 @@ import pytest
 
 from service.api.attention_weights import attention_of
 from service.config.settings import Settings
+from service.edge.learning_queue import LearningQueue
 from service.learning.attention import top_k
 from service.mission.mission import Mission
 from shared.features import FEATURES
@@ -43,8 +43,12 @@ def test_the_same_features_have_the_same_scores(features: Features, n: int) -> N
 
 @pytest.mark.parametrize("belief", get_args(Belief))
 @pytest.mark.parametrize("features", get_args(Features))
-def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Features, belief: Belief) -> None:
+def test_a_lone_uav_keeps_what_the_edge_would_keep(
+    edge: Edge, features: Features, belief: Belief, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nobody else knows more: from full reports the edge ranks the sensors alike."""
+    # Learned from before the weights are fetched, so that these are what decides.
+    monkeypatch.setattr(LearningQueue, "add", LearningQueue._learn)
     alone = PAPER.model_copy(update={"uavs": 1, "steps": 10})
     world, reports = PipelineWorld(alone), PrunedReports()
     observations, _ = world.reset(seed=3)
@@ -55,9 +59,7 @@ def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Feature
         reports.take(0, 0, client.mission("m"), None)
         for step in range(alone.steps):
             if outcome is not None:
-                # Learned from before the weights are fetched, so that these are what decides.
                 client.feedback(FeedbackRequest(mission_id="m", **outcome.model_dump()))
-                taught(client)
             fetched = httpx.get(f"{client.base_url}/missions/m/attention").content
             reports.take(0, step, MissionAttention.model_validate_json(fetched), None)
             request = decide_request(0, observations["uav_0"], "m", outcome=outcome)
@@ -74,15 +76,6 @@ def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Feature
             observations, _, _, _, infos = world.step({"uav_0": np.array([answer.sensor_id, answer.velocity])})
             outcome = exchange.outcome(float(infos["uav_0"]["cost"]), bool(infos["uav_0"]["failed"]))
     assert compared >= 18
-
-
-def taught(client: EdgeClient) -> None:
-    """Wait for the lessons; a decision that the modules had no part in teaches none."""
-    before, ends = -1, time.monotonic() + 1
-    while (told := client.mission("m")).learner_updates < told.feedback and time.monotonic() < ends:
-        if told.learner_updates != before:
-            before, ends = told.learner_updates, time.monotonic() + 1
-        time.sleep(0.005)
 
 
 def test_weights_are_asked_for_now_and_then() -> None:

@@ -150,7 +150,7 @@ def test_whoever_flies_and_however_the_world_is_the_same(site: str) -> None:
             ("ok", LossyTransport(httpx.HTTPTransport(), drop=0.3, jitter_ms=1.0, seed=5)),
         ):
             stub.otherwise = behaviour  # type: ignore[assignment]
-            with EdgeClient(stub.url, timeout_s=5, attempts=1, seed=5, transport=transport) as client:
+            with EdgeClient(stub.url, timeout_s=60, attempts=1, seed=5, transport=transport) as client:
                 fly(watched, EdgePilot(client, "m", scenario, seed=5), seed=5)
     assert len({tuple(drawn(world)) for world in watched.made}) == 1
     assert len(watched.made) == len(POLICY_NAMES) + 4

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 from simulator import demo, simulate
 from simulator.record import DRAWN, Summary, read_decisions
 from tests.simulator.edge_stub import EdgeStub, stub_edge
+from tests.waiting import PATIENCE_S, until
 
 
 @pytest.fixture
@@ -29,18 +29,20 @@ def summary_in(out: Path) -> Summary:
 
 def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "run"
-    code = simulate.main(["--edge", stub.url, "--steps", "3", "--seed", "4", "--deadline-ms", "900", "--out", str(out)])
+    code = simulate.main(
+        ["--edge", stub.url, "--steps", "3", "--seed", "4", "--deadline-ms", "30000", "--out", str(out)]
+    )
     assert code == 0
     left = ["decisions.jsonl", "figures", "report.html", "requests.jsonl", "summary.json"]
     assert sorted(p.name for p in out.iterdir()) == left
     assert {str(p.relative_to(out)) for p in (out / "figures").iterdir()} == set(DRAWN)
     summary = summary_in(out)
-    assert (summary.seed, summary.steps, summary.decisions, summary.deadline_ms) == (4, 3, 9, 900)
+    assert (summary.seed, summary.steps, summary.decisions, summary.deadline_ms) == (4, 3, 9, 30_000)
     assert len(read_decisions(out / "decisions.jsonl")) == 9
     assert summary.command.startswith("aicvds simulate --edge http://127.0.0.1")
     assert set(stub.missions) == {summary.mission_id}
     assert stub.missions[summary.mission_id].seed == 4
-    assert {d.deadline_ms for d in stub.decides} == {900}
+    assert {d.deadline_ms for d in stub.decides} == {30_000}
     printed = capsys.readouterr().out
     assert "AIC-VDS (6 llm, 3 policy)" in printed
     assert "The LLM took 6 of 9 decisions" in printed and "llm_timeout 3" in printed
@@ -125,22 +127,21 @@ def test_an_edge_that_never_decides_is_code_1(
 
 
 def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
-    stub.otherwise, stub.slow_s = "slow", 0.1
+    # It is interrupted while the eighth decision is waited for: the second of the third step.
+    stub.script, stub.otherwise = ["ok"] * 7, "slow"
     arguments = ["simulate", "--edge", stub.url, "--out", str(tmp_path)]
     process = subprocess.Popen([sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.PIPE, text=True)
     try:
-        give_up = time.monotonic() + 60
-        while stub.asked < 8 and time.monotonic() < give_up:
-            time.sleep(0.05)
+        until(lambda: stub.gate.came)
         process.send_signal(signal.SIGTERM)
-        printed, _ = process.communicate(timeout=60)
+        printed, _ = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 130
     finally:
         process.kill()
         process.wait()
     summary = summary_in(tmp_path)
     assert f"interrupted after {summary.steps_flown} steps; writing what was flown" in printed
-    assert summary.interrupted and 2 <= summary.steps_flown < 30
+    assert summary.interrupted and summary.steps_flown == 2
     assert summary.decisions == 3 * summary.steps_flown == len(read_decisions(tmp_path / "decisions.jsonl"))
     assert f"interrupted after step {summary.steps_flown} of 30" in (tmp_path / "report.html").read_text("utf-8")
 
@@ -192,11 +193,9 @@ def test_the_demo_stops_its_edge_when_interrupted(tmp_path: Path) -> None:
     )
     log = tmp_path / "decisions.jsonl"
     try:
-        give_up = time.monotonic() + 90
-        while not (log.exists() and log.stat().st_size) and time.monotonic() < give_up:
-            time.sleep(0.02)
+        until(lambda: log.exists() and log.stat().st_size)
         process.send_signal(signal.SIGINT)
-        assert process.wait(90) == 130
+        assert process.wait(PATIENCE_S) == 130
     finally:
         process.kill()
         process.wait()

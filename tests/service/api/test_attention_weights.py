@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 from shared.missions import MissionAttention
 from tests.service.api.test_authentication import bearer, made
 from tests.service.keeping import running
+from tests.waiting import until
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
@@ -26,10 +26,7 @@ def learned(client: httpx.Client, report: Report) -> None:
     before = client.get("/missions/test").json()["learner_updates"]
     decision = client.post("/decide", json=report()).json()["decision_id"]
     client.post("/feedback", json={"mission_id": "test", "decision_id": decision, "cost": 0.5}).raise_for_status()
-    ends = time.monotonic() + 20
-    while client.get("/missions/test").json()["learner_updates"] == before:
-        assert time.monotonic() < ends
-        time.sleep(0.005)
+    until(lambda: client.get("/missions/test").json()["learner_updates"] > before)
 
 
 @pytest.mark.parametrize(("features", "numbers"), [("paper", 5), ("reach", 12)])

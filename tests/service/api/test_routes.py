@@ -3,13 +3,15 @@
 import gzip
 import json
 import socket
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import httpx
 import pytest
 import zstandard
+
+from tests.waiting import until
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
@@ -352,13 +354,15 @@ def test_the_modules_learn_from_feedback(edge: Edge, report: Report) -> None:
         answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
         outcome = {"decision_id": answer["decision_id"], "cost": 2.0}
         scores.append(answer["top_k"][0]["score"])
-    for _ in range(100):
-        status = client.get("/missions/test").json()
-        if status["learner_updates"] == 11:
-            break
+    until(lambda: client.get("/missions/test").json()["learner_updates"] == 11)
+    status = client.get("/missions/test").json()
     assert status["learner_updates"] == status["feedback"] == 11
     assert status["learner_loss"] > 0
     assert "aicvds_learner_loss 0.0" not in client.get("/metrics").text
+
+
+def updates_of(client: httpx.Client, mission: str) -> int:
+    return int(client.get(f"/missions/{mission}").json()["learner_updates"])
 
 
 def test_a_forged_cost_teaches_no_more_than_the_worst_that_can_be(edge: Edge, report: Report) -> None:
@@ -369,12 +373,8 @@ def test_a_forged_cost_teaches_no_more_than_the_worst_that_can_be(edge: Edge, re
         decision = client.post("/decide", json=report(mission_id=mission)).json()
         outcome = {"decision_id": decision["decision_id"], "cost": cost}
         client.post("/decide", json=report(mission_id=mission, step=1, outcome=outcome))
-        for _ in range(200):
-            status = client.get(f"/missions/{mission}").json()
-            if status["learner_updates"]:
-                break
-            time.sleep(0.02)
-        losses.append(status["learner_loss"])
+        until(partial(updates_of, client, mission))
+        losses.append(client.get(f"/missions/{mission}").json()["learner_loss"])
     assert losses[0] == pytest.approx(losses[1])
     assert "aicvds_costs_clipped_total 1.0" in client.get("/metrics").text
 

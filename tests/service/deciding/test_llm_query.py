@@ -12,6 +12,7 @@ from service.storage.journal import Journal
 from tests.running import listening
 from tests.service.keeping import running
 from tests.service.stub_llm import misbehaving, silent, wait_for
+from tests.waiting import PATIENCE_S
 
 Report = Callable[..., dict[str, Any]]
 
@@ -23,7 +24,7 @@ def test_closing_time_at_the_moment_of_a_deadline_fails_nobody(tmp_path: Path, r
         ThreadPoolExecutor(1) as pool,
     ):
         wait_for(client, "ready")
-        late = pool.submit(client.post, "/decide", json=report(deadline_ms=300))
+        late = pool.submit(client.post, "/decide", json=report(deadline_ms=100))
 
         async def every_turn_of_the_loop() -> None:
             while not late.done():
@@ -31,5 +32,5 @@ def test_closing_time_at_the_moment_of_a_deadline_fails_nobody(tmp_path: Path, r
                 await asyncio.sleep(0)
 
         assert isinstance(engine.journal, Journal)
-        asyncio.run_coroutine_threadsafe(every_turn_of_the_loop(), engine.journal._loop).result(timeout=30)
+        asyncio.run_coroutine_threadsafe(every_turn_of_the_loop(), engine.journal._loop).result(PATIENCE_S)
         assert (late.result().status_code, late.result().json()["reason"]) == (200, "llm_timeout")

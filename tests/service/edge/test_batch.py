@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -26,6 +25,7 @@ from shared.actions import Action
 from tests.running import serving
 from tests.service.making import PAPER, attended, mission, uav
 from tests.service.stub_llm import PROBE, StubLlm, said, wait_for
+from tests.waiting import Clock, Gate, until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -34,15 +34,15 @@ Edge = Callable[..., httpx.Client]
 class Chorus(StubLlm):
     """Answers the first letter of every list that it is asked about; ``deaf`` ones answer one letter, whatever.
 
-    About several lists it says nothing where the question contains ``hangs_on``, and refuses what contains ``refuses``;
-    ``delays_s`` are those of its first answers about several.
+    About several lists it says nothing where the question contains ``hangs_on``, as long as its ``gate`` is shut, and
+    refuses what contains ``refuses``.
     """
 
     def __init__(
-        self, *, deaf: bool = False, hangs_on: str = "\0", refuses: str = "\0", delays_s: Sequence[float] = ()
+        self, *, deaf: bool = False, hangs_on: str = "\0", refuses: str = "\0", gate: Gate | None = None
     ) -> None:
         super().__init__()
-        self.deaf, self.hangs_on, self.refuses, self.delays_s = deaf, hangs_on, refuses, list(delays_s)
+        self.deaf, self.hangs_on, self.refuses, self.gate = deaf, hangs_on, refuses, gate or Gate()
         self.prose = False
 
     async def respond(self, body: dict[str, Any], probed: bool) -> Response:
@@ -51,9 +51,7 @@ class Chorus(StubLlm):
         if several and self.refuses in asked:
             return JSONResponse({}, status_code=400)
         if several and self.hangs_on in asked:
-            await asyncio.sleep(5)
-        if several and "UAV" in asked and self.delays_s:
-            await asyncio.sleep(self.delays_s.pop(0))
+            await self.gate.passed()
         lists = body.get("grammar", "").removeprefix("root ::= ").split(r' "\n" ')
         if "7301" in lists[0]:
             return said(f"{PROBE} 0")
@@ -156,23 +154,28 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
     async def timed(
         self: LlmQueries, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
     ) -> dict[int, LlmAdvice]:
-        given_s.append(deadline.left())
+        given_s.append(deadline.at - time.perf_counter())
+        # All but the last moment of the LLM's time is over.
+        clock.ahead_s = max(0.0, given_s[-1] - 0.1)
         return await ask_for_fleet(self, mission, states, deadline)
 
+    clock = Clock()
+    monkeypatch.setattr("service.deciding.deadline.time", clock)
     monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
     chorus = Chorus(hangs_on="UAV")
-    with serving(chorus.app) as url:
+    with serving(chorus.app) as url, chorus.gate:
         client = edge(mode="guided", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         client.put("/missions/test", json={"scenario": {**PAPER.model_dump(), "uavs": 8}, "planner": "off"})
         for step in range(2):
-            response = client.post("/decide/batch", json=fleet(report, 8, step, deadline_ms=4000))
+            response = client.post("/decide/batch", json=fleet(report, 8, step))
             decisions = response.json()["decisions"]
             assert {decision["reason"] for decision in decisions} <= {"llm_timeout", "no_candidate"}
         # What the LLM was waited for is not taken for the edge's own time, and the rest is left to the fleet.
-        assert len(given_s) == 2 and max(given_s) <= 3.0
+        assert len(given_s) == 2 and max(given_s) <= 45.0
         # Twice late in a row: asked about one by one from now on.
-        client.post("/decide/batch", json=fleet(report, 8, 2, deadline_ms=8000))
+        clock.ahead_s = 0.0
+        client.post("/decide/batch", json=fleet(report, 8, 2))
     assert [question.count("UAV") for question in chorus.questions()[:3]] == [8, 8, 0]
 
 
@@ -189,24 +192,25 @@ def test_a_question_that_is_refused_is_put_one_by_one_in_the_same_step(edge: Edg
 
 def test_a_batch_that_was_sent_again_meanwhile_does_not_count(edge: Edge, report: Report) -> None:
     """Its answer would give away sensors that the later one's UAVs fly to."""
-    chorus = Chorus(delays_s=[1.5])
-    with serving(chorus.app) as url, ThreadPoolExecutor() as pool:
+    chorus = Chorus(hangs_on="UAV")
+    with serving(chorus.app) as url, ThreadPoolExecutor() as pool, chorus.gate:
         client = edge(mode="guided", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         client.put("/missions/test", json={"planner": "off"})
-        slow = pool.submit(client.post, "/decide/batch", json=batch(report, deadline_ms=10_000))
-        while not chorus.questions():
-            time.sleep(0.01)
+        slow = pool.submit(client.post, "/decide/batch", json=batch(report))
+        until(lambda: chorus.gate.came)
+        chorus.hangs_on = "\0"
         assert client.post("/decide/batch", json=batch(report)).status_code == 200
+        chorus.gate.open()
         assert slow.result().status_code == 409
 
 
 def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.probing._TOGETHER_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("service.llm.probing._TOGETHER_TIMEOUT_S", 0.1)
     chorus = Chorus(hangs_on="Say hello.")
-    with serving(chorus.app) as url:
+    with serving(chorus.app) as url, chorus.gate:
         client = edge(mode="guided", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         assert [d["source"] for d in decided(client, batch(report))] == ["guided"] * 3

@@ -1,8 +1,8 @@
 """Operator guidance over HTTP: compiled beside the decisions, confirmed by the operator, and obeyed by every mode."""
 
 import asyncio
-import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import httpx
@@ -31,6 +31,7 @@ from tests.running import serving
 from tests.service.api.test_routes import fields
 from tests.service.making import PAPER, attended, mission, uav
 from tests.service.stub_llm import StubLlm, said, wait_for
+from tests.waiting import Gate, soon, until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -49,24 +50,26 @@ class Scribe(StubLlm):
         super().__init__(answer)
         self.orders = list(orders)
         self.asked: list[dict[str, Any]] = []
-        self.delay_s = 0.0
+        self.gate = Gate(opened=True)
 
     async def respond(self, body: dict[str, Any], probed: bool) -> Response:
         if probed or not body["messages"][0]["content"].startswith("Rewrite"):
             return await super().respond(body, probed)
         self.asked.append(body)
-        await asyncio.sleep(self.delay_s)
+        await self.gate.passed()
         return said(self.orders[min(len(self.asked), len(self.orders)) - 1])
 
 
 def guidance(client: httpx.Client, status: str) -> dict[str, Any]:
     """The mission's guidance once it is in that state."""
-    for _ in range(400):
-        told: dict[str, Any] = client.get("/missions/test/guidance").json()
-        if told["status"] == status:
-            return told
-        time.sleep(0.02)
-    raise AssertionError(f"the guidance never became {status}: {told}")
+    told: dict[str, Any] = {}
+
+    def there() -> bool:
+        told.update(client.get("/missions/test/guidance").json())
+        return bool(told["status"] == status)
+
+    until(there, lambda: f"the guidance is to be {status}: {told}")
+    return told
 
 
 def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, report: Report) -> None:
@@ -158,8 +161,8 @@ def test_a_mission_without_a_note_takes_guidance_too(edge: Edge, report: Report)
 
 def test_a_decision_does_not_wait_for_the_note(edge: Edge, report: Report) -> None:
     scribe = Scribe(ORDERS)
-    scribe.delay_s = 3.0
-    with serving(scribe.app) as url:
+    scribe.gate.shut()
+    with serving(scribe.app) as url, scribe.gate:
         client = edge(mode="llm", llm_url=f"{url}/v1")
         wait_for(client, "ready")
         client.put("/missions/test", json={"note": NOTE})
@@ -331,14 +334,15 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
     async def ask(body: dict[str, Any]) -> Completion:
         name = "note" if "Rewrite" in body["messages"][0]["content"] else "decision"
         running.append(name)
-        await asyncio.sleep(0.05)
+        if running == ["note"]:
+            await asyncio.Event().wait()
         finished.append(name)
         return Completion(ORDERS, None, None, None)
 
     upstream._ask = ask  # type: ignore[method-assign]
     upstream._embedded = object()  # type: ignore[assignment]
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
-    await asyncio.sleep(0.01)
+    await soon(lambda: running)
     await upstream.ask("static", "user", [0], 15)
     assert finished == ["decision"]
     assert await note == ORDERS
@@ -348,22 +352,30 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
 async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
     upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
-    given_up = 0
+    given_up = asked = decided = 0
 
     async def ask(body: dict[str, Any]) -> Completion:
-        nonlocal given_up
+        nonlocal given_up, asked, decided
         if "Rewrite" in body["messages"][0]["content"]:
+            asked, before = asked + 1, decided
             try:
-                await asyncio.sleep(0.02)
+                # As long as a decision takes that is asked meanwhile, which is for ever where it goes first.
+                await soon(lambda: asked > 3 and decided > before)
             except asyncio.CancelledError:
                 given_up += 1
                 raise
+        else:
+            decided += 1
         return Completion(ORDERS, None, None, None)
+
+    def asked_times(times: int) -> bool:
+        return asked == times
 
     upstream._ask = ask  # type: ignore[method-assign]
     upstream._embedded = object()  # type: ignore[assignment]
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
-    while not note.done():
-        await asyncio.sleep(0.005)
+    for turn in range(1, 5):
+        await soon(partial(asked_times, turn))
         await upstream.ask("static", "user", [0], 15)
+    await note
     assert (note.result(), given_up) == (ORDERS, 3)

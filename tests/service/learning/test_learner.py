@@ -1,7 +1,10 @@
 import subprocess
 import sys
-import threading
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,8 @@ from service.learning.sample import Sample
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
+
+Scores = tuple[float, ...]
 
 PRESETS: list[Features] = ["paper", "reach"]
 
@@ -148,20 +153,40 @@ def test_what_other_modules_learned_is_refused() -> None:
             learner.load_state_dict(Learner(other.weights(), learning_rate=5e-4).state_dict())
 
 
+def at_every_line(lesson: Callable[[], object], look: Callable[[], Scores]) -> list[Scores]:
+    """What is seen before each line of the service that a lesson runs, as another thread may look."""
+    seen: list[Scores] = []
+
+    def trace(frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
+        if "/service/" not in frame.f_code.co_filename or frame.f_code.co_name.startswith("<"):
+            return None
+        seen.append(look())
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        lesson()
+    finally:
+        sys.settrace(before)
+    return seen
+
+
 def test_a_decision_never_sees_half_a_step() -> None:
     features = sample("reach", 99).features
-    known, watched = (Learner(Modules("reach", 15, seed=1).weights(), learning_rate=0.1) for _ in range(2))
-    finished = {tuple(known.score(features)[0].tolist())}
-    for seed in range(300):
-        known.update(sample("reach", seed), cost=0.3)
-        finished.add(tuple(known.score(features)[0].tolist()))
-    seen: set[tuple[float, ...]] = set()
-    learning = threading.Thread(target=lambda: [watched.update(sample("reach", seed), 0.3) for seed in range(300)])
-    learning.start()
-    while learning.is_alive():
-        seen.add(tuple(watched.score(features)[0].tolist()))
-    assert len(seen) > 1
-    assert seen <= finished
+    learner = Learner(Modules("reach", 15, seed=1).weights(), learning_rate=0.1)
+
+    def scores() -> Scores:
+        return tuple(learner.score(features)[0].tolist())
+
+    for seed in range(3):
+        in_hand, before = learner._weights, scores()
+        seen = at_every_line(partial(learner.update, sample("reach", seed), cost=0.3), scores)
+        after = scores()
+        assert before != after
+        assert len(seen) > 10 and {before, after} == {*seen, after}
+        # Nor does a decision that was begun before the lesson: its copy is as it was.
+        assert tuple(in_hand.score(features)[0].tolist()) == before
 
 
 def test_nothing_brings_torchs_compiler_into_the_process() -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import signal
 import socket
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -29,6 +30,7 @@ from service.storage.serialization import pack
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav
+from tests.waiting import PATIENCE_S, Gate, until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -91,20 +93,26 @@ def test_a_listener_gets_a_snapshot_and_then_what_changes(edge: Edge, report: Re
         assert list(events) == []
 
 
-def test_updates_come_at_most_ten_times_a_second(edge: Edge, report: Report) -> None:
-    client = edge()
+def test_updates_come_at_most_ten_times_a_second(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+
+    async def pause(seconds: float) -> None:
+        pauses.append(seconds)
+        await gate.passed()
+
+    gate, client = Gate(), edge()
+    monkeypatch.setattr("service.live.broadcaster.asyncio", SimpleNamespace(**{**vars(asyncio), "sleep": pause}))
     decided(client, report())
-    with watching(client) as events:
+    with watching(client) as events, gate:
         next(events)
-        began = time.monotonic()
-        for step in range(1, 61):
+        decided(client, report(step=1))
+        assert next(events)[1]["made"] == 2
+        # The next one comes after the pause, and tells of all that happened in it.
+        for step in range(2, 61):
             decided(client, report(step=step))
-        took = time.monotonic() - began
-        updates, made = 0, 1
-        while made < 61:
-            made = next(events)[1]["made"]
-            updates += 1
-    assert updates <= took / 0.1 + 2
+        assert len(pauses) == 1 and pauses[0] >= 0.1
+        gate.open()
+        assert next(events)[1]["made"] == 61
 
 
 def test_the_missions_are_listed_the_one_that_decided_last_first(edge: Edge, report: Report) -> None:
@@ -147,12 +155,8 @@ def test_listeners_are_bounded_and_take_no_decisions_place(edge: Edge, report: R
         assert refused.headers["retry-after"]
         assert "pages are watching already" in refused.json()["detail"]
         decided(client, report(step=1))
-    for _ in range(100):
-        if client.get("/missions/none/events").status_code == 404:
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("those who left still take places")
+    # Those who left take no places any more.
+    until(lambda: client.get("/missions/none/events").status_code == 404)
 
 
 def test_nobody_watches_a_mission_that_there_is_not(edge: Edge) -> None:
@@ -164,7 +168,7 @@ def test_nobody_watches_a_mission_that_there_is_not(edge: Edge) -> None:
 
 def test_who_stops_reading_holds_little_and_goes_on_from_a_snapshot(report: Report) -> None:
     """Its mission has 10,000 sensors, so that the system's own buffers are soon full."""
-    with serving_edge(AICVDS_MODE="value") as (url, process), httpx.Client(base_url=url, timeout=60) as client:
+    with serving_edge(AICVDS_MODE="value") as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         client.put("/missions/large", json={"scenario": {"name": "large", "sensors": 10_000, "uavs": 1}})
         body = report(mission_id="large")
         decided(client, body)
@@ -193,7 +197,7 @@ def silent_listener(url: str, mission: str) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     listener.connect((host, int(port)))
     listener.sendall(f"GET /missions/{mission}/events HTTP/1.1\r\nHost: edge\r\n\r\n".encode())
-    listener.settimeout(30)
+    listener.settimeout(PATIENCE_S)
     return listener
 
 
@@ -209,16 +213,22 @@ def names_until(listener: socket.socket, step: int) -> list[str]:
 
 
 def test_the_edge_stops_while_pages_watch(report: Report) -> None:
-    with serving_edge(AICVDS_MODE="value") as (url, process), httpx.Client(base_url=url, timeout=60) as client:
+    with serving_edge(AICVDS_MODE="value") as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         decided(client, report())
         with watching(client) as events, closing(silent_listener(url, "test")):
             next(events)
             process.send_signal(signal.SIGTERM)
             assert list(events) == []
-            assert process.wait(timeout=10) in (0, -signal.SIGTERM)
+            assert process.wait(PATIENCE_S) in (0, -signal.SIGTERM)
 
 
-def test_the_page_is_open_and_what_it_shows_needs_a_key(edge: Edge, report: Report, tmp_path: Path) -> None:
+def test_the_page_is_open_and_what_it_shows_needs_a_key(
+    edge: Edge, report: Report, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A key is looked at again at each event, and one comes soon.
+    monkeypatch.setattr("service.live.broadcaster._HEARTBEAT_S", 0.05)
+    monkeypatch.setattr("service.api.live_routes._STILL_KNOWN_S", 0.0)
+    monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
     path = tmp_path / "keys.json"
     with editing(path) as known:
         admin = known.add("fleet", frozenset(("decide", "admin")), 6000)

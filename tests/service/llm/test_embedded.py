@@ -1,31 +1,47 @@
 """The real embedded model: SmolLM2-135M out of the installed package, in this process, over its own HTTP server."""
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
 import httpx
 import pytest
+from fastapi import FastAPI
 
 from service.api.app import create_app
 from service.config.cores import usable_cores
 from service.config.settings import Settings
+from service.llm.embedded import EmbeddedServer
 from tests.running import serving
 from tests.service.stub_llm import wait_for
+from tests.waiting import PATIENCE_S, Gate, until
 
 Report = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def loaded() -> Iterator[httpx.Client]:
+def app() -> FastAPI:
+    return create_app(Settings(mode="llm", deadline_ms=60_000))
+
+
+@pytest.fixture(scope="module")
+def loaded(app: FastAPI) -> Iterator[httpx.Client]:
     with ExitStack() as stack:
-        url = stack.enter_context(serving(create_app(Settings(mode="llm", deadline_ms=30_000))))
-        client = stack.enter_context(httpx.Client(base_url=url, timeout=60))
+        patient = stack.enter_context(pytest.MonkeyPatch.context())
+        for limit in ("upstream._PROBE_TIMEOUT_S", "upstream._TOGETHER_TIMEOUT_S", "calibration._TIMEOUT_S"):
+            patient.setattr(f"service.llm.{limit}", PATIENCE_S)
+        url = stack.enter_context(serving(app))
+        client = stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S))
         ready = wait_for(client, "ready")
         assert ready["constraint"] == "grammar"
         assert "SmolLM2-135M" in ready["model"]
         yield client
+
+
+def measured(app: FastAPI) -> None:
+    """Wait until the bias is measured, beside the decisions, which the first of a kind begins."""
+    labels = app.state.engine.queries._labels
+    until(lambda: labels._task is not None and labels._task.done())
 
 
 def test_the_llm_decides_within_the_grammar(loaded: httpx.Client, report: Report) -> None:
@@ -61,7 +77,7 @@ def test_the_static_block_is_read_once(loaded: httpx.Client, report: Report) -> 
     assert third["tokens"]["cached"] > second["tokens"]["cached"]
 
 
-def test_guided_asks_for_one_token_and_reads_little_anew(loaded: httpx.Client, report: Report) -> None:
+def test_guided_asks_for_one_token_and_reads_little_anew(loaded: httpx.Client, app: FastAPI, report: Report) -> None:
     """At k = 5, once the bias is measured: the last experience, five rows, and the chat template's end."""
     loaded.put("/missions/guided", json={"mode": "guided"})
     outcome = None
@@ -77,13 +93,13 @@ def test_guided_asks_for_one_token_and_reads_little_anew(loaded: httpx.Client, r
         assert tokens["completion"] == 1
         fresh.append(tokens["server_prompt"] - tokens["cached"])
         outcome = {"decision_id": answer["decision_id"], "cost": 0.2}
-        # The bias is measured after the first decision, and the server has one slot.
-        time.sleep(3 if step == 0 else 0)
+        # The server has one slot.
+        measured(app)
     assert max(fresh[2:]) <= 70, fresh
     assert answer["guided"]["calibrated"]
 
 
-def test_a_fleets_step_takes_one_call(loaded: httpx.Client, report: Report) -> None:
+def test_a_fleets_step_takes_one_call(loaded: httpx.Client, app: FastAPI, report: Report) -> None:
     """One letter a UAV and a line's end between them, each with the LLM's probabilities."""
     loaded.put("/missions/fleet", json={"mode": "guided"})
     for step in range(30):
@@ -97,8 +113,8 @@ def test_a_fleets_step_takes_one_call(loaded: httpx.Client, report: Report) -> N
         assert [d["tokens"]["completion"] for d in decisions] == [5, None, None]
         if decisions[0]["guided"]["calibrated"]:
             break
-        # The bias is measured beside the decisions, and the server has one slot.
-        time.sleep(1)
+        # The server has one slot.
+        measured(app)
     assert decisions[0]["guided"]["calibrated"]
     assert decisions[0]["tokens"]["cached"] > decisions[0]["tokens"]["static"]
 
@@ -109,21 +125,23 @@ def calls(client: httpx.Client) -> float:
     return sum(float(line.split()[-1]) for line in lines if line.startswith("aicvds_llm_requests_total"))
 
 
-def test_decisions_and_health_go_on_while_the_model_loads(report: Report) -> None:
-    with serving(create_app(Settings())) as url, httpx.Client(base_url=url, timeout=10) as client:
-        seen = set()
-        for _ in range(2000):
-            assert client.get("/healthz").status_code == 200
-            llm = client.get("/readyz").json()["llm"]
-            if llm == "loading":
-                seen.add(client.post("/decide", json=report(mission_id="early")).json()["reason"])
-            if llm == "ready":
-                break
-            time.sleep(0.01)
-    assert llm == "ready"
-    # The model may turn ready between the two requests.
-    assert "llm_loading" in seen
-    assert seen <= {"llm_loading", None}
+def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate()
+
+    def slowly(*args: Any, **settings: Any) -> EmbeddedServer:
+        gate.wait()
+        return EmbeddedServer(*args, **settings)
+
+    monkeypatch.setattr("service.llm.server.EmbeddedServer", slowly)
+    app = create_app(Settings(deadline_ms=60_000))
+    with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client, gate:
+        until(lambda: gate.came)
+        assert client.get("/healthz").status_code == 200
+        assert client.get("/readyz").json()["llm"] == "loading"
+        assert client.post("/decide", json=report(mission_id="early")).json()["reason"] == "llm_loading"
+        gate.open()
+        wait_for(client, "ready")
+        assert client.post("/decide", json=report(mission_id="early", step=1)).json()["reason"] is None
 
 
 def test_threads_default_to_one_core_less_than_there_are() -> None:

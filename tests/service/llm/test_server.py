@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -14,6 +13,7 @@ from fastapi.responses import JSONResponse, Response
 
 from tests.running import listening, serving
 from tests.service.stub_llm import FAULTS, FLOODS, PROBE, StubLlm, misbehaving, said, saying, wait_for
+from tests.waiting import until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -86,7 +86,7 @@ def faulty(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
 def test_a_misbehaving_upstream_never_keeps_a_uav_waiting(edge: Edge, report: Report, faulty: tuple[str, str]) -> None:
     url, reason = faulty
     # Only who waits for the deadline needs a short one; the others must not meet it on a slow machine.
-    deadline_ms = 400 if reason == "llm_timeout" else 20_000
+    deadline_ms = 100 if reason == "llm_timeout" else 60_000
     client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=deadline_ms)
     wait_for(client, "ready")
     answers = [client.post("/decide", json=report(uav_id=uav)) for uav in range(3)]
@@ -127,10 +127,7 @@ def test_a_server_that_is_still_loading_is_probed_again(
     app.post("/v1/chat/completions")(loading)
     with serving(app) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1")
-        for _ in range(200):
-            if (ready := client.get("/readyz").json())["llm"] == "ready":
-                break
-            time.sleep(0.05)
+        ready = wait_for(client, "ready")
     assert (ready["llm"], ready["constraint"]) == ("ready", "grammar")
 
 
@@ -156,9 +153,7 @@ def test_a_list_of_models_that_is_none(edge: Edge, report: Report, models: Any) 
     app.post("/v1/chat/completions")(Model("grammar").complete)
     with serving(app) as url:
         client = edge(mode="llm", llm_url=f"{url}/v1")
-        for _ in range(20):
-            assert client.get("/readyz").status_code == 200
-            time.sleep(0.02)
+        until(lambda: client.get("/readyz").raise_for_status().json()["llm"] != "loading")
         assert client.post("/decide", json=report()).status_code == 200
 
 
@@ -189,10 +184,7 @@ def test_a_timed_out_call_is_hung_up(edge: Edge, report: Report) -> None:
         client = edge(mode="llm", llm_url=f"{url}/v1", llm_model="stub-1", deadline_ms=200)
         wait_for(client, "ready")
         assert client.post("/decide", json=report()).json()["reason"] == "llm_timeout"
-        for _ in range(100):
-            if hung_up:
-                break
-            time.sleep(0.02)
+        until(lambda: hung_up)
     assert hung_up == [b""]
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
 import httpx
 import pytest
+
+from tests.waiting import until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -25,9 +26,8 @@ def test_every_update_counts_with_its_loss(edge: Edge, report: Report) -> None:
     for step in range(6):
         answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
         outcome = {"decision_id": answer["decision_id"], "cost": 2.0}
-    ends = time.monotonic() + 30
-    while (told := numbers(client))["aicvds_learner_update_loss_count"] < 5 and time.monotonic() < ends:
-        time.sleep(0.02)
+    until(lambda: numbers(client)["aicvds_learner_update_loss_count"] >= 5)
+    told = numbers(client)
     assert told["aicvds_learner_update_loss_count"] == 5
     assert told["aicvds_learner_update_loss_sum"] > told["aicvds_learner_loss"] > 0
     last = client.get("/missions/test").json()["learner_loss"]

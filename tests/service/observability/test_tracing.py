@@ -17,6 +17,7 @@ from opentelemetry.proto.trace.v1.trace_pb2 import Span
 from tests.e2e.processes import run, serving_edge
 from tests.running import listening, serving
 from tests.service.stub_llm import StubLlm, misbehaving, saying, wait_for
+from tests.waiting import PATIENCE_S
 
 Report = Callable[..., dict[str, Any]]
 
@@ -34,13 +35,13 @@ def test_each_line_is_json_and_names_the_mission_and_decision_and_no_secret(tmp_
             AICVDS_LOG_FORMAT="json",
             AICVDS_LOG_LEVEL="debug",
         ) as (url, process),
-        httpx.Client(base_url=url, timeout=30, headers={"Authorization": f"Bearer {key}"}) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S, headers={"Authorization": f"Bearer {key}"}) as client,
     ):
         wait_for(client, "ready")
         answers = [client.post("/decide", json=report(step=step)).json() for step in range(4)]
         client.post("/decide", json=report(step="no number"))
         process.terminate()
-        output = process.communicate(timeout=30)[0]
+        output = process.communicate(timeout=PATIENCE_S)[0]
     lines = [json.loads(line) for line in output.splitlines() if line.startswith("{")]
     decisions = [line for line in lines if line["event"] in ("decision", "late decision")]
     assert [line["decision_id"] for line in decisions] == [answer["decision_id"] for answer in answers]
@@ -101,14 +102,14 @@ def test_a_decision_is_a_trace_under_its_callers(report: Report) -> None:
             url,
             process,
         ),
-        httpx.Client(base_url=url, timeout=30) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
     ):
         wait_for(client, "ready")
         headers = {"traceparent": f"00-{trace}-{parent}-01"}
         answer = client.post("/decide", json=report(), headers=headers).json()
         assert answer["source"] == "llm"
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=PATIENCE_S)
     whole = next(span for span in spans if span.name == "decide")
     assert (whole.trace_id.hex(), whole.parent_span_id.hex()) == (trace, parent)
     assert told(whole)["aicvds.decision_id"] == answer["decision_id"]
@@ -132,12 +133,12 @@ def test_an_llm_that_fails_is_an_error_in_the_trace(report: Report) -> None:
             url,
             process,
         ),
-        httpx.Client(base_url=url, timeout=30) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
     ):
         wait_for(client, "ready")
         client.post("/decide", json=report())
         process.terminate()
-        process.communicate(timeout=30)
+        process.communicate(timeout=PATIENCE_S)
     asked = next(span for span in spans if span.name.startswith("chat"))
     assert told(asked)["error.type"] == "llm_status"
     assert asked.status.code == 2
@@ -147,10 +148,10 @@ def test_a_log_that_nobody_reads_keeps_no_uav_waiting(report: Report) -> None:
     """A pipe holds 64 KB; past that, who writes to it waits."""
     with (
         serving_edge(AICVDS_MODE="value", AICVDS_LOG_LEVEL="debug") as (url, process),
-        httpx.Client(base_url=url, timeout=30) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
     ):
         for step in range(600):
             assert client.post("/decide", json=report(step=step)).status_code == 200
         process.terminate()
         # Nor is the end waited for.
-        assert process.wait(timeout=60) in (0, -15)
+        assert process.wait(PATIENCE_S) in (0, -15)

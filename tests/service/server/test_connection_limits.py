@@ -17,6 +17,7 @@ from starlette.types import Receive, Scope, Send
 from service.server import connection_limits
 from tests.e2e.processes import serving_edge
 from tests.running import serving
+from tests.waiting import PATIENCE_S
 
 Address = tuple[str, int]
 # More than the system keeps between the two ends.
@@ -37,9 +38,17 @@ def edge_process() -> Iterator[str]:
 
 def answered(address: Address, sent: bytes) -> bytes:
     """All that comes back until the server hangs up."""
-    with socket.create_connection(address, timeout=60) as connection:
+    with socket.create_connection(address, timeout=PATIENCE_S) as connection:
         connection.sendall(sent)
         return b"".join(iter(lambda: connection.recv(65536), b""))
+
+
+def hung_up(address: Address, sent: bytes) -> bool:
+    """Whether nothing comes back: what is sent may come too late to be read."""
+    try:
+        return answered(address, sent) == b""
+    except ConnectionError:
+        return True
 
 
 def long(begun: bytes, piece: bytes, ended: bytes = b"") -> bytes:
@@ -66,7 +75,7 @@ def test_a_head_past_64_kilobytes_is_refused(edge_process: str, head: bytes) -> 
     answer = answered(address_of(edge_process), head)
     assert answer.startswith(b"HTTP/1.1 431 ")
     assert b"\r\ncontent-type: application/problem+json\r\n" in answer
-    assert httpx.get(f"{edge_process}/healthz", headers={"x": "y" * 60_000}, timeout=60).status_code == 200
+    assert httpx.get(f"{edge_process}/healthz", headers={"x": "y" * 60_000}, timeout=PATIENCE_S).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -79,7 +88,7 @@ def test_a_head_past_64_kilobytes_is_refused(edge_process: str, head: bytes) -> 
     ids=["headers", "trailers", "extension of a chunk"],
 )
 def test_who_goes_on_without_end_is_hung_up(edge_process: str, begun: bytes, more: bytes) -> None:
-    with socket.create_connection(address_of(edge_process), timeout=60) as connection:
+    with socket.create_connection(address_of(edge_process), timeout=PATIENCE_S) as connection:
         connection.sendall(begun)
         with pytest.raises(ConnectionError):
             for _ in range(_MOST_SENT // len(more)):
@@ -98,22 +107,22 @@ async def counting(scope: Scope, receive: Receive, send: Send) -> None:
 
 def test_a_body_in_many_small_chunks_is_no_head() -> None:
     with serving(counting) as url:
-        assert httpx.post(url, content=(b"x" for _ in range(30_000)), timeout=60).text == "30000"
+        assert httpx.post(url, content=(b"x" for _ in range(30_000)), timeout=PATIENCE_S).text == "30000"
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nho"])
 def test_who_does_not_end_its_head_is_hung_up(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
-    monkeypatch.setattr(connection_limits, "_MOST_S", 0.3)
+    monkeypatch.setattr(connection_limits, "_MOST_S", 0.1)
     with serving(counting) as url:
-        assert answered(address_of(url), sent) == b""
+        assert hung_up(address_of(url), sent)
 
 
 @pytest.mark.parametrize("sent", [b"\r\n", b"GET / HT"])
 def test_nor_does_it_help_to_have_asked_before(monkeypatch: pytest.MonkeyPatch, sent: bytes) -> None:
-    monkeypatch.setattr(connection_limits, "_MOST_S", 0.3)
-    with serving(counting) as url, socket.create_connection(address_of(url), timeout=60) as connection:
+    with serving(counting) as url, socket.create_connection(address_of(url), timeout=PATIENCE_S) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
         assert connection.recv(65536).startswith(b"HTTP/1.1 200 ")
+        monkeypatch.setattr(connection_limits, "_MOST_S", 0.1)
         # Whatever comes ends uvicorn's own waiting.
         connection.sendall(sent)
         while connection.recv(65536):
@@ -121,19 +130,19 @@ def test_nor_does_it_help_to_have_asked_before(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_who_has_asked_may_wait_longer_than_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_limits, "_MOST_S", 0.3)
     asked, may = threading.Event(), threading.Event()
 
     async def patient(scope: Scope, receive: Receive, send: Send) -> None:
         assert scope["type"] == "http"
         asked.set()
-        await asyncio.to_thread(may.wait, 60)
+        await asyncio.to_thread(may.wait, PATIENCE_S)
         await PlainTextResponse("alive")(scope, receive, send)
 
     with serving(patient) as url, ThreadPoolExecutor() as pool:
-        waiting = pool.submit(httpx.get, url, timeout=60)
-        assert asked.wait(timeout=30)
+        waiting = pool.submit(httpx.get, url, timeout=PATIENCE_S)
+        assert asked.wait(PATIENCE_S)
+        monkeypatch.setattr(connection_limits, "_MOST_S", 0.1)
         # Who came later and said nothing was hung up before.
-        assert answered(address_of(url), b"") == b""
+        assert hung_up(address_of(url), b"")
         may.set()
-        assert waiting.result(timeout=60).text == "alive"
+        assert waiting.result(timeout=PATIENCE_S).text == "alive"

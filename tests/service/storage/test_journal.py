@@ -1,4 +1,4 @@
-"""Missions that outlive the process: what is read back is what was, to the bit."""
+"""MissionRegistry that outlive the process: what is read back is what was, to the bit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,8 @@ from service.config.settings import Settings
 from service.storage import journal
 from service.storage.recovery import restore_mission
 from service.storage.store import Store
-from tests.service.keeping import copy_of, fly, locked, running, same, settled, state
+from tests.service.keeping import copy_of, fly, locked, on_disk, running, same, settled, state
+from tests.waiting import PATIENCE_S, until
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
@@ -40,7 +40,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
         assert client.post("/missions/test/guidance", json=answer).status_code == 200
         fly(client, report, range(20))
         mission = settled(engine, engine.missions.awake[0], 57)
-        time.sleep(0.3)
+        on_disk(engine)
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
         before = state(mission)
     store = Store(str(copied))
@@ -63,10 +63,8 @@ def test_a_restarted_edge_flies_on(address: str, report: Report) -> None:
     with running(address) as (client, _):
         owed = fly(client, report, range(5))
         # Lessons come after the answers.
-        ends = time.monotonic() + 30
-        while (before := client.get("/missions/test").json())["learner_updates"] < 12:
-            assert time.monotonic() < ends
-            time.sleep(0.05)
+        until(lambda: client.get("/missions/test").json()["learner_updates"] == 12)
+        before = client.get("/missions/test").json()
     with running(address, top_k=2, mode="policy") as (client, engine):
         assert engine.missions.awake == []
         assert client.get("/missions/test").json() == before
@@ -146,16 +144,16 @@ def test_many_missions_are_woken_when_they_are_asked_about(tmp_path: Path, repor
 def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(journal, "_LONGEST_PAUSE_S", 0.25)
     with running(tmp_path / "m.db") as (client, engine):
         owed = fly(client, report, range(3))
         other = locked(tmp_path / "m.db")
         try:
             first = client.post("/decide", json=report(step=3, outcome=owed[0]))
             assert (first.status_code, first.json()["stored"]) == (200, False)
-            # Nobody waits for a store that is known to fail: each that did would take a minute here.
-            monkeypatch.setattr("service.edge.engine._STORE_S", 60.0)
+            # Nobody waits for a store that is known to fail: each that did would take two minutes here.
             for step in range(4, 40):
-                answer = client.post("/decide", json=report(step=step, deadline_ms=60_000))
+                answer = client.post("/decide", json=report(step=step))
                 assert (answer.status_code, answer.json()["stored"]) == (200, False)
             refused = client.post("/feedback", json={"mission_id": "test", **owed[1]})
             assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
@@ -164,9 +162,7 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
         finally:
             other.execute("ROLLBACK")
             other.close()
-        ends = time.monotonic() + 20
-        while engine.journal.failing and time.monotonic() < ends:
-            time.sleep(0.1)
+        until(lambda: not engine.journal.failing)
         # What was told with a decision has been written meanwhile; what was refused was not applied.
         first_again = client.post("/feedback", json={"mission_id": "test", **owed[0]})
         assert (first_again.status_code, first_again.json()["result"]) == (200, "duplicate")
@@ -214,7 +210,7 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) 
     try:
         url = process.stderr.readline().split()[4].rstrip(",")
         acknowledged, refused, owed = [], 0, None
-        with httpx.Client(base_url=url, timeout=60) as client:
+        with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             for step in range(120):
                 answer = client.post("/decide", json=report(step=step))
                 assert answer.status_code == 200, answer.text

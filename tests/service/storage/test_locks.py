@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,8 @@ from service.storage.locks import StoreUnusable
 from service.storage.operations import Deleted
 from service.storage.store import Store
 from tests.e2e.processes import serving_edge
-from tests.service.keeping import fly, running, written
+from tests.service.keeping import fly, kept, running, written
+from tests.waiting import PATIENCE_S, until
 
 Report = Callable[..., dict[str, Any]]
 
@@ -54,10 +54,7 @@ def test_an_edge_whose_hold_on_postgresql_broke_takes_it_again_or_writes_no_more
         fly(client, report, range(2))
         _break_holds(postgres)
         # Nobody else came: the first write finds out, the next takes the hold again.
-        ends = time.monotonic() + 30
-        while not client.post("/decide", json=report(step=5)).json()["stored"]:
-            assert time.monotonic() < ends
-            time.sleep(0.1)
+        kept(client, report(step=5))
         with pytest.raises(StoreUnusable, match="another edge"):
             Store(postgres)
 
@@ -73,12 +70,14 @@ def test_an_edge_that_comes_back_after_another_had_the_database_writes_nothing_i
             fly(second, report, range(2, 4))
             flown = second.get("/missions/test").json()
         # The other has ended, and the lock is free: the first, which was not asked meanwhile, has it as of step 2.
-        ends = time.monotonic() + 30
-        while "another edge has had it since" not in caplog.text:
-            assert time.monotonic() < ends
-            late = first.post("/decide", json=report(step=9)).json()
+        late: dict[str, Any] = {}
+
+        def refused() -> bool:
+            late.update(first.post("/decide", json=report(step=9)).json())
             assert not late["stored"]
-            time.sleep(0.1)
+            return "another edge has had it since" in caplog.text
+
+        until(refused)
         outcome = {"mission_id": "test", "decision_id": late["decision_id"], "cost": 0.5, "failed": False}
         assert first.post("/feedback", json=outcome).status_code == 503
     with running(postgres) as (third, _):
@@ -122,13 +121,13 @@ async def test_an_edge_that_was_followed_stays_out_and_lets_a_third_in(
 def test_an_edge_ends_though_postgresql_waits_for_a_lock(postgres: str, report: Report) -> None:
     with (
         serving_edge(AICVDS_STORE=postgres, AICVDS_MODE="value") as (url, process),
-        httpx.Client(base_url=url, timeout=60) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
     ):
-        assert client.post("/decide", json=report()).json()["stored"]
+        kept(client, report())
         with _locking(postgres, "journal"):
             told = client.post("/decide", json=report(step=1)).json()
             assert not told["stored"]
             outcome = {"mission_id": "test", "decision_id": told["decision_id"], "cost": 1.0}
             assert client.post("/feedback", json=outcome).status_code == 503
             process.terminate()
-            assert process.wait(30) == -signal.SIGTERM
+            assert process.wait(PATIENCE_S) == -signal.SIGTERM

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -34,6 +33,7 @@ from tests.running import serving
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state, writers
 from tests.service.making import attended, uav
 from tests.service.stub_llm import StubLlm, wait_for
+from tests.waiting import PATIENCE_S, soon, until
 
 Report = Callable[..., dict[str, Any]]
 
@@ -68,13 +68,6 @@ class MoodyStore(Store):
         return self.moody
 
 
-async def until(done: Callable[[], bool]) -> None:
-    ends = time.monotonic() + 20
-    while not done():
-        assert time.monotonic() < ends
-        await asyncio.sleep(0.01)
-
-
 async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_path: Path) -> None:
     store = MoodyStore(str(tmp_path / "m.db"))
     journal = Journal(store, Metrics())
@@ -83,25 +76,25 @@ async def test_a_checkpoint_stands_where_the_events_stood_that_it_covers(tmp_pat
     journal.begin(mission)
     for step in range(3):
         mission.observe(uav(step=step), step)
-    assert await journal.stored(5)
+    assert await journal.stored(PATIENCE_S)
     writer.well = False
     for step in range(3, 10):
         mission.observe(uav(step=step), step)
-    await until(lambda: journal.failing)
+    await soon(lambda: journal.failing)
     track = journal.due(mission, 1)
     assert track is not None
     journal.checkpoint(track, {**mission.state_dict(), "learner": mission.learner.state_dict()})
     for step in range(10, 13):
         mission.observe(uav(step=step), step)
     writer.well = True
-    await until(lambda: not journal.failing and not journal._commits._queue)
+    await soon(lambda: not journal.failing and not journal._commits._queue)
     tail = writer.written[4:]
     assert [item.seq for item in tail if isinstance(item, Checkpoint | Entry)] == [10, 11, 12, 13]
     assert isinstance(tail[0], Checkpoint)
     kept = store.load("test")
     assert kept is not None
     assert same(state(restore_mission("test", kept, Settings(mode="value"))), state(mission))
-    assert await journal.close(5)
+    assert await journal.close(PATIENCE_S)
     store.close()
 
 
@@ -111,11 +104,11 @@ async def test_a_journal_outlives_any_failure_of_its_store(tmp_path: Path) -> No
     store.moody.failures = [MemoryError(), OSError("no such device")]
     mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
     journal.begin(mission)
-    assert not await journal.stored(5)
-    await until(lambda: not journal.failing)
-    assert await journal.stored(5)
+    assert not await journal.stored(PATIENCE_S)
+    await soon(lambda: not journal.failing)
+    assert await journal.stored(PATIENCE_S)
     assert store.missions() == ["test"]
-    assert await journal.close(5)
+    assert await journal.close(PATIENCE_S)
     store.close()
 
 
@@ -124,9 +117,9 @@ async def test_a_journal_that_is_closed_writes_no_more_and_starts_nothing(tmp_pa
     journal = Journal(store, Metrics())
     mission = Mission("test", MissionSpec(mode="value"), Settings(mode="value"))
     journal.begin(mission)
-    assert await journal.close(5)
+    assert await journal.close(PATIENCE_S)
     mission.observe(uav(step=0), 0)
-    assert not await journal.stored(0.2)
+    assert not await journal.stored(0.05)
     assert writers(os.getpid()) == []
     kept = store.load("test")
     assert kept is not None and kept.events == []
@@ -153,8 +146,8 @@ async def test_large_checkpoints_are_written_a_few_at_a_time(tmp_path: Path, mon
         assert track is not None
         state = {**mission.state_dict(), "learner": mission.learner.state_dict(), "more": b"x" * 20_000}
         journal.checkpoint(track, state)
-    assert await journal.stored(5)
-    assert await journal.close(5)
+    assert await journal.stored(PATIENCE_S)
+    assert await journal.close(PATIENCE_S)
     assert sum(most) == 9
     assert max(most) <= 3
     store.close()
@@ -169,7 +162,7 @@ async def test_a_large_checkpoint_is_packed_beside_the_decisions(
 
     def slowly(value: Any) -> bytes:
         threads.append(threading.current_thread().name)
-        at_rest.wait(10)
+        assert at_rest.wait(PATIENCE_S)
         return pack(value)
 
     store = Store(str(tmp_path / "m.db"))
@@ -187,9 +180,9 @@ async def test_a_large_checkpoint_is_packed_beside_the_decisions(
     # What happens while it is packed is on disk at once, and is not lost when the checkpoint comes after it.
     for step in range(1, 4):
         mission.observe(uav(step=step), step)
-    assert await journal.stored(5)
+    assert await journal.stored(PATIENCE_S)
     at_rest.set()
-    assert await journal.close(5)
+    assert await journal.close(PATIENCE_S)
     kept = store.load("test")
     assert kept is not None and kept.state is not None and len(kept.events) == 3
     assert same(state(restore_mission("test", kept, Settings(mode="value"))), state(mission))
@@ -207,7 +200,7 @@ def test_a_store_that_hangs_keeps_no_other_mission_waiting_and_a_sleeping_one_no
 
     def slowly(self: Store, mission_id: str) -> StoredMission | None:
         hung.set()
-        well.wait(timeout=60)
+        assert well.wait(PATIENCE_S)
         return load(self, mission_id)
 
     monkeypatch.setattr(Store, "load", slowly)
@@ -216,19 +209,17 @@ def test_a_store_that_hangs_keeps_no_other_mission_waiting_and_a_sleeping_one_no
         ThreadPoolExecutor(9) as pool,
     ):
         client.post("/decide", json=report(mission_id="awake"))
-        bodies = [report(mission_id=f"m{number}", deadline_ms=500) for number in range(9)]
+        bodies = [report(mission_id=f"m{number}", deadline_ms=100) for number in range(9)]
         sleeping = [pool.submit(client.post, "/decide", json=body) for body in bodies]
-        hung.wait(timeout=30)
+        assert hung.wait(PATIENCE_S)
         # Answered at all: the store comes back only after it.
-        assert client.post("/decide", json=report(mission_id="awake", step=1, deadline_ms=1500)).status_code == 200
+        assert client.post("/decide", json=report(mission_id="awake", step=1)).status_code == 200
         late = [asked.result() for asked in sleeping]
         assert {answer.status_code for answer in late} == {503}
         assert {answer.headers["retry-after"] for answer in late} == {"1"}
         well.set()
         # It wakes all the same.
-        ends = time.monotonic() + 60
-        while client.post("/decide", json=bodies[0]).status_code == 503:
-            assert time.monotonic() < ends
+        until(lambda: client.post("/decide", json=bodies[0]).status_code == 200)
 
 
 def test_while_the_store_fails_nothing_is_deleted_made_or_confirmed(tmp_path: Path, report: Report) -> None:
@@ -238,10 +229,7 @@ def test_while_the_store_fails_nothing_is_deleted_made_or_confirmed(tmp_path: Pa
         try:
             client.post("/decide", json=report(step=2))
             # Only what the edge knows can it refuse: a DELETE that comes before is carried out, and told as a 503.
-            ends = time.monotonic() + 30
-            while not engine.journal.failing:
-                assert time.monotonic() < ends
-                time.sleep(0.01)
+            until(lambda: engine.journal.failing)
             structure = {"guidance": {"max_velocity": 5}}
             assert client.delete("/missions/test").status_code == 503
             assert client.put("/missions/new", json={}).status_code == 503
@@ -259,6 +247,7 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
 ) -> None:
     # Of a batch's three outcomes, which come at once, two can wait.
     monkeypatch.setattr(learning_queue, "_MAX_LESSONS", 2)
+    monkeypatch.setattr(learning_queue, "_TELL_S", 3600.0)
     with running(tmp_path / "m.db") as (client, engine):
         owed: dict[int, str] = {}
         for step in range(6):
@@ -299,7 +288,7 @@ async def test_who_waits_for_a_request_that_is_given_up_is_told_to_send_it_again
 
     async def never() -> str:
         begun.set()
-        await asyncio.sleep(60)
+        await asyncio.Event().wait()
         return "never"
 
     first = asyncio.create_task(repeats.once("k", "request", never, lambda _: None))
@@ -344,7 +333,7 @@ def test_a_traceback_shows_no_variables(form: str) -> None:
         "except ValueError:\n"
         "    logging.getLogger('x').exception('caught')\n"
     )
-    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     assert "it failed" in ran.stderr
     assert "sk-secret" not in ran.stderr
     # Colours are for terminals.

@@ -65,7 +65,7 @@ def test_an_operator_confirms_only_what_he_means(edge: Edge, says: str, orders: 
     with serving(Scribe(orders).app) as llm:
         client = edge(mode="llm", llm_url=f"{llm}/v1")
         wait_for(client, "ready")
-        with EdgeClient(str(client.base_url), timeout_s=30) as own:
+        with EdgeClient(str(client.base_url), timeout_s=120) as own:
             own.put_mission("test", MissionSpec(note=operator.note(0)))
             assert operator.answer(own, "test", 0) == status
             understood = own.guidance("test").guidance
