@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from service.config.settings import Settings
-from service.storage import journal
+from service.storage import group_commit, journal
 from service.storage.recovery import restore_mission
 from service.storage.store import Store
 from tests.service.keeping import copy_of, fly, locked, on_disk, running, same, settled, state
@@ -144,7 +144,7 @@ def test_many_missions_are_woken_when_they_are_asked_about(tmp_path: Path, repor
 def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journal, "_LONGEST_PAUSE_S", 0.25)
+    monkeypatch.setattr(group_commit, "_LONGEST_PAUSE_S", 0.25)
     with running(tmp_path / "m.db") as (client, engine):
         owed = fly(client, report, range(3))
         other = locked(tmp_path / "m.db")

@@ -324,7 +324,7 @@ def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path
 def test_a_traceback_shows_no_variables(form: str) -> None:
     script = (
         "import logging\n"
-        "from service import logs\n"
+        "from service.observability import logs\n"
         f"logs.configure('info', '{form}')\n"
         "def fail(key):\n"
         "    raise ValueError('it failed')\n"
