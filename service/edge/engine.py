@@ -106,7 +106,7 @@ class Engine:
         for threads in (self._planning, self._judging):
             await asyncio.to_thread(threads.shutdown, cancel_futures=True)
         self.missions.close()
-        await self._outcomes.close(self.missions.awake, _LAST_CHECKPOINTS_S)
+        await self._outcomes.close(self.missions.loaded, _LAST_CHECKPOINTS_S)
         return await self.keeper.close(_LAST_COMMIT_S)
 
     async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
