@@ -102,12 +102,12 @@ async def page() -> FileResponse:
 async def list_missions(engine: TheEngine) -> MissionList:
     """The missions that there are: the one that decided last first, those that are only in the store last."""
     missions = engine.missions
-    awake = {mission.mission_id: mission for mission in missions.awake}
-    lately = [name for name in engine.live.history.newest_first() if name in awake]
-    names = list(dict.fromkeys((*lately, *reversed(awake), *missions.asleep)))
+    loaded = {mission.mission_id: mission for mission in missions.loaded}
+    lately = [name for name in engine.live.history.newest_first() if name in loaded]
+    names = list(dict.fromkeys((*lately, *reversed(loaded), *missions.stored)))
     lines = []
     for name in names[:_MOST_LISTED]:
-        mission = awake.get(name)
+        mission = loaded.get(name)
         if mission is None:
             lines.append(MissionLine(mission_id=name))
         else:

@@ -154,5 +154,5 @@ async def metrics(request: Request) -> Response:
     owned: Metrics = request.state.metrics
     owned.tasks.set(len(asyncio.all_tasks()))
     llm: ServerPool = request.state.llm
-    owned.record_llm(llm.statuses, llm.left_alone)
+    owned.record_llm(llm.statuses, llm.breakers_open)
     return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

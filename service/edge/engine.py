@@ -85,7 +85,7 @@ class Engine:
         self._feedback.finish()
         await self.pipeline.close()
         self.missions.close()
-        await self._feedback.close(self.missions.awake, _LAST_CHECKPOINTS_S)
+        await self._feedback.close(self.missions.loaded, _LAST_CHECKPOINTS_S)
         return await self.journal.close(_LAST_COMMIT_S)
 
     async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 AnyRequest = TypeVar("AnyRequest", DecideRequest, BatchRequest)
 
 # The longest that who asks about a mission waits for its being read back; a decision no longer than its deadline.
-_WAKE_S = 10.0
+_LOAD_S = 10.0
 
 
 class MissionRegistry:
@@ -39,30 +39,30 @@ class MissionRegistry:
         metrics: Metrics,
         journal: Journal | NullJournal,
         store: Store | None,
-        on_wake: Callable[[Mission], None],
+        on_load: Callable[[Mission], None],
     ) -> None:
         self._settings = settings
         self._metrics = metrics
         self._journal = journal
         self._store = store
-        self._on_wake = on_wake
+        self._on_load = on_load
         self._missions: dict[str, Mission] = {}
-        self._asleep = set[str]() if store is None else set(store.missions())
-        self._waking: dict[str, asyncio.Task[Mission]] = {}
+        self._stored = set[str]() if store is None else set(store.missions())
+        self._loading: dict[str, asyncio.Task[Mission]] = {}
         # One after another, and apart from what decisions need: a store that hangs must not keep these waiting, and
         # torch draws initial weights from one generator.
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
         self._count()
 
     @property
-    def awake(self) -> list[Mission]:
+    def loaded(self) -> list[Mission]:
         """Those in memory."""
         return list(self._missions.values())
 
     @property
-    def asleep(self) -> list[str]:
+    def stored(self) -> list[str]:
         """Names of those that are only in the store."""
-        return sorted(self._asleep)
+        return sorted(self._stored)
 
     async def get(self, mission_id: str) -> Mission:
         """A mission, waited for where the store must be read.
@@ -72,7 +72,7 @@ class MissionRegistry:
             Unavailable: the store cannot be read, or takes longer.
             Conflict: what the store has of it is damaged.
         """
-        mission = await self._find(mission_id, _WAKE_S)
+        mission = await self._find(mission_id, _LOAD_S)
         if mission is None:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
@@ -116,7 +116,7 @@ class MissionRegistry:
             Conflict: the mission flies with another spec.
             Unavailable: the store fails.
         """
-        mission = await self._find(mission_id, _WAKE_S)
+        mission = await self._find(mission_id, _LOAD_S)
         if mission is None:
             self.refuse_if_failing("mission_id")
             mission = Mission(mission_id, spec, self._settings)
@@ -128,12 +128,12 @@ class MissionRegistry:
     async def delete(self, mission_id: str) -> None:
         """Forget a mission; raises :class:`NotFound`, or :class:`Unavailable` while the store fails."""
         self.refuse_if_failing("mission_id")
-        if (waking := self._waking.get(mission_id)) is not None:
-            await asyncio.wait({waking})
-        if mission_id not in self._missions and mission_id not in self._asleep:
+        if (loading := self._loading.get(mission_id)) is not None:
+            await asyncio.wait({loading})
+        if mission_id not in self._missions and mission_id not in self._stored:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         self._missions.pop(mission_id, None)
-        self._asleep.discard(mission_id)
+        self._stored.discard(mission_id)
         self._journal.end(mission_id)
         self._count()
 
@@ -147,19 +147,19 @@ class MissionRegistry:
         self._reading.shutdown(wait=False, cancel_futures=True)
 
     async def _find(self, mission_id: str, within_s: float) -> Mission | None:
-        if mission_id in self._asleep:
-            waking = self._waking.get(mission_id)
-            if waking is None:
-                waking = self._waking[mission_id] = asyncio.create_task(self._wake(mission_id), name="wake-mission")
-                waking.add_done_callback(lambda _: self._waking.pop(mission_id, None))
-            await asyncio.wait({waking}, timeout=max(0.0, within_s))
-            if not waking.done():
+        if mission_id in self._stored:
+            loading = self._loading.get(mission_id)
+            if loading is None:
+                loading = self._loading[mission_id] = asyncio.create_task(self._load(mission_id), name="load-mission")
+                loading.add_done_callback(lambda _: self._loading.pop(mission_id, None))
+            await asyncio.wait({loading}, timeout=max(0.0, within_s))
+            if not loading.done():
                 raise Unavailable("mission_id", f"mission {mission_id} is being read back from the store")
             # Raises what it raised. It may have been deleted since.
-            waking.result()
+            loading.result()
         return self._missions.get(mission_id)
 
-    async def _wake(self, mission_id: str) -> Mission:
+    async def _load(self, mission_id: str) -> Mission:
         """Read a mission back, beside the decisions for others."""
         assert self._store is not None and isinstance(self._journal, Journal)
         store = self._store
@@ -184,15 +184,15 @@ class MissionRegistry:
             )
         self._journal.follow(mission, kept.seq, kept.events)
         self._missions[mission_id] = mission
-        self._asleep.discard(mission_id)
-        self._on_wake(mission)
+        self._stored.discard(mission_id)
+        self._on_load(mission)
         return mission
 
     def _add(self, mission: Mission) -> None:
         """Hold it, unless it is held; no other of its ID can have come between, for nothing was waited for."""
         if mission.mission_id in self._missions:
             return
-        if len(self._missions) + len(self._asleep) >= self._settings.max_missions:
+        if len(self._missions) + len(self._stored) >= self._settings.max_missions:
             limit = self._settings.max_missions
             raise Conflict("mission_id", f"{limit} missions are held already: DELETE one, or raise AICVDS_MAX_MISSIONS")
         self._missions[mission.mission_id] = mission
@@ -200,4 +200,4 @@ class MissionRegistry:
         self._count()
 
     def _count(self) -> None:
-        self._metrics.missions.set(len(self._missions) + len(self._asleep))
+        self._metrics.missions.set(len(self._missions) + len(self._stored))

@@ -96,7 +96,7 @@ class NoteCompiler:
 
     async def _ready(self) -> None:
         """Wait while the LLM loads, or recovers."""
-        while self._llm.status != "ready" and self._llm.coming:
+        while self._llm.status != "ready" and self._llm.recovering:
             await asyncio.sleep(_POLL_S)
         if self._llm.status != "ready":
             raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")

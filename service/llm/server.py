@@ -50,7 +50,7 @@ class _Status:
     llm: Literal["loading", "ready", "unavailable", "off"]
     detail: str | None = None
     # Whether the circuit breaker is open.
-    left_alone: bool = False
+    breaker_open: bool = False
 
 
 class LlmServer:
@@ -89,9 +89,9 @@ class LlmServer:
         return self._status.llm
 
     @property
-    def left_alone(self) -> bool:
+    def breaker_open(self) -> bool:
         """Whether its circuit breaker is open."""
-        return self._status.left_alone
+        return self._status.breaker_open
 
     def readiness(self) -> Readiness:
         """What ``/readyz`` says."""
@@ -111,7 +111,7 @@ class LlmServer:
             self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up", context=Context())
 
     @property
-    def coming(self) -> bool:
+    def recovering(self) -> bool:
         """Whether an LLM that is not ready may yet be, without anybody's doing."""
         return self._task is not None and not self._task.done()
 
@@ -214,7 +214,7 @@ class LlmServer:
             return
         pause_s = self._breaker.pause_s
         detail = f"failed too often, the last time by {reason}: left alone {pause_s:g} s"
-        self._status = _Status("unavailable", detail, left_alone=True)
+        self._status = _Status("unavailable", detail, breaker_open=True)
         log.warning("LLM %s", self._status.detail)
         self._on_open()
         self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())

@@ -30,38 +30,38 @@ class ServerPool:
         self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None
 
     @property
-    def present(self) -> LlmServer:
+    def active(self) -> LlmServer:
         """The one that is asked now: the first that is ready, or the first of all."""
         return next((server for server in self._each if server.status == "ready"), self._each[0])
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
-        """Where the present one stands."""
-        return self.present.status
+        """Where the active one stands."""
+        return self.active.status
 
     @property
     def model(self) -> str | None:
-        """The present one's."""
-        return self.present.model
+        """The active one's."""
+        return self.active.model
 
     @property
     def logprobs(self) -> bool:
-        """Whether the present one tells the probabilities of tokens."""
-        return self.present.logprobs
+        """Whether the active one tells the probabilities of tokens."""
+        return self.active.logprobs
 
     @property
     def most_together(self) -> int:
-        """UAVs that the present one may be asked about at once."""
-        return self.present.most_together
+        """UAVs that the active one may be asked about at once."""
+        return self.active.most_together
 
     @most_together.setter
     def most_together(self, most: int) -> None:
-        self.present.most_together = most
+        self.active.most_together = most
 
     @property
-    def coming(self) -> bool:
+    def recovering(self) -> bool:
         """Whether one that is not ready may yet be, without anybody's doing."""
-        return any(server.coming for server in self._each)
+        return any(server.recovering for server in self._each)
 
     @property
     def statuses(self) -> Counter[str]:
@@ -69,15 +69,15 @@ class ServerPool:
         return Counter(server.status for server in self._each)
 
     @property
-    def left_alone(self) -> int:
+    def breakers_open(self) -> int:
         """How many servers' circuit breakers are open."""
-        return sum(server.left_alone for server in self._each)
+        return sum(server.breaker_open for server in self._each)
 
     def readiness(self) -> Readiness:
-        """What ``/readyz`` says: of the present one, and how many more are well."""
-        present = self.present
-        well = sum(server.status == "ready" for server in self._each if server is not present)
-        return present.readiness().model_copy(update={"standing_by": well})
+        """What ``/readyz`` says: of the active one, and how many more are well."""
+        active = self.active
+        well = sum(server.status == "ready" for server in self._each if server is not active)
+        return active.readiness().model_copy(update={"standing_by": well})
 
     def start(self) -> None:
         """Begin loading or probing all of them, unless the LLM is off."""
@@ -97,8 +97,8 @@ class ServerPool:
         return await self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
-        """As :meth:`LlmServer.rewrite`, of the present one."""
-        return await self.present.rewrite(wanted, temperature=temperature, seed=seed)
+        """As :meth:`LlmServer.rewrite`, of the active one."""
+        return await self.active.rewrite(wanted, temperature=temperature, seed=seed)
 
     async def _first(self, ask: Ask, uavs: int = 1) -> Completion:
         """The first answer of those that are well, asked one after another; the first failure where there is none."""

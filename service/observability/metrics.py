@@ -75,16 +75,16 @@ class Metrics:
         self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
         self._tokens = cache(self.llm_tokens.labels)
 
-    def record_llm(self, statuses: Mapping[str, int], left_alone: int) -> None:
+    def record_llm(self, statuses: Mapping[str, int], breakers_open: int) -> None:
         """Where the LLM servers stand now.
 
         Args:
             statuses: how many stand where.
-            left_alone: how many circuit breakers are open.
+            breakers_open: how many circuit breakers are open.
         """
         for status in _STATUSES:
             self.llm_servers.labels(status).set(statuses.get(status, 0))
-        self.llm_breaker_open.set(left_alone)
+        self.llm_breaker_open.set(breakers_open)
 
     def record_decision(self, decision: DecideResponse) -> None:
         """Count one answered decision: source, stages, overhead, tokens, lateness."""

@@ -34,7 +34,7 @@ def test_the_same_flight_learns_the_same(tmp_path: Path, report: Report) -> None
     def flown(name: str) -> tuple[dict[str, Any], list[int]]:
         with running(tmp_path / name) as (client, engine):
             fly(client, report, range(20))
-            mission = settled(engine, engine.missions.awake[0], 57)
+            mission = settled(engine, engine.missions.loaded[0], 57)
             unnamed = {key: value for key, value in state(mission).items() if key not in _NAMED}
             return unnamed, mission.visits.tolist()
 
@@ -49,7 +49,7 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
         first = client.post("/decide", json=report(step=1)).json()
         outcome = {} if cost is None else {"outcome": {"decision_id": first["decision_id"], "cost": cost}}
         second = client.post("/decide", json=report(step=2) | outcome).json()
-        return second["top_k"], engine.missions.awake[0]
+        return second["top_k"], engine.missions.loaded[0]
 
     with running(tmp_path / "with.db") as (client, engine):
         taught, mission = told_by(client, engine, 7.0)

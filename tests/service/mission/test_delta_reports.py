@@ -117,7 +117,7 @@ def test_the_mission_that_is_read_back_is_that_of_full_reports(tmp_path: Path, r
             asked(client, changed(report, first, 1) if name == "delta" else whole(report, 1))
         with running(tmp_path / f"{name}.db") as (client, engine):
             assert client.get("/missions/test").json()["decisions"] == 2
-            state = engine.missions.awake[0].state_dict()
+            state = engine.missions.loaded[0].state_dict()
             # By the decisions' random IDs.
             del state["records"]["open"]
             states.append({part: str(state[part]) for part in ("records", "belief", "decisions")})
@@ -215,7 +215,7 @@ def test_a_base_takes_little(edge: Edge, report: Report, tmp_path: Path) -> None
     with running(tmp_path / "m.db") as (client, engine):
         for step in range(4):
             asked(client, report(step=step, uplink="delta"))
-        (held,) = engine.missions.awake[0].bases._held.values()
+        (held,) = engine.missions.loaded[0].bases._held.values()
         assert held.columns.nbytes == 5 * 8 * 5
         asked(client, report(step=5))
-        assert not engine.missions.awake[0].bases._held
+        assert not engine.missions.loaded[0].bases._held

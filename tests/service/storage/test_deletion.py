@@ -76,7 +76,7 @@ def test_a_mission_deleted_twice_is_gone_when_that_is_said(
 def test_a_deleted_mission_is_gone_from_memory_before_any_collection(tmp_path: Path, report: Report, mode: str) -> None:
     with running(tmp_path / "m.db", mode=mode) as (client, engine):
         fly(client, report, range(3))
-        deleted = weakref.ref(engine.missions.awake[0])
+        deleted = weakref.ref(engine.missions.loaded[0])
         gc.disable()
         try:
             assert client.delete("/missions/test").status_code == 204

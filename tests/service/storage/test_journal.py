@@ -39,7 +39,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
         answer = {"guidance": {"sensors": [{"sensor_id": 2, "visit_every": 4}]}}
         assert client.post("/missions/test/guidance", json=answer).status_code == 200
         fly(client, report, range(20))
-        mission = settled(engine, engine.missions.awake[0], 57)
+        mission = settled(engine, engine.missions.loaded[0], 57)
         on_disk(engine)
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
         before = state(mission)
@@ -66,7 +66,7 @@ def test_a_restarted_edge_flies_on(address: str, report: Report) -> None:
         until(lambda: client.get("/missions/test").json()["learner_updates"] == 12)
         before = client.get("/missions/test").json()
     with running(address, top_k=2, mode="policy") as (client, engine):
-        assert engine.missions.awake == []
+        assert engine.missions.loaded == []
         assert client.get("/missions/test").json() == before
         # The outcomes of decisions from before the restart are known.
         fly(client, report, range(5, 8), owed)
@@ -138,7 +138,7 @@ def test_many_missions_are_woken_when_they_are_asked_about(tmp_path: Path, repor
         for thread in threads:
             thread.join()
         assert answers == [1] * 40
-        assert len(engine.missions.awake) == 20
+        assert len(engine.missions.loaded) == 20
 
 
 def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
@@ -231,7 +231,7 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) 
     with running(path) as (client, engine):
         status = client.get("/missions/test").json()
         assert status["feedback"] >= len(acknowledged)
-        applied = engine.missions.awake[0]._applied
+        applied = engine.missions.loaded[0]._applied
         assert all(name in applied for name in acknowledged[-20:])
 
 
@@ -243,6 +243,6 @@ def test_missions_that_begin_together_are_not_checkpointed_all_at_once(tmp_path:
         assert isinstance(engine.journal, journal.Journal)
         least = {
             next(n for n in range(journal._EVENTS, -1, -1) if engine.journal.due(mission, n) is not None)
-            for mission in engine.missions.awake
+            for mission in engine.missions.loaded
         }
     assert len(least) > 10

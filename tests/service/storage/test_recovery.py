@@ -258,7 +258,7 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
             answer = client.post("/decide/batch", json={"mission_id": "test", "step": step, "uavs": uavs})
             assert answer.status_code == 200, answer.text
             owed = {decision["uav_id"]: decision["decision_id"] for decision in answer.json()["decisions"]}
-        mission = engine.missions.awake[0]
+        mission = engine.missions.loaded[0]
         assert settled(engine, mission, 10).feedback == 15
         # Not a line for each.
         assert sum("falls behind" in line.message for line in caplog.records) == 1
@@ -314,7 +314,7 @@ def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path
         first = client.post("/decide", json=report()).json()
         body = report(step=1, outcome={"decision_id": first["decision_id"], "cost": 0.5})
         answer = client.post("/decide", json=body, headers={"Idempotency-Key": "k"}).json()
-        engine.missions.awake[0]._applied.load_state_dict([])
+        engine.missions.loaded[0]._applied.load_state_dict([])
         again = client.post("/decide", json=body, headers={"Idempotency-Key": "k"})
         assert (again.status_code, again.json()["decision_id"]) == (200, answer["decision_id"])
         assert Outcome.model_validate(body["outcome"]).cost == 0.5
