@@ -6,8 +6,6 @@ from simulator.experiments.plan import Drawing, Experiment
 from simulator.experiments.schemes import every_scheme
 
 _AGES = ("aoi_mean", "aoi_peak", "aoi_worst")
-
-
 EXPERIMENT = Experiment(
     name="aoi",
     title="Age of information",

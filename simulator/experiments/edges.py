@@ -14,12 +14,13 @@ import httpx
 from rich.console import Console
 
 from shared.scenario import Scenario
-from simulator.client import EdgeClient, EdgeError
-from simulator.demo import HOST, check_alive, edge_process, usable_port
+from simulator.client import EdgeClient
+from simulator.client.lossy_transport import LossyTransport
+from simulator.errors import EdgeError
 from simulator.experiments.schemes import ASKED, CHANCE, OFF, WORST, Backing
 from simulator.experiments.stand_ins import answering, drawn, worst
-from simulator.simulate import API_KEY
-from simulator.uplink import LossyTransport
+from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
+from simulator.flying.run import API_KEY
 
 # Settings that say how to reach the LLM or what this machine can bear. Every other one changes what is decided, and
 # a figure must not depend on what happens to be exported.

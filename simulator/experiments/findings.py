@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from io import StringIO
 
+from simulator.errors import UsageError
 from simulator.experiments.flight import Flown
 from simulator.experiments.intervals import METHOD, curve, interval, paired
 from simulator.experiments.measures import MEASURES, STEP_MEASURES, policys_instead
 from simulator.experiments.plan import Drawing, Experiment, Plan, Setup
 from simulator.experiments.result import Curve, Figure, Interval, Paired, Result
 from simulator.experiments.schemes import BOUND, OverEdge, Scheme
-from simulator.record import BadUse
 
 # Of one flight's decisions: a few late answers are the LLM's own weather, more are another method's result.
 _FEW_PCT = 3.0
@@ -45,12 +45,12 @@ def findings(
         said: notes of the run, such as why a scheme could not fly.
 
     Raises:
-        BadUse: no scheme flew at all.
+        UsageError: no scheme flew at all.
     """
     groups = _groups(plan, load)
     flying = [group for group in groups if group.scheme.name != BOUND.name]
     if not flying:
-        raise BadUse(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(said)}")
+        raise UsageError(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(said)}")
     experiment, seeds = plan.experiment, max((group.seeds for group in flying), key=len)
     schemes, curves, lacking = _scores(experiment, flying)
     return Result(

@@ -14,8 +14,9 @@ from typing import Any
 
 from shared.guidance import Guidance, GuidanceState
 from simulator.experiments.schemes import Scheme
-from simulator.record import Record, naming_out
-from simulator.site import Site
+from simulator.records.record import Record
+from simulator.records.run_folder import naming_out
+from simulator.sites.site import Site
 
 # Part of every key: raise it when what a flight keeps, or means, changes.
 FORMAT = 1
@@ -50,7 +51,7 @@ class Decided(Record):
 
 
 class BoundFound(Record):
-    """The clairvoyant bound of one world, packets; see ``simulator.bound``."""
+    """The clairvoyant bound of one world, packets; see ``simulator.flying.clairvoyant_bound``."""
 
     lower_bound: float
     lost_packets: int
@@ -110,7 +111,7 @@ class FlightStore:
     """Flights in a folder, one gzipped JSON file each; a file is there whole or not at all.
 
     Raises:
-        BadUse: the folder cannot be made.
+        UsageError: the folder cannot be made.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -134,7 +135,7 @@ class FlightStore:
             return None
 
     def save(self, key: str, flight: Flown) -> None:
-        """Keep a flight; raises ``BadUse`` if it cannot be written."""
+        """Keep a flight; raises ``UsageError`` if it cannot be written."""
         part = self._folder / f".{key}.{os.getpid()}.part"
         with naming_out(self._folder):
             part.write_bytes(gzip.compress(flight.model_dump_json(exclude_defaults=True).encode(), mtime=0))

@@ -8,13 +8,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from simulator.client import EdgeError
+from simulator.errors import EdgeError, UsageError
 from simulator.experiments.edges import EdgeAt, radio
 from simulator.experiments.flight import BoundFound, Counted, Decided, Flown
 from simulator.experiments.plan import Planned
 from simulator.experiments.schemes import Clairvoyant, Local, OverEdge
-from simulator.mission import Choice, EdgePilot, Flight, LocalPilot, Pilot, fly, new_mission_id
-from simulator.record import BadUse, Decision
+from simulator.flying.flight import Flight, fly
+from simulator.flying.pilots import Choice, EdgePilot, LocalPilot, Pilot
+from simulator.flying.run import new_mission_id
+from simulator.records.decision import Decision
 from simulator.world import Observation
 
 
@@ -49,7 +51,7 @@ def fly_here(planned: Planned) -> Flown:
         pilot: Pilot = LocalPilot(planned.scheme.decides.policy, scenario, planned.seed)
         if planned.scheme.decides.velocity == "full":
             pilot = FullSpeed(planned.scheme.decides.policy, scenario.max_velocity, planned)
-    except (BadUse, ValueError, ImportError, OSError) as error:
+    except (UsageError, ValueError, ImportError, OSError) as error:
         raise CannotFly(str(error)) from error
     return _kept(planned, fly(planned.site, pilot, planned.seed), model=None)
 
@@ -98,7 +100,7 @@ def fly_over(edge: EdgeAt, planned: Planned) -> Flown:
 
 def _bound(planned: Planned, seconds: float) -> Flown:
     try:
-        from simulator.bound import clairvoyant
+        from simulator.flying.clairvoyant_bound import clairvoyant
 
         found = clairvoyant(planned.site, planned.seed, seconds)
     except ImportError as error:

@@ -9,7 +9,7 @@ from itertools import accumulate
 import numpy as np
 
 from simulator.experiments.flight import Counted, Decided, Flown
-from simulator.record import jain_index
+from simulator.records.statistics import jain_index
 
 # Decisions that the policy took because the LLM gave none; `no_candidate` is not among them: nobody was to be asked.
 _INSTEAD_OF_LLM = ("llm_", "answer_", "edge_", "critic_")

@@ -7,7 +7,7 @@ from typing import Literal
 
 from shared.guidance import Guidance, GuidanceAnswer, GuidanceState
 from simulator.client import EdgeClient
-from simulator.record import Record
+from simulator.records.record import Record
 
 _WAIT_S = 300.0
 _POLL_S = 0.2

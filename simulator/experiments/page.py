@@ -14,14 +14,15 @@ from rich.console import Console
 from tyro.conf import arg
 
 from shared.scenario import Scenario
-from simulator.commandline import command_main
+from simulator.cli.running import command_main
+from simulator.errors import UsageError
 from simulator.experiments import claims, jain
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.evidence import ZERO, flew_all
 from simulator.experiments.plots import draw, label_of, measured
 from simulator.experiments.result import Figure, Interval, Result
 from simulator.experiments.tables import cell, measure_tables, pair_tables, row_label
-from simulator.record import BadUse, naming_out
+from simulator.records.run_folder import naming_out
 
 RESULT = "results.json"
 FIGURES = "figures"
@@ -62,7 +63,7 @@ def write_page(runs: Path, out: Path) -> None:
         runs: the folder that ``aicvds experiment`` wrote to. An experiment that it lacks is on the page as not run.
 
     Raises:
-        BadUse: there is no result in it, one cannot be read, or the page cannot be written.
+        UsageError: there is no result in it, one cannot be read, or the page cannot be written.
     """
     found = results_in(runs)
     with naming_out(out):
@@ -75,11 +76,11 @@ def results_in(runs: Path) -> dict[str, Result]:
     """The results in ``runs`` and its folders, by experiment; a full run before a quick one, then the latest.
 
     Raises:
-        BadUse: there is none, or one cannot be read.
+        UsageError: there is none, or one cannot be read.
     """
     paths = sorted([*runs.glob(RESULT), *runs.glob(f"*/{RESULT}")])
     if not paths:
-        raise BadUse(f"--runs {runs} has no {RESULT}; make some with: aicvds experiment all --out {runs}")
+        raise UsageError(f"--runs {runs} has no {RESULT}; make some with: aicvds experiment all --out {runs}")
     results = sorted((_read(path) for path in paths), key=lambda result: (not result.quick, result.created_at))
     return {result.experiment: result for result in results}
 
@@ -90,7 +91,7 @@ def _read(path: Path) -> Result:
     except (OSError, ValidationError) as error:
         told = error.errors(include_url=False)[0] if isinstance(error, ValidationError) else None
         why = f"{'.'.join(map(str, told['loc']))}: {told['msg']}" if told else str(error)
-        raise BadUse(f"{path}: {why}; run that experiment again") from None
+        raise UsageError(f"{path}: {why}; run that experiment again") from None
 
 
 def _figures(result: Result, folder: Path) -> list[tuple[Figure, Path]]:

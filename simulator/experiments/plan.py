@@ -16,7 +16,7 @@ from simulator.experiments.result import Sweep
 from simulator.experiments.schemes import ASKED, PLANNER, Clairvoyant, Local, OverEdge, Scheme
 
 if TYPE_CHECKING:
-    from simulator.site import Site
+    from simulator.sites.site import Site
 
 # So that `all --quick` ends within 15 minutes on two cores, an LLM's decision taking three quarters of a second.
 QUICK_STEPS = 3

@@ -1,7 +1,7 @@
 """The figures of a ``results.json``, in a two-column paper's width: PNG, SVG and PDF, byte for byte the same each time.
 
 Bands and whiskers are 95% intervals over seeds, small dots the seeds. A scheme looks alike on every figure (see
-``simulator.figures.POLICIES``): it is told apart by its dash and marker as well as by its colour.
+``simulator.reporting.figures.POLICIES``): it is told apart by its dash and marker as well as by its colour.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from matplotlib.axis import XAxis, YAxis
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator, SymmetricalLogLocator
 
-from simulator.drawing import DOUBLE_IN, RC, SINGLE_IN
 from simulator.experiments.result import Figure, Interval, Result
-from simulator.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
-from simulator.report import NAMES
+from simulator.reporting.figure_style import DOUBLE_IN, RC, SINGLE_IN
+from simulator.reporting.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
+from simulator.reporting.wording import NAMES
 
 Format = Literal["png", "svg", "pdf"]
 FORMATS: tuple[Format, ...] = ("png", "svg", "pdf")

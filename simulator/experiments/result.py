@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Literal
 
-from simulator.record import Record
+from simulator.records.record import Record
 
 
 class Interval(Record):

@@ -14,6 +14,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from simulator.errors import UsageError
 from simulator.experiments.edges import edge_for
 from simulator.experiments.flight import FlightStore, Flown
 from simulator.experiments.flying import CannotFly, commit, fly_here, fly_over
@@ -21,7 +22,7 @@ from simulator.experiments.measures import policys_instead
 from simulator.experiments.pace import Pace, told
 from simulator.experiments.plan import Experiment, Plan, Planned, Setup, plan
 from simulator.experiments.result import Result
-from simulator.record import BadUse, naming_out
+from simulator.records.run_folder import naming_out
 
 FLIGHTS, RESULT, TABLE = "flights", "results.json", "results.csv"
 # Where nobody watches a progress bar, a line this often.
@@ -48,7 +49,7 @@ class Run:
         """Make the experiments, from flights kept and flown.
 
         Raises:
-            BadUse: the folder cannot be written.
+            UsageError: the folder cannot be written.
             EdgeError: an edge died, or has no LLM though it should have one.
             KeyboardInterrupt: interrupted; what was flown is kept.
         """
@@ -70,7 +71,7 @@ class Run:
         plans = [plan(experiment, self.setup) for experiment in experiments]
         empty = [p.experiment.name for p in plans if not p.flights]
         if len(empty) == len(plans):
-            raise BadUse(f"experiment {', '.join(empty)}: every scheme of it asks an LLM; name one with --llm")
+            raise UsageError(f"experiment {', '.join(empty)}: every scheme of it asks an LLM; name one with --llm")
         if empty:
             self.console.print(f"Without an LLM there is nothing to fly for {', '.join(empty)}.", highlight=False)
         return [p for p in plans if p.flights]

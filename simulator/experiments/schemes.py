@@ -8,7 +8,7 @@ from pydantic import Field
 
 from shared.wire import MissionSpec
 from simulator.experiments.operators import Operator
-from simulator.record import Record
+from simulator.records.record import Record
 
 # Decisions through an edge are compared for what they are, not for how fast this machine is.
 GENEROUS_DEADLINE_MS = 30_000
@@ -96,7 +96,7 @@ def at_full_speed(name: str) -> Scheme:
 
 def locals_there_are(*names: str) -> list[Scheme]:
     """Those of ``names`` that this version of the simulator has, in the order to show them; of no names, all."""
-    from simulator.policies import POLICY_NAMES
+    from simulator.policies.registry import POLICY_NAMES
 
     wanted = names or (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
     return [local(name) for name in wanted if name in POLICY_NAMES]

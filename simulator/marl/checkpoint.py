@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from shared.scenario import Scenario
+from simulator.errors import UsageError
 from simulator.marl.networks import two_heads
-from simulator.record import BadUse
 
 
-class Misfit(BadUse, ValueError):
+class Misfit(UsageError, ValueError):
     """The weights are for scenarios of another size; a command tells it in one line, as it does any bad use."""
 
 

@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 
 from shared.scenario import Scenario
 from simulator.marl.observation import stacked, width
-from simulator.vector import BatchObservation, VectorWorld
 from simulator.world import Cost
+from simulator.world.batch import BatchObservation, VectorWorld
 
 
 class PipelineEnv(EnvBase):  # type: ignore[misc]

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from torch import nn
 
+from shared.channel import IntArray
 from shared.scenario import Scenario
 from simulator.marl.networks import greedy
 from simulator.marl.observation import of_uav, view, without
-from simulator.sensors import IntArray
-from simulator.vector import VectorWorld
+from simulator.world.batch import VectorWorld
 
 
 def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -> IntArray:

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray, packets_per_step
+from shared.channel import FloatArray, IntArray, packets_per_step
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory, trajectories
-from simulator.sensors import IntArray
 
 BoolArray = NDArray[np.bool_]
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from shared.scenario import Scenario
-from simulator.explore import FIRST_TRAINING_SEED
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 # The file in a training's folder to resume from.
 STATE = "state.pt"

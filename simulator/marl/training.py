@@ -13,12 +13,12 @@ from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
 from shared.scenario import Scenario
-from simulator.explore import FIRST_TRAINING_SEED
+from simulator.errors import UsageError
 from simulator.marl import checkpoint
 from simulator.marl.curve import Point
 from simulator.marl.evaluate import lost_packets
 from simulator.marl.plan import STATE, Plan
-from simulator.record import BadUse
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 TENSORBOARD = "tensorboard"
 _CURVE_POINTS = 50
@@ -71,7 +71,7 @@ class Training:
         self.plan = plan
         self.learner = make(plan.scenario, plan.episodes, plan.first_seed)
         if plan.episodes % self.learner.worlds:
-            raise BadUse(
+            raise UsageError(
                 f"--episodes {plan.episodes} is not a multiple of {self.learner.worlds}, the missions flown together"
             )
         self.points: list[Point] = []
@@ -83,18 +83,18 @@ class Training:
         """Go on from the state in the folder.
 
         Raises:
-            BadUse: there is none, or it is of another plan.
+            UsageError: there is none, or it is of another plan.
         """
         try:
             state = checkpoint.read(self._out / STATE)
         except FileNotFoundError:
-            raise BadUse(f"--resume: there is no {STATE} in {self._out}; start without --resume") from None
+            raise UsageError(f"--resume: there is no {STATE} in {self._out}; start without --resume") from None
         except ValueError as error:
-            raise BadUse(f"--resume: {error}; start anew with another --out") from None
+            raise UsageError(f"--resume: {error}; start anew with another --out") from None
         for name, value in self.plan.told().items():
             if state["plan"].get(name) != value:
                 began = state["plan"].get(name)
-                raise BadUse(f"--{name} differs from the training in {self._out}" + _of(name, began))
+                raise UsageError(f"--{name} differs from the training in {self._out}" + _of(name, began))
         self.learner.restore(state["learner"])
         torch.set_rng_state(state["random"])
         self.episodes = state["episodes"]

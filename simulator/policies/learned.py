@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shared.scenario import Scenario
-from simulator.record import BadUse
+from simulator.errors import UsageError
 from simulator.world import Observation
 
 # Torch takes seconds to import, and whoever flies another policy may not have it.
@@ -25,7 +25,7 @@ class Learned:
         checkpoint: weights of that scheme; the ones that ship with the package where none is named.
 
     Raises:
-        BadUse: torch is not installed.
+        UsageError: torch is not installed.
         ValueError: the file holds no such weights; at ``reset``, they are for other numbers of sensors, UAVs or
             velocities than the scenario's.
         OSError: it cannot be read.
@@ -35,7 +35,7 @@ class Learned:
         try:
             from simulator.marl.checkpoint import Checkpoint, shipped
         except ModuleNotFoundError as missing:
-            raise BadUse(
+            raise UsageError(
                 f"policy {scheme} needs {missing.name}, which is not installed. "
                 "Install the extra: pip install 'aic-vds[marl]'"
             ) from None

@@ -15,7 +15,7 @@ from service.pretraining import losses
 from service.recall import recall, references, velocity_agreement, velocity_error
 from service.reward import Reward, fleet_cost
 from shared.rollouts import Header, Reference, RolloutStep
-from simulator.explore import explore
+from simulator.flying.exploration import explore
 from tests.service.making import PAPER
 
 SHORT = PAPER.model_copy(update={"steps": 12})

@@ -15,7 +15,7 @@ from simulator.experiments.flight import Decided, Flown
 from simulator.experiments.plan import Drawing, Experiment, Setup
 from simulator.experiments.runner import Run
 from simulator.experiments.schemes import Scheme, local
-from simulator.site import Site
+from simulator.sites.site import Site
 
 TINY = Scenario(steps=3)
 

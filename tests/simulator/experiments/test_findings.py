@@ -15,7 +15,7 @@ from simulator.experiments.measures import MEASURES, STEP_MEASURES
 from simulator.experiments.plan import QUICK_STEPS, Drawing, Experiment, plan
 from simulator.experiments.result import Result
 from simulator.experiments.schemes import BOUND, llm, local
-from simulator.site import Site
+from simulator.sites.site import Site
 from tests.simulator.experiments.flying_tiny import TINY, decided, declared, flown, setup
 
 LOST = {"eof": 10, "random": 30, "llm": 20}

@@ -12,9 +12,9 @@ from shared.scenario import Scenario
 from simulator.experiments.flight import FlightStore, flight_key
 from simulator.experiments.plan import weights_of
 from simulator.experiments.schemes import BOUND, OFF, Scheme, at_full_speed, llm, local, over_edge
-from simulator.policies import policy_named
-from simulator.rollout import rollout
-from simulator.site import Site
+from simulator.flying.rollout import rollout
+from simulator.policies.registry import policy_named
+from simulator.sites.site import Site
 from tests.simulator.experiments.flying_tiny import TINY, declared, flown, run_in
 
 

@@ -20,7 +20,7 @@ from simulator.experiments.obedience import EXPERIMENT
 from simulator.experiments.operators import Operator, Told
 from simulator.experiments.plan import plan
 from simulator.experiments.schemes import OFF, over_edge
-from simulator.site import Site
+from simulator.sites.site import Site
 from tests.running import serving
 from tests.service.stub_llm import wait_for
 from tests.service.test_guidance import Scribe

@@ -7,7 +7,7 @@ import pytest
 from simulator.experiments.pace import Pace, told
 from simulator.experiments.plan import Planned, plan
 from simulator.experiments.schemes import llm, local, value
-from simulator.site import Site
+from simulator.sites.site import Site
 from tests.simulator.experiments.flying_tiny import TINY, declared, setup
 
 

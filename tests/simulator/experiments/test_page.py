@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from simulator.errors import UsageError
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.page import (
     Swap,
@@ -19,7 +20,6 @@ from simulator.experiments.page import (
 )
 from simulator.experiments.result import Paired, Result
 from simulator.experiments.tables import cell
-from simulator.record import BadUse
 from tests.simulator.experiments.made_results import CURVES, figure, interval, result, zero_from
 
 LATER = datetime(2026, 5, 6, tzinfo=UTC)
@@ -175,12 +175,12 @@ def test_schemes_that_rank_alike_are_not_said_to_swap() -> None:
 
 
 def test_a_folder_without_results_or_with_a_broken_one_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadUse, match=r"has no results\.json; make some with: aicvds experiment all --out"):
+    with pytest.raises(UsageError, match=r"has no results\.json; make some with: aicvds experiment all --out"):
         write_page(tmp_path, tmp_path / "results.md")
     broken = tmp_path / "tokens" / "results.json"
     broken.parent.mkdir()
     broken.write_text('{"experiment": "tokens"}')
-    with pytest.raises(BadUse, match=r"tokens/results\.json: title: Field required; run that experiment again"):
+    with pytest.raises(UsageError, match=r"tokens/results\.json: title: Field required; run that experiment again"):
         write_page(tmp_path, tmp_path / "results.md")
 
 

@@ -7,9 +7,9 @@ from xml.etree import ElementTree
 import pytest
 from PIL import Image
 
-from simulator.drawing import DOUBLE_IN, SINGLE_IN
 from simulator.experiments.plots import BOUND_LABEL, draw, label_of, styles
 from simulator.experiments.result import Result, Sweep
+from simulator.reporting.figure_style import DOUBLE_IN, SINGLE_IN
 from tests.simulator.experiments.made_results import CURVES, figure, interval, result, zero_from
 
 SCHEMES = [

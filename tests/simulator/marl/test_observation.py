@@ -9,8 +9,8 @@ import pytest
 
 from shared.scenario import SCENARIOS, Scenario
 from simulator.marl.observation import View, stacked, taken_by, view, width, without
-from simulator.vector import VectorWorld
 from simulator.world import Observation, PipelineWorld
+from simulator.world.batch import VectorWorld
 
 PAPER = SCENARIOS["paper"]
 ROUTES = Scenario(

@@ -1,0 +1,91 @@
+"""Training missions: exploring UAVs fly a world, beside a teacher or without one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shared.rollouts import Reference, RolloutStep
+from shared.scenario import Scenario
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
+
+# The world and the planner take seconds to import; `--help` and bad use answer without them.
+if TYPE_CHECKING:
+    from simulator.flying.teachers import Action, Teacher, TeacherName
+    from simulator.world import Observation
+
+
+def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None) -> Iterator[RolloutStep]:
+    """One mission's decisions in order of step and UAV, in training world number ``mission``.
+
+    Raises:
+        ModuleNotFoundError: there is a teacher and OR-Tools is not installed (extra ``planner``).
+    """
+    from simulator.client.observation_report import decide_request
+    from simulator.flying.teachers import TEACHERS
+    from simulator.world import PipelineWorld
+
+    rng = np.random.default_rng([FIRST_TRAINING_SEED, mission])
+    world = PipelineWorld(scenario)
+    observations, _ = world.reset(seed=FIRST_TRAINING_SEED + mission)
+    deviation = _Deviation(scenario, mission, rng)
+    asked: Teacher | None = None if teacher is None else TEACHERS[teacher](world)
+    share = 1.0 if asked is None else rng.uniform(0.0, asked.deviations)
+    for step in range(scenario.steps):
+        deviating = bool(rng.random() < share)
+        choices: list[Action] = []
+        references: list[Reference | None] = []
+        for uav in range(scenario.uavs):
+            observation, taken = observations[f"uav_{uav}"], frozenset(sensor for sensor, _ in choices)
+            told = None if asked is None else asked.refer(uav, observation, taken, deviating)
+            choices.append(told if told and not deviating else deviation.instead_of(told, uav, observation, taken))
+            references.append(_reference(teacher, told))
+            if asked is not None:
+                asked.flown(uav, step, choices[-1])
+        requests = [decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in range(scenario.uavs)]
+        observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in enumerate(choices)})
+        for uav, (sensor, velocity) in enumerate(choices):
+            info = infos[f"uav_{uav}"]
+            yield RolloutStep(
+                request=requests[uav],
+                sensor_id=sensor,
+                velocity=velocity,
+                cost=float(info["cost"]),
+                failed=bool(info["failed"]),
+                fleet_lost=world.tally[-1].lost_packets,
+                reference=references[uav],
+            )
+
+
+def _reference(teacher: TeacherName | None, told: Action | None) -> Reference | None:
+    if teacher is None or told is None:
+        return None
+    return Reference(teacher=teacher, sensor_id=told[0], velocity=told[1])
+
+
+class _Deviation:
+    """What a fleet does that leaves its teacher's way, or has none."""
+
+    def __init__(self, scenario: Scenario, mission: int, rng: np.random.Generator) -> None:
+        from simulator.policies.registry import policy_named
+
+        self._rng = rng
+        self._levels = scenario.max_velocity + 1
+        self._guides = [policy_named("eof"), policy_named("wqcs")]
+        for guide in self._guides:
+            guide.reset(scenario, mission)
+
+    def instead_of(self, told: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
+        """A sensor of EOF's, WQCS's or at random, and a random velocity; or one of both as the teacher says."""
+        rng = self._rng
+        sensor, _ = self._guides[rng.integers(2)].decide(uav, observation, taken)
+        heard = np.flatnonzero(observation["last_heard"] >= 0)
+        if rng.random() < 0.5 and len(heard):
+            sensor = int(rng.choice(heard))
+        velocity = int(rng.integers(self._levels))
+        if told is not None:
+            kept = rng.integers(3)
+            return (told[0] if kept == 1 else sensor), (told[1] if kept == 2 else velocity)
+        return sensor, velocity

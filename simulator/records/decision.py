@@ -1,0 +1,56 @@
+"""One decision of a flight: one line of ``decisions.jsonl``."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from shared.wire import Candidate, Tokens
+from simulator.records.record import Record
+
+# Reasons with which the LLM was asked, and its answer or its silence not used.
+_ASKED_IN_VAIN = frozenset(
+    {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
+)
+
+
+DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
+
+
+class Decision(Record):
+    """One decision and what came of it.
+
+    ``position`` is where it was taken, metres. ``source`` is ``onboard`` when the UAV decided itself, and then
+    ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null`` and ``attempts``, ``request_bytes``,
+    ``response_bytes`` and ``attention_bytes`` 0. ``rtt_ms`` includes retries; ``lost_packets`` and ``cost`` are this
+    UAV's share.
+    """
+
+    step: int
+    uav_id: int
+    position: tuple[float, float]
+    sensor_id: int
+    velocity: int
+    source: DecidedBy
+    reason: str | None = None
+    model: str | None = None
+    decision_id: str | None = None
+    top_k: list[Candidate] = []
+    tokens: Tokens | None = None
+    latency_ms: dict[str, float] = {}
+    deadline_ms: int | None = None
+    rtt_ms: float | None = None
+    attempts: int = 0
+    request_bytes: int = 0
+    response_bytes: int = 0
+    attention_bytes: int = 0
+    failed: bool = False
+    collected: int = 0
+    lost_packets: int = 0
+    cost: float = 0.0
+
+
+def asked_llm(decision: Decision) -> bool:
+    """Whether the LLM was asked for it, in vain or not."""
+    if decision.source in ("llm", "guided") or decision.reason in _ASKED_IN_VAIN:
+        return True
+    return decision.tokens is not None and decision.tokens.server_prompt is not None

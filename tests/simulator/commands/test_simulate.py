@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from simulator.commands import demo, simulate
+from simulator.records.decision_log import read_decisions
+from simulator.records.run_folder import DRAWN
+from simulator.records.summary import Summary
+from tests.simulator.edge_stub import EdgeStub, stub_edge
+
+
+@pytest.fixture
+def stub() -> Iterator[EdgeStub]:
+    with stub_edge() as edge:
+        yield edge
+
+
+def summary_in(out: Path) -> Summary:
+    return Summary.model_validate_json((out / "summary.json").read_bytes())
+
+
+def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    code = simulate.main(["--edge", stub.url, "--steps", "3", "--seed", "4", "--deadline-ms", "900", "--out", str(out)])
+    assert code == 0
+    left = ["decisions.jsonl", "figures", "report.html", "requests.jsonl", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == left
+    assert {str(p.relative_to(out)) for p in (out / "figures").iterdir()} == set(DRAWN)
+    summary = summary_in(out)
+    assert (summary.seed, summary.steps, summary.decisions, summary.deadline_ms) == (4, 3, 9, 900)
+    assert len(read_decisions(out / "decisions.jsonl")) == 9
+    assert summary.command.startswith("aicvds simulate --edge http://127.0.0.1")
+    assert set(stub.missions) == {summary.mission_id}
+    assert stub.missions[summary.mission_id].seed == 4
+    assert {d.deadline_ms for d in stub.decides} == {900}
+    printed = capsys.readouterr().out
+    assert "AIC-VDS (6 llm, 3 policy)" in printed
+    assert "The LLM took 6 of 9 decisions" in printed and "llm_timeout 3" in printed
+    assert "80 % read from" in printed and "lost; 6 llm, 3 policy" in printed
+    for words in ("AIC-VDS", "EOF", "WQCS", "summary.json", "report.html"):
+        assert words in printed
+
+
+@pytest.mark.parametrize(("awaited", "polled", "told"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
+def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, told: str
+) -> None:
+    stub.readiness = [(True, "unavailable"), (True, "unavailable"), (True, "ready")]
+    arguments = ["--edge", stub.url, "--steps", "1", "--await-llm", awaited, "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert stub.polled == polled
+    assert told in capsys.readouterr().out
+
+
+def test_an_old_result_is_kept_unless_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert simulate.main(arguments) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    (tmp_path / "figures" / "tokens.pdf").write_text("of a mission that an LLM flew")
+    assert simulate.main([*arguments, "--overwrite"]) == 0
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"losses", "visits"}
+
+
+def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
+    assert simulate.main(["--policy", "round_robin", "--steps", "2", "--out", str(tmp_path)]) == 0
+    summary = summary_in(tmp_path)
+    assert set(summary.lost_packets) == {"round_robin", "eof", "wqcs"}
+    assert summary.edge is None and summary.by_source.onboard == 6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "--edge is missing"),
+        (["--edge", "nowhere"], "'nowhere' is not an edge's URL"),
+        (["--edge", "http://e", "--scenario", "mars"], "unknown scenario 'mars'"),
+        (["--edge", "http://e", "--steps", "0"], "--steps 0"),
+        (["--edge", "http://e", "--seed", "-1"], "--seed -1"),
+        (["--edge", "http://e", "--policy", "magic"], "--policy magic"),
+        (["--edge", "http://e", "--deadline-ms", "5"], "--deadline-ms 5"),
+        (["--edge", "http://e", "--wait-s", "nan"], "--wait-s nan"),
+        (["--edge", "http://e", "--reconnect-s", "-1"], "--reconnect-s -1"),
+        (["--edge", "http://e", "--policy", "eof"], "--policy eof asks no edge"),
+        (["--policy", "eof", "--uplink", "delta"], "--uplink delta means nothing"),
+        (["--edge", "http://e", "--out", __file__], "is a file"),
+        (["--policy", "eof", "--out", f"{__file__}/below"], f"--out {__file__}/below: Not a directory"),
+    ],
+)
+def test_bad_use_is_one_line_and_code_2(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert simulate.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("aicvds simulate: ") and error.count("\n") == 1 and said in error
+
+
+def test_what_tyro_refuses_is_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert simulate.main(["--seed", "x"]) == 2
+    assert simulate.main(["--help"]) == 0
+    assert "AICVDS_API_KEY" in capsys.readouterr().out
+
+
+def test_no_edge_is_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert simulate.main(["--edge", "http://127.0.0.1:1", "--wait-s", "0", "--out", str(out)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "http://127.0.0.1:1" in error
+    assert not out.exists()
+
+
+def test_an_edge_that_never_decides_is_code_1(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub.otherwise = "crash"
+    assert simulate.main(["--edge", stub.url, "--steps", "2", "--out", str(tmp_path)]) == 1
+    assert "6 decisions were taken on board" in capsys.readouterr().err
+    assert summary_in(tmp_path).by_reason == {"edge_refused": 6}
+
+
+def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
+    stub.otherwise, stub.slow_s = "slow", 0.1
+    arguments = ["simulate", "--edge", stub.url, "--out", str(tmp_path)]
+    process = subprocess.Popen([sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.PIPE, text=True)
+    try:
+        give_up = time.monotonic() + 60
+        while stub.asked < 8 and time.monotonic() < give_up:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        printed, _ = process.communicate(timeout=60)
+        assert process.returncode == 130
+    finally:
+        process.kill()
+        process.wait()
+    summary = summary_in(tmp_path)
+    assert f"interrupted after {summary.steps_flown} steps; writing what was flown" in printed
+    assert summary.interrupted and 2 <= summary.steps_flown < 30
+    assert summary.decisions == 3 * summary.steps_flown == len(read_decisions(tmp_path / "decisions.jsonl"))
+    assert f"interrupted after step {summary.steps_flown} of 30" in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_help_comes_without_the_heavy_imports() -> None:
+    code = (
+        "import sys; from simulator.commands import simulate; simulate.main(['--help']);"
+        "print([m for m in ('matplotlib', 'pettingzoo', 'scipy', 'torch') if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+
+
+def test_the_demo_serves_flies_and_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AICVDS_MODE", "value")
+    (tmp_path / "summary.json").write_text("{}", encoding="utf-8")
+    assert demo.main(["--out", str(tmp_path), "--seed", "1"]) == 0
+    summary = summary_in(tmp_path)
+    assert summary.decisions == 90 and summary.mode == "value"
+    assert summary.by_source.value > 80 and summary.by_source.value + summary.by_source.policy == 90
+    assert "Finished server process" in (tmp_path / "edge.log").read_text("utf-8")
+    assert summary.edge is not None
+    port = int(summary.edge.rsplit(":", 1)[1])
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def test_an_edge_that_dies_at_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("AICVDS_MODE", "nonsense")
+    assert demo.main(["--out", str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert "the edge ended with code 2" in error and "AICVDS_MODE" in error
+
+
+def test_a_taken_port_is_bad_use(stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port = stub.url.rsplit(":", 1)[1]
+    assert demo.main(["--out", str(tmp_path), "--port", port]) == 2
+    assert f"--port {port}" in capsys.readouterr().err
+    assert demo.main(["--out", str(tmp_path), "--port", "65536"]) == 2
+
+
+def test_the_demo_stops_its_edge_when_interrupted(tmp_path: Path) -> None:
+    environment = {**os.environ, "AICVDS_MODE": "value"}
+    arguments = ["demo", "--out", str(tmp_path), "--scenario", "dense"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.DEVNULL, env=environment
+    )
+    log = tmp_path / "decisions.jsonl"
+    try:
+        give_up = time.monotonic() + 90
+        while not (log.exists() and log.stat().st_size) and time.monotonic() < give_up:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(90) == 130
+    finally:
+        process.kill()
+        process.wait()
+    assert json.loads((tmp_path / "summary.json").read_bytes())["interrupted"]
+    assert "Finished server process" in (tmp_path / "edge.log").read_text("utf-8")

@@ -1,0 +1,138 @@
+"""Training worlds: apart from every evaluation seed, and flown by teachers whose word is recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shared.rollouts import RolloutStep, read_rollouts
+from shared.scenario import SCENARIOS
+from simulator.commands.explore import main, teacher_of
+from simulator.flying.clairvoyant_bound import clairvoyant
+from simulator.flying.exploration import explore
+from simulator.flying.rollout import rollout
+from simulator.flying.teachers import TEACHERS, Clairvoyant, Planner, TeacherName
+from simulator.policies.registry import policy_named
+from simulator.sites.site import Site
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
+from simulator.world import PipelineWorld
+
+SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
+NAMES: list[TeacherName] = ["planner", "clairvoyant"]
+
+
+def lost(steps: list[RolloutStep]) -> int:
+    return sum(step.fleet_lost for step in steps[:: SHORT.uavs])
+
+
+def flown_as_told(step: RolloutStep) -> bool:
+    told = step.reference
+    return told is not None and (told.sensor_id, told.velocity) == (step.sensor_id, step.velocity)
+
+
+@pytest.mark.parametrize("mission", [0, 1, 599])
+def test_training_worlds_are_no_evaluation_worlds(mission: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    drawn = PipelineWorld.reset
+
+    def reset(world: PipelineWorld, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        assert seed is not None
+        seeds.append(seed)
+        return drawn(world, seed, options)
+
+    monkeypatch.setattr(PipelineWorld, "reset", reset)
+    assert list(explore(SHORT, mission))
+    # Evaluation is on 0 to 999, development on a few thousand more.
+    assert seeds == [FIRST_TRAINING_SEED + mission]
+    assert min(seeds) > 100_000
+
+
+def test_without_a_teacher_there_is_no_reference() -> None:
+    assert [step.reference for step in explore(SHORT, 3)] == [None] * 36
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_same_world_is_explored_the_same_way(name: TeacherName) -> None:
+    assert list(explore(SHORT, 5, name)) == list(explore(SHORT, 5, name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_fleet_flies_as_its_teacher_says_and_sometimes_leaves_its_way(
+    name: TeacherName, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TEACHERS[name], "deviations", 0.6)
+    steps = list(explore(SHORT, 8, name))
+    assert {step.reference.teacher for step in steps if step.reference} == {name}
+    share = np.mean([flown_as_told(step) for step in steps])
+    assert 0.4 < share < 1
+
+
+def test_a_planner_answers_in_states_off_its_way_and_plans_on_from_there() -> None:
+    left = [step for step in explore(SHORT, 8, "planner") if not flown_as_told(step)]
+    assert left
+    assert all(step.reference is not None for step in left)
+
+
+def test_a_planner_left_alone_is_the_policy_mpc(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Planner, "deviations", 0.0)
+    steps = list(explore(SHORT, 8, "planner"))
+    alone = rollout(PipelineWorld(SHORT), policy_named("mpc"), FIRST_TRAINING_SEED + 8)
+    assert all(flown_as_told(step) for step in steps)
+    assert lost(steps) == sum(tally.lost_packets for tally in alone)
+
+
+def test_a_clairvoyant_left_alone_flies_one_plan_that_is_all_but_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Clairvoyant, "deviations", 0.0)
+    steps = list(explore(SHORT, 9, "clairvoyant"))
+    assert all(flown_as_told(step) for step in steps)
+    bound = clairvoyant(Site(SHORT), FIRST_TRAINING_SEED + 9, time_limit_s=20, workers=1)
+    assert bound.lower_bound <= lost(steps) <= bound.lost_packets + 5
+
+
+def test_a_clairvoyant_is_silent_while_the_fleet_leaves_its_way_and_plans_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Clairvoyant, "deviations", 0.6)
+    steps = list(explore(SHORT, 8, "clairvoyant"))
+    silent = {step.request.step for step in steps if step.reference is None}
+    assert silent
+    assert all(flown_as_told(step) for step in steps if step.request.step not in silent)
+    assert any(step > min(silent) for step in range(SHORT.steps) if step not in silent)
+
+
+def test_both_take_turns() -> None:
+    assert [teacher_of("both", mission) for mission in range(4)] == ["planner", "clairvoyant"] * 2
+    assert teacher_of("clairvoyant", 0) == "clairvoyant"
+    assert set(NAMES) == set(TEACHERS)
+
+
+def test_workers_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENARIOS, "paper", SHORT)
+    written = []
+    for workers in ("1", "2"):
+        out = tmp_path / f"{workers}.gz"
+        assert main(["--out", str(out), "--missions", "2", "--untaught", "1", "--workers", workers]) == 0
+        written.append(list(read_rollouts(out)[1]))
+    assert written[0] == written[1]
+    assert len(written[0]) == 3 * 36
+    taught = [{step.reference.teacher for step in written[0][m * 36 :][:36] if step.reference} for m in range(3)]
+    assert taught == [{"planner"}, {"clairvoyant"}, set()]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--missions", "-1"], "--missions -1 is less than 0"),
+        (["--missions", "0", "--untaught", "0"], "there is nothing to fly"),
+        (["--workers", "0"], "--workers 0 is not between 1 and 64"),
+        (["--scenario", "moon"], "unknown scenario 'moon'"),
+    ],
+)
+def test_bad_use_is_one_clear_line(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--out", str(tmp_path / "r.gz"), *options]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1

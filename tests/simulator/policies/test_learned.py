@@ -1,0 +1,151 @@
+"""The learned schemes as policies: greedy, repeatable, and only where they fit."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from shared.scenario import SCENARIOS, Scenario
+from simulator.errors import UsageError
+from simulator.flying.rollout import rollout
+from simulator.marl.checkpoint import Checkpoint, shipped
+from simulator.marl.curve import read_csv
+from simulator.marl.evaluate import lost_packets
+from simulator.marl.networks import two_heads
+from simulator.policies.learned import Learned
+from simulator.policies.registry import policy_named
+from simulator.world import PipelineWorld
+
+PAPER = SCENARIOS["paper"]
+SMALL = Scenario(name="small", sensors=4, uavs=2, steps=6)
+SCHEMES = ["madqn", "mappo"]
+CHECKPOINTS = Path(__file__).parents[3] / "simulator" / "checkpoints"
+
+
+def saved(path: Path, scenario: Scenario = SMALL) -> Path:
+    torch.manual_seed(0)
+    weights = two_heads(scenario).state_dict()
+    Checkpoint("madqn", scenario, 10, 0, "aicvds train madqn", "0", weights).save(path)
+    return path
+
+
+def lost(scheme: str, seed: int) -> int:
+    return sum(t.lost_packets for t in rollout(PipelineWorld(), policy_named(scheme), seed))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_shipped_weights_are_small_and_say_where_they_come_from(scheme: str) -> None:
+    assert (CHECKPOINTS / f"{scheme}.pt").stat().st_size < 5_000_000
+    held = shipped(scheme)
+    assert (held.scheme, held.scenario, held.seed) == (scheme, PAPER, 0)
+    assert held.command == f"aicvds train {scheme} --out runs/{scheme}"
+    assert {value.dtype for value in held.weights.values()} == {torch.float32}
+
+
+def test_madqn_was_trained_for_the_papers_thousand_episodes() -> None:
+    assert shipped("madqn").episodes == 1000
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_shipped_learning_curve_rises(scheme: str) -> None:
+    points = read_csv(CHECKPOINTS / f"{scheme}.csv")
+    fifth = len(points) // 5
+    first, last = points[:fifth], points[-fifth:]
+    assert points[-1].episode == shipped(scheme).episodes
+    assert np.mean([p.lost_packets for p in last]) < 0.7 * np.mean([p.lost_packets for p in first])
+    assert np.mean([p.episode_return for p in last]) > np.mean([p.episode_return for p in first])
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_it_beats_random_by_far_on_evaluation_worlds(scheme: str) -> None:
+    random = [lost("random", seed) for seed in range(6)]
+    assert sum(lost(scheme, seed) for seed in range(6)) < 0.5 * sum(random)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_the_batched_evaluation_in_training_is_that_of_the_policy(scheme: str) -> None:
+    network = shipped(scheme).network(PAPER)
+    assert lost_packets(PAPER, network, range(4)).tolist() == [lost(scheme, seed) for seed in range(4)]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_it_is_greedy_so_the_policys_seed_does_not_matter(scheme: str) -> None:
+    observations, _ = PipelineWorld().reset(seed=3)
+    chosen = set()
+    for seed in range(3):
+        policy = policy_named(scheme)
+        policy.reset(PAPER, seed)
+        chosen.add(policy.decide(0, observations["uav_0"], frozenset()))
+    assert len(chosen) == 1
+
+
+def test_it_takes_what_no_other_took_and_was_heard(tmp_path: Path) -> None:
+    policy = Learned("madqn", saved(tmp_path / "own.pt"))
+    policy.reset(SMALL, 0)
+    drawn = (PipelineWorld(SMALL).reset(seed=seed)[0] for seed in range(50))
+    observations = next(o for o in drawn if np.count_nonzero(o["uav_0"]["last_heard"] >= 0) == 2)
+    heard = set(np.flatnonzero(observations["uav_0"]["last_heard"] >= 0).tolist())
+    one, other = sorted(heard)
+    for taken in (set[int](), {one}, {other}, heard, {0, 1, 2}):
+        sensor, velocity = policy.decide(0, observations["uav_0"], frozenset(taken))
+        assert sensor not in taken
+        assert sensor in heard or not heard - taken
+        assert 0 <= velocity <= 14
+    assert policy.decide(0, observations["uav_0"], frozenset(range(4)))[0] in range(4)
+
+
+def test_a_scenario_of_another_size_says_what_to_train() -> None:
+    policy = policy_named("madqn")
+    message = "madqn was trained for sensors 10, scenario dense has 100: train one with `aicvds train madqn --scenario"
+    with pytest.raises(ValueError, match=message) as refused:
+        policy.reset(SCENARIOS["dense"], 0)
+    assert isinstance(refused.value, UsageError), "a command shows it as one line"
+
+
+def test_weights_of_ones_own_fly_the_scenario_they_were_trained_in(tmp_path: Path) -> None:
+    policy = Learned("madqn", saved(tmp_path / "own.pt"))
+    assert len(rollout(PipelineWorld(SMALL), policy, seed=0)) == 6
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish"])
+def test_a_file_that_holds_no_weights_is_one_clear_error(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "bad.pt").write_bytes(content)
+    with pytest.raises(ValueError, match="bad.pt is no checkpoint of `aicvds train`"):
+        Learned("madqn", tmp_path / "bad.pt")
+
+
+def test_a_state_to_resume_from_is_no_policy(tmp_path: Path) -> None:
+    torch.save({"episodes": 3}, tmp_path / "state.pt")
+    with pytest.raises(ValueError, match="state.pt holds no trained policy: train one with `aicvds train`"):
+        Learned("madqn", tmp_path / "state.pt")
+
+
+@pytest.fixture
+def without_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if neither torch nor TorchRL were installed."""
+    for module in [name for name in sys.modules if name.startswith("simulator.marl")]:
+        monkeypatch.delitem(sys.modules, module)
+    for module in [name for name in sys.modules if name.startswith("torchrl.")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "torchrl", None)
+
+
+@pytest.mark.usefixtures("without_extra")
+def test_without_torch_the_error_names_the_extra_and_others_fly() -> None:
+    with pytest.raises(UsageError, match=r"policy mappo needs torch, .* pip install 'aic-vds\[marl\]'"):
+        policy_named("mappo")
+    assert sum(t.lost_packets for t in rollout(PipelineWorld(), policy_named("eof"), seed=0)) > 0
+
+
+@pytest.mark.usefixtures("without_extra")
+def test_without_torch_training_names_the_extra(tmp_path: Path) -> None:
+    from simulator.commands.train import Train, train
+
+    with pytest.raises(UsageError, match=r"torch is not installed. Install the extra: pip install 'aic-vds\[marl\]'"):
+        train(Train("madqn", out=tmp_path), "aicvds train madqn", Console())
