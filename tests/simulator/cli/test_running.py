@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import pytest
 from rich.console import Console
 
-from simulator.cli.options import check_between, check_deadline, check_seed, check_wait, checked_edge
 from simulator.cli.running import command_main
 from simulator.errors import EdgeError, UsageError
 
@@ -76,31 +75,3 @@ def test_sigterm_ends_a_command_as_ctrl_c_does_and_means_what_it_did_before_afte
     before = signal.getsignal(signal.SIGTERM)
     assert flown([], run) == 130
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.parametrize(
-    ("check", "told"),
-    [
-        (lambda: check_seed(2**32), "--seed 4294967296 is not between 0 and 4294967295"),
-        (lambda: check_seed(-1), "--seed -1 is not between 0 and 4294967295"),
-        (lambda: check_wait(90_000.5), "--wait-s 90000.5 is not between 0 and 86400"),
-        (lambda: check_wait(float("nan")), "--wait-s nan is not between 0 and 86400"),
-        (lambda: check_deadline(9), "--deadline-ms 9 is not between 10 and 60000"),
-        (lambda: check_between("--time-limit-s", 0.0, 0.1, 86_400), "--time-limit-s 0 is not between 0.1 and 86400"),
-        (lambda: checked_edge(None), "--edge is missing: give the edge's address"),
-        (lambda: checked_edge("ftp://edge"), "--edge: "),
-    ],
-)
-def test_a_value_out_of_bounds_is_told_with_its_bounds(check: Callable[[], object], told: str) -> None:
-    with pytest.raises(UsageError) as error:
-        check()
-    assert str(error.value).startswith(told)
-
-
-def test_values_on_their_bounds_are_taken() -> None:
-    check_seed(0)
-    check_seed(2**32 - 1)
-    check_wait(86_400)
-    check_deadline(None)
-    check_deadline(10)
-    assert checked_edge("http://127.0.0.1:8000").startswith("http://127.0.0.1:8000")

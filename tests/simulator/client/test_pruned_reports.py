@@ -117,8 +117,9 @@ import sys
 sys.modules.update(dict.fromkeys(("torch", "scipy", "scipy.special", "ortools"), None))
 from shared.scenario import SCENARIOS
 from simulator.client import EdgeClient
-from simulator.mission import EdgePilot, fly
-from simulator.site import Site
+from simulator.flying.flight import fly
+from simulator.flying.pilots import EdgePilot
+from simulator.sites.site import Site
 scenario = SCENARIOS["paper"].model_copy(update={"steps": 3})
 with EdgeClient(sys.argv[1], uplink="pruned") as client:
     pilot = EdgePilot(client, "m", scenario, 0)

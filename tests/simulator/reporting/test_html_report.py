@@ -12,16 +12,18 @@ from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import LocalPilot
 from simulator.flying.rollout import baselines
 from simulator.records.decision import Decision
-from simulator.records.decision_log import DecisionLog, read_decisions
-from simulator.records.statistics import jain_index, visits_per_sensor
 from simulator.records.summary import Summary, summarise
 from simulator.reporting import figures
 from simulator.reporting.html_report import costliest, drawings, render_report, write_report
-from simulator.reporting.wording import llm_notice, number, policy_labels, verdict
+from simulator.reporting.wording import llm_notice, policy_labels
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
+
+
 EVIL = '<script>alert("$x$")</script>&amp;'
+
+
 SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "glossary", "provenance")
 
 
@@ -129,15 +131,6 @@ def test_a_policy_has_one_colour_on_every_page(flight: Flight) -> None:
     assert figures.POLICIES["eof"][0].lower() in alone and figures.POLICIES["aic_vds"][0].lower() not in alone
 
 
-def test_the_verdict_ranks(flight: Flight) -> None:
-    summary = summary_of(flight, None)
-    for lost, rank in ((1, "the fewest"), (2, "as many as the best"), (3, "neither"), (4, "neither"), (5, "the most")):
-        told = verdict(summary.model_copy(update={"lost_packets": {"aic_vds": lost, "eof": 2, "wqcs": 4}}))
-        assert rank in told and told.count(".") == 1
-    assert "the same" in verdict(summary.model_copy(update={"lost_packets": {"eof": 2, "wqcs": 2}}))
-    assert "Nothing was flown" in verdict(summary.model_copy(update={"steps_flown": 0}))
-
-
 def test_the_costliest_decisions_come_first() -> None:
     flown = [decision(step=n, cost=float(n % 7)) for n in range(30)]
     shown = costliest(flown)
@@ -207,48 +200,3 @@ def test_figures_are_written_for_print(tmp_path: Path) -> None:
         assert b"/FontFile2" in pdf and b"<text" in svg
         assert pdf == (tmp_path / "b" / "figures" / f"{name}.pdf").read_bytes()
         assert svg == (tmp_path / "b" / "figures" / f"{name}.svg").read_bytes()
-
-
-def test_a_torn_last_line_is_left_out(tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
-    whole = [decision(step=0), decision(step=1)]
-    with DecisionLog(path) as log:
-        for one in whole:
-            log.append(one)
-    full = path.read_bytes()
-    for torn in (full + b'{"step": 2, "uav', full + b'{"step": 2, "reason": "\xc3', full + b"\n"):
-        path.write_bytes(torn)
-        assert read_decisions(path) == whole
-
-
-def test_a_broken_line_elsewhere_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "decisions.jsonl"
-    path.write_text("{}\n" + decision().model_dump_json() + "\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="line 1"):
-        read_decisions(path)
-
-
-def test_each_line_is_on_disk_at_once(tmp_path: Path) -> None:
-    with DecisionLog(tmp_path / "d.jsonl") as log:
-        log.append(decision())
-        assert len(read_decisions(tmp_path / "d.jsonl")) == 1
-
-
-def test_an_interrupt_in_the_middle_of_a_step_leaves_whole_steps(tmp_path: Path) -> None:
-    with DecisionLog(tmp_path / "d.jsonl") as log:
-        for step in range(3):
-            log.append(decision(step=step))
-        log.keep([decision(step=0)])
-        log.append(decision(step=1))
-    assert [d.step for d in read_decisions(tmp_path / "d.jsonl")] == [0, 1]
-
-
-def test_jains_index() -> None:
-    assert jain_index([3, 3, 3]) == pytest.approx(1)
-    assert jain_index([5, 0, 0, 0]) == pytest.approx(1 / 4)
-    assert jain_index([0, 0]) is None
-    assert visits_per_sensor([decision(), decision(failed=True), decision(sensor_id=2)], 3) == [1, 0, 1]
-
-
-def test_numbers_for_people() -> None:
-    assert [number(None), number(1234.56), number(0.5, 3)] == ["–", "1,234.6", "0.500"]
