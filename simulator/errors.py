@@ -6,22 +6,22 @@ from shared.wire import Problem
 
 
 class UsageError(Exception):
-    """What was asked for cannot be done; the text says what to ask for instead."""
+    """The command's options or files are unusable; the text says how to correct them."""
 
 
 class EdgeError(Exception):
-    """The edge gave no usable answer."""
+    """A call to the edge yielded no usable answer."""
 
 
 class EdgeUnreachable(EdgeError):
-    """Every attempt failed on the way, or the edge was too busy each time; the text names the URL and the cause."""
+    """Every attempt failed in transport, or the edge was overloaded each time; the text names the URL and the cause."""
 
 
 class EdgeRefused(EdgeError):
-    """The edge answered, and the answer was no.
+    """The edge answered with an error.
 
-    ``status`` is the HTTP status, ``detail`` the problem's own words, ``errors`` its fields at fault, ``type`` its
-    type, ``about:blank`` where it has none of its own.
+    ``status`` is the HTTP status. ``detail``, ``errors`` (the invalid fields) and ``type`` (``about:blank`` by default)
+    are those of the problem document.
     """
 
     def __init__(self, url: str, problem: Problem, status: int) -> None:
@@ -38,4 +38,4 @@ class EdgeRefused(EdgeError):
 
 
 class EdgeProtocolError(EdgeError):
-    """Something answered with success, and the answer is not what an AIC-VDS edge says."""
+    """A server answered with success, but the answer does not follow the edge's protocol."""

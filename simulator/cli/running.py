@@ -24,18 +24,18 @@ def command_main(options: type[Options], prog: str, argv: list[str], run: Callab
     Args:
         options: the dataclass whose fields are the command's options and whose docstring is its ``--help``.
         prog: the command as people type it, such as ``aicvds simulate``.
-        argv: the words after it.
-        run: the command itself; returns its exit code, and may raise what :func:`reporting` tells of.
+        argv: the arguments after it.
+        run: the command itself; returns its exit code, and may raise the errors of :func:`run_reporting_errors`.
     """
     try:
         chosen = tyro.cli(options, prog=prog, args=argv)
     except SystemExit as done:
         return done.code if isinstance(done.code, int) else 2
-    return reporting(prog, lambda console: run(chosen, console))
+    return run_reporting_errors(prog, lambda console: run(chosen, console))
 
 
-def reporting(prog: str, run: Callable[[Console], int]) -> int:
-    """Run a command with its errors as one line on stderr and an exit code; SIGTERM ends it as Ctrl-C does."""
+def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
+    """Run a command; print its errors as one line on stderr and return an exit code. SIGTERM acts like Ctrl-C."""
     try:
         with sigterm_interrupts():
             return run(Console())
@@ -55,7 +55,7 @@ def reporting(prog: str, run: Callable[[Console], int]) -> int:
 
 @contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """Within, SIGTERM raises KeyboardInterrupt, so that `docker stop` leaves a result as Ctrl-C does."""
+    """Within the context, SIGTERM raises KeyboardInterrupt, so that `docker stop` leaves a result as Ctrl-C does."""
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt

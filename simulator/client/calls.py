@@ -1,8 +1,8 @@
-"""What is asked of an edge, when it is asked again, and what counts as an answer; without network or waiting.
+"""The calls to an edge: requests, retries and checks of the answers, without network or waiting.
 
-A call is a generator. It yields what is to be done, a :class:`Send` or a :class:`Pause`; whoever runs it does that, and
-sends the HTTP answer in or throws the ``httpx`` error; what it returns is the call's result. So the synchronous and the
-asynchronous client of :mod:`simulator.client` are one and the same but for how they wait.
+A call is a generator. It yields a :class:`Send` or a :class:`Pause`. Its runner, a client, carries that out and sends
+the HTTP response into the generator, or throws the ``httpx`` error. The generator returns the result of the call. The
+synchronous and the asynchronous client of :mod:`simulator.client` therefore differ only in how they wait.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Send:
-    """One HTTP request, to be sent once."""
+    """One HTTP request, sent once."""
 
     method: str
     path: str
@@ -63,7 +63,7 @@ class Send:
 
 @dataclass(frozen=True)
 class Pause:
-    """Wait so many seconds."""
+    """A wait of so many seconds."""
 
     seconds: float
 
@@ -73,11 +73,12 @@ Call = Generator[Send | Pause, httpx.Response | None, Result]
 
 @dataclass(frozen=True)
 class Exchange:
-    """One decision and what it took: milliseconds from the first attempt to the answer, retries included,
-    and the bytes of the request's body (of one attempt) and of the answer's.
+    """One decision and its transfer.
 
-    A report that the edge could not complete was sent again in full: then of both bodies. ``attention_bytes`` is what
-    a UAV that prunes on board was sent before it asked, as it came.
+    ``rtt_ms`` is the time from the first attempt to the answer, retries included, in milliseconds. ``request_bytes``
+    and ``response_bytes`` are the sizes of the bodies, the request's of one attempt. A report that the edge could not
+    complete is sent again in full, and then ``request_bytes`` counts both bodies. ``attention_bytes`` is the size of
+    the weights that a UAV with pruning on board fetched before the request, as transferred.
     """
 
     response: DecideResponse
@@ -88,7 +89,7 @@ class Exchange:
     attention_bytes: int = 0
 
     def outcome(self, cost: float, failed: bool) -> Outcome:
-        """What came of the decision, to be told with this UAV's next request."""
+        """The outcome of the decision, for this UAV's next request."""
         round_trip_ms = min(round(self.rtt_ms, 3), MAX_ROUND_TRIP_MS)
         decision_id = self.response.decision_id
         return Outcome(decision_id=decision_id, cost=cost, failed=failed, round_trip_ms=round_trip_ms)
@@ -98,7 +99,7 @@ def edge_url(text: str) -> str:
     """The edge's base URL, without a trailing slash.
 
     Raises:
-        ValueError: it is no http or https URL with a host, or it carries a password.
+        ValueError: it is no http or https URL with a host, or it has a password.
     """
     try:
         url = httpx.URL(text)
@@ -108,14 +109,15 @@ def edge_url(text: str) -> str:
         raise ValueError(f"{text!r} is not an edge's URL; write it like http://127.0.0.1:8000")
     if url.userinfo or url.query or url.fragment:
         # The URL goes into summary.json and the report; a secret must not.
-        raise ValueError("an edge's URL carries no user, password, query or fragment; set AICVDS_API_KEY for a key")
+        raise ValueError("an edge's URL has no user, password, query or fragment; set AICVDS_API_KEY for a key")
     return str(url).rstrip("/")
 
 
 class Calls:
-    """The calls to one edge. ``attempts`` is how often each is tried in all; ``seed`` fixes the pauses' draws.
+    """The calls to one edge.
 
-    ``uplink`` says how much of a report is sent.
+    ``attempts`` is the number of attempts of each call, ``seed`` fixes the draws of the pauses, and ``uplink`` selects
+    the encoder of the reports.
 
     Raises:
         ValueError: ``base_url`` is no edge's URL (see :func:`edge_url`), or ``attempts`` is below 1.
@@ -127,8 +129,8 @@ class Calls:
         self.base_url = edge_url(base_url)
         self._attempts = attempts
         self._random = random.Random(f"backoff-{seed}")
-        self._reports = encoder_of(uplink)
-        # What a reduced report leaves out need not say that it is nothing.
+        self._encoder = encoder_of(uplink)
+        # Reduced reports omit fields at their defaults too.
         self._terse = uplink != "full"
 
     def wait_ready(
@@ -157,11 +159,11 @@ class Calls:
 
     def put_mission(self, mission_id: str, spec: MissionSpec) -> Call[MissionStatus]:
         """``PUT /missions/{id}``."""
-        return self._asked("PUT", f"/missions/{mission_id}", MissionStatus, spec)
+        return self._request("PUT", f"/missions/{mission_id}", MissionStatus, spec)
 
     def mission(self, mission_id: str) -> Call[MissionStatus]:
         """``GET /missions/{id}``."""
-        return self._asked("GET", f"/missions/{mission_id}", MissionStatus)
+        return self._request("GET", f"/missions/{mission_id}", MissionStatus)
 
     def delete_mission(self, mission_id: str) -> Call[None]:
         """``DELETE /missions/{id}``."""
@@ -169,15 +171,15 @@ class Calls:
 
     def guidance(self, mission_id: str) -> Call[GuidanceStatus]:
         """``GET /missions/{id}/guidance``."""
-        return self._asked("GET", f"/missions/{mission_id}/guidance", GuidanceStatus)
+        return self._request("GET", f"/missions/{mission_id}/guidance", GuidanceStatus)
 
     def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> Call[GuidanceStatus]:
         """``POST /missions/{id}/guidance``."""
-        return self._asked("POST", f"/missions/{mission_id}/guidance", GuidanceStatus, given)
+        return self._request("POST", f"/missions/{mission_id}/guidance", GuidanceStatus, given)
 
     def feedback(self, outcome: FeedbackRequest) -> Call[FeedbackResponse]:
         """``POST /feedback``."""
-        return self._asked("POST", "/feedback", FeedbackResponse, outcome)
+        return self._request("POST", "/feedback", FeedbackResponse, outcome)
 
     def decide(self, request: DecideRequest, attempts: int | None) -> Call[Exchange]:
         """``POST /decide``, timed."""
@@ -185,7 +187,7 @@ class Calls:
         fetched = yield from self._refresh(mission_id, step, request.uav_id)
         began = time.perf_counter()
         answer, tried, sent = yield from self._decided(
-            "/decide", [request], lambda: self._reports.reduced(mission_id, step, request), attempts
+            "/decide", [request], lambda: self._encoder.reduced(mission_id, step, request), attempts
         )
         rtt_ms = (time.perf_counter() - began) * 1000
         response = self._parse(DecideResponse, answer, "/decide")
@@ -199,7 +201,7 @@ class Calls:
             yield from self._refresh(mission_id, step, uav.uav_id)
 
         def reduced() -> BatchRequest:
-            uavs = [self._reports.reduced(mission_id, step, uav) for uav in request.uavs]
+            uavs = [self._encoder.reduced(mission_id, step, uav) for uav in request.uavs]
             return request.model_copy(update={"uavs": uavs})
 
         answer, _, _ = yield from self._decided("/decide/batch", request.uavs, reduced, None)
@@ -211,25 +213,28 @@ class Calls:
         return batch
 
     def _refresh(self, mission_id: str, step: int, uav_id: int) -> Call[int]:
-        """Fetch what a UAV's uplink needs; returns the bytes. Without it reports are sent as before, or in full."""
+        """Fetch the resources that the uplink's encoder needs; returns the bytes fetched.
+
+        After a failed fetch, the encoder works with the resources that it has.
+        """
         fetched = 0
         try:
-            while (wanted := self._reports.missing(mission_id, step, uav_id)) is not None:
+            while (wanted := self._encoder.missing(mission_id, step, uav_id)) is not None:
                 headers = None if wanted.etag is None else {"If-None-Match": wanted.etag}
                 answer, _ = yield from self._exchange(Send("GET", wanted.path, headers=headers), attempts=1)
                 fetched += answer.num_bytes_downloaded
                 unchanged = answer.status_code == NOT_MODIFIED
-                told = None if unchanged else self._parse(wanted.model, answer, wanted.path)
-                self._reports.take(uav_id, step, told, answer.headers.get("ETag"))
+                resource = None if unchanged else self._parse(wanted.model, answer, wanted.path)
+                self._encoder.take(uav_id, step, resource, answer.headers.get("ETag"))
         except (EdgeError, ValueError):
-            # No decision is to fail by it.
+            # A failed fetch must not fail the decision.
             return fetched
         return fetched
 
     def _decided(
         self, path: str, uavs: Sequence[UavState], reduced: Callable[[], BaseModel], attempts: int | None
     ) -> Call[tuple[httpx.Response, int, int]]:
-        """The answer, the attempts, and the bytes of the body: of both, where the edge wants it in full after all."""
+        """The answer, the number of attempts, and the bytes sent: of both bodies if the edge needs the full report."""
         send = self._deciding(path, reduced())
         try:
             answer, tried = yield from self._exchange(send, attempts)
@@ -238,24 +243,24 @@ class Calls:
             if refused.type != INCOMPLETE:
                 raise
         for uav in uavs:
-            self._reports.forget(uav.uav_id)
+            self._encoder.forget(uav.uav_id)
         whole = self._deciding(path, reduced())
         answer, tried = yield from self._exchange(whole, attempts)
         return answer, 1 + tried, len(send.content or b"") + len(whole.content or b"")
 
     def _deciding(self, path: str, request: BaseModel) -> Send:
-        # What is sent again, because its answer was lost on the way, gets that answer.
+        # A retry with the same key after a lost response gets that response.
         body = request.model_dump_json(exclude_defaults=self._terse).encode()
         return Send("POST", path, body, {"Idempotency-Key": uuid.uuid4().hex})
 
-    def _check(self, response: DecideResponse, asked: UavState, step: int, path: str) -> None:
-        if response.sensor_id not in asked.sensors.id:
+    def _check(self, response: DecideResponse, uav: UavState, step: int, path: str) -> None:
+        if response.sensor_id not in uav.sensors.id:
             raise EdgeProtocolError(f"{self.base_url}{path} chose sensor {response.sensor_id}, which was not offered")
-        if (response.uav_id, response.step) != (asked.uav_id, step):
+        if (response.uav_id, response.step) != (uav.uav_id, step):
             raise EdgeProtocolError(f"{self.base_url}{path} answered for another UAV or step")
-        self._reports.answered(asked, response)
+        self._encoder.answered(uav, response)
 
-    def _asked(self, method: str, path: str, model: type[Answer], body: BaseModel | None = None) -> Call[Answer]:
+    def _request(self, method: str, path: str, model: type[Answer], body: BaseModel | None = None) -> Call[Answer]:
         content = None if body is None else body.model_dump_json().encode()
         answer, _ = yield from self._exchange(Send(method, path, content))
         return self._parse(model, answer, path)
@@ -281,7 +286,7 @@ class Calls:
             raise _TryAgain(f"{type(error).__name__}: {error}" if str(error) else type(error).__name__) from error
         except httpx.DecodingError as error:
             raise EdgeProtocolError(f"{url} answered with a broken body: {error}") from error
-        assert answer is not None, "whoever runs a call answers a Send with the response"
+        assert answer is not None, "the runner of a call answers a Send with the response"
         if answer.status_code in RETRIED_STATUS:
             raise _TryAgain(f"{answer.status_code} {_problem(answer).detail}", _retry_after(answer))
         if answer.status_code >= 400:
@@ -307,7 +312,7 @@ class Calls:
 
 
 class _TryAgain(Exception):
-    """A failure that another attempt may mend."""
+    """A failure that a retry may cure."""
 
     def __init__(self, cause: str, retry_after_s: float | None = None) -> None:
         super().__init__(cause)
@@ -319,9 +324,9 @@ def _problem(answer: httpx.Response) -> Problem:
     try:
         return Problem.model_validate_json(answer.content)
     except ValidationError:
-        # A proxy's error page, say: its words are all there is, and the first line of them enough.
-        words = answer.text.strip().splitlines()
-        detail = words[0][:200] if words else answer.reason_phrase
+        # Such as a proxy's error page: its first line is the detail.
+        lines = answer.text.strip().splitlines()
+        detail = lines[0][:200] if lines else answer.reason_phrase
         return Problem(title=answer.reason_phrase, status=answer.status_code, detail=detail)
 
 

@@ -1,4 +1,4 @@
-"""The UAVs' side of the wire: one edge, asked over HTTP, with bounded retries and a clock; blocking or in asyncio."""
+"""Clients of one edge over HTTP, with bounded retries and timed decisions: a blocking one and one for asyncio."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from simulator.client.calls import Call, Calls, Exchange, Pause, Result
 class EdgeClient:
     """A synchronous client of one edge; use it as a context manager.
 
-    Connection errors, timeouts and 429/502/503/504 are tried again, ``attempts`` times in all, after a
-    random pause of at most 0.1 s, doubled each time up to 2 s; a ``Retry-After`` is honoured up to 5 s.
-    ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network
-    (see :mod:`simulator.client.lossy_transport`); ``seed`` fixes the draws of the pauses. ``uplink`` selects the part
-    of a report that is sent: all of it (``full``), the changes (``delta``), or the sensors that the mission's
-    attention, computed here, keeps (``pruned``). Every call takes the full report, and the full report is sent where
-    the edge needs it.
+    Connection errors, timeouts and 429/502/503/504 are retried, ``attempts`` attempts in all. The pause before a retry
+    is random, at most 0.1 s, and this limit doubles each time up to 2 s; a ``Retry-After`` is honoured up to 5 s.
+    ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network (see
+    :mod:`simulator.client.lossy_transport`); ``seed`` fixes the draws of the pauses. ``uplink`` selects the part of a
+    report that is sent: all of it (``full``), the changes (``delta``), or the sensors that the mission's attention,
+    computed here, keeps (``pruned``). Every call takes the full report, and the full report is sent where the edge
+    needs it.
 
     Raises (every method):
-        EdgeUnreachable: no attempt got through.
-        EdgeRefused: the edge answered with an error that another attempt would not mend.
-        EdgeProtocolError: what answered is no AIC-VDS edge.
+        EdgeUnreachable: no attempt succeeded.
+        EdgeRefused: the edge answered with an error that a retry cannot cure.
+        EdgeProtocolError: the server is no AIC-VDS edge.
     """
 
     def __init__(
@@ -99,48 +99,48 @@ class EdgeClient:
     ) -> Readiness:
         """Poll ``/readyz`` until the edge can decide and its LLM's state is none of ``wait_out``.
 
-        After ``timeout_s`` seconds an edge that decides is returned as it is. ``on_wait`` hears, before each pause,
-        what is being waited for.
+        After ``timeout_s`` seconds the readiness of an edge that can decide is returned whatever its LLM's state.
+        ``on_wait`` is called with the cause of the wait before each pause.
         """
         return self._run(self._calls.wait_ready(timeout_s, wait_out, on_wait))
 
     def put_mission(self, mission_id: str, spec: MissionSpec) -> MissionStatus:
-        """Make the mission at the edge."""
+        """Create the mission at the edge."""
         return self._run(self._calls.put_mission(mission_id, spec))
 
     def mission(self, mission_id: str) -> MissionStatus:
-        """Where the mission stands."""
+        """The mission's status."""
         return self._run(self._calls.mission(mission_id))
 
     def delete_mission(self, mission_id: str) -> None:
-        """Have the edge forget the mission and what it learned."""
+        """Delete the mission and its learned state at the edge."""
         self._run(self._calls.delete_mission(mission_id))
 
     def guidance(self, mission_id: str) -> GuidanceStatus:
-        """What the edge understood of the operator's note."""
+        """The edge's compilation of the operator's note, and its state."""
         return self._run(self._calls.guidance(mission_id))
 
     def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> GuidanceStatus:
-        """Confirm or reject it, or give a structure in its place."""
+        """Confirm or reject the compiled guidance, or replace it by a structure."""
         return self._run(self._calls.answer_guidance(mission_id, given))
 
     def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
-        """Ask for one decision, and time it; ``attempts`` overrides the client's."""
+        """Request one decision, and time it; ``attempts`` overrides the client's."""
         return self._run(self._calls.decide(request, attempts))
 
     def decide_batch(self, request: BatchRequest) -> BatchResponse:
-        """Ask for the decisions of all UAVs of a step."""
+        """Request the decisions for all UAVs of a step."""
         return self._run(self._calls.decide_batch(request))
 
     def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
-        """Send an outcome on its own."""
+        """Send an outcome without a request for a decision."""
         return self._run(self._calls.feedback(outcome))
 
 
 class AsyncEdgeClient:
     """:class:`EdgeClient` for asyncio: the same calls, retries and errors; use it as an asynchronous context manager.
 
-    A call that is cancelled is not sent again. ``transport`` replaces the network.
+    A cancelled call is not retried. ``transport`` replaces the network.
     """
 
     def __init__(
@@ -201,41 +201,41 @@ class AsyncEdgeClient:
     ) -> Readiness:
         """Poll ``/readyz`` until the edge can decide and its LLM's state is none of ``wait_out``.
 
-        After ``timeout_s`` seconds an edge that decides is returned as it is. ``on_wait`` hears, before each pause,
-        what is being waited for.
+        After ``timeout_s`` seconds the readiness of an edge that can decide is returned whatever its LLM's state.
+        ``on_wait`` is called with the cause of the wait before each pause.
         """
         return await self._run(self._calls.wait_ready(timeout_s, wait_out, on_wait))
 
     async def put_mission(self, mission_id: str, spec: MissionSpec) -> MissionStatus:
-        """Make the mission at the edge."""
+        """Create the mission at the edge."""
         return await self._run(self._calls.put_mission(mission_id, spec))
 
     async def mission(self, mission_id: str) -> MissionStatus:
-        """Where the mission stands."""
+        """The mission's status."""
         return await self._run(self._calls.mission(mission_id))
 
     async def delete_mission(self, mission_id: str) -> None:
-        """Have the edge forget the mission and what it learned."""
+        """Delete the mission and its learned state at the edge."""
         await self._run(self._calls.delete_mission(mission_id))
 
     async def guidance(self, mission_id: str) -> GuidanceStatus:
-        """What the edge understood of the operator's note."""
+        """The edge's compilation of the operator's note, and its state."""
         return await self._run(self._calls.guidance(mission_id))
 
     async def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> GuidanceStatus:
-        """Confirm or reject it, or give a structure in its place."""
+        """Confirm or reject the compiled guidance, or replace it by a structure."""
         return await self._run(self._calls.answer_guidance(mission_id, given))
 
     async def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
-        """Ask for one decision, and time it; ``attempts`` overrides the client's."""
+        """Request one decision, and time it; ``attempts`` overrides the client's."""
         return await self._run(self._calls.decide(request, attempts))
 
     async def decide_batch(self, request: BatchRequest) -> BatchResponse:
-        """Ask for the decisions of all UAVs of a step."""
+        """Request the decisions for all UAVs of a step."""
         return await self._run(self._calls.decide_batch(request))
 
     async def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
-        """Send an outcome on its own."""
+        """Send an outcome without a request for a decision."""
         return await self._run(self._calls.feedback(outcome))
 
 

@@ -1,4 +1,4 @@
-"""The radio link between a UAV and the edge, when the scenario says that it loses requests."""
+"""An HTTP transport that delays and loses requests, as the radio link of a scenario with a lossy uplink."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import httpx
 
 
 class LossyTransport(httpx.BaseTransport):
-    """Delays every request by up to ``jitter_ms`` and loses the share ``drop`` of them.
+    """Delays every request by up to ``jitter_ms`` and loses a share ``drop`` of the requests.
 
-    A lost request never reaches the edge: after its delay it raises ``httpx.ConnectTimeout``, so
-    that the client's retries meet the loss as they would a real one. The draws come from ``seed``
-    alone, two a request, so a mission meets the same losses each time that it is flown.
+    A lost request never reaches the edge: after its delay it raises ``httpx.ConnectTimeout``, which the client retries
+    like a real loss. The draws depend on ``seed`` alone, two a request, so a repeated mission has the same losses.
 
     Raises:
         ValueError: ``drop`` is no probability below 1, or ``jitter_ms`` is negative.
@@ -28,7 +27,7 @@ class LossyTransport(httpx.BaseTransport):
         self._random = random.Random(f"uplink-{seed}")
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
-        """Pass the request on, late, or lose it.
+        """Forward the request after a delay, or lose it.
 
         Raises:
             httpx.ConnectTimeout: the request was lost.
@@ -40,5 +39,5 @@ class LossyTransport(httpx.BaseTransport):
         return self._inner.handle_request(request)
 
     def close(self) -> None:
-        """Close the transport underneath."""
+        """Close the wrapped transport."""
         self._inner.close()

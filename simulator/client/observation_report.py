@@ -15,13 +15,13 @@ def decide_request(
     deadline_ms: int | None = None,
     outcome: Outcome | None = None,
 ) -> DecideRequest:
-    """What one UAV sends: its observation as columns, ``null`` where it never heard a beacon.
+    """One UAV's request: its observation as columns, ``null`` for sensors that it never heard.
 
     Raises:
         pydantic.ValidationError: the observation breaks a bound of the wire.
     """
     heard = observation["last_heard"].tolist()
-    places = observation["sensor_position"]
+    positions = observation["sensor_position"]
 
     def column(values: FloatArray) -> list[float | None]:
         return [value if step >= 0 else None for value, step in zip(values.tolist(), heard, strict=True)]
@@ -34,8 +34,8 @@ def decide_request(
         progress_m=float(observation["progress"][0]),
         sensors=SensorColumns(
             id=list(range(len(heard))),
-            x=places[:, 0].tolist(),
-            y=places[:, 1].tolist(),
+            x=positions[:, 0].tolist(),
+            y=positions[:, 1].tolist(),
             queue=column(observation["queue"]),
             battery=column(observation["battery"]),
             channel_gain=column(observation["channel_gain"]),

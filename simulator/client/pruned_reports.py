@@ -1,4 +1,4 @@
-"""Pruning on board: a UAV scores the sensors by its mission's attention, in numpy alone, and reports the k best."""
+"""Pruning on board: a UAV scores the sensors with its mission's attention, in numpy, and reports the k best."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from shared.missions import MissionAttention, MissionStatus
 from shared.records import Records, take_report
 from shared.scenario import Scenario
 from shared.wire import DecideResponse, Outcome, UavState
-from simulator.client.report_encoders import Fetch, FullReports, Told, unplaced
+from simulator.client.report_encoders import Fetch, FullReports, Report, without_positions
 
-# Steps until a UAV asks whether its weights are still the mission's.
+# Steps between a UAV's checks that its weights are still current.
 REFRESH_STEPS = 10
-# Queries that are weighed at once: of 10,000 sensors all would be a matrix of 400 MB.
+# Queries a block: the full matrix of 10,000 sensors would take 400 MB.
 _BLOCK = 256
 
 FloatMatrix = NDArray[np.float32]
@@ -36,13 +36,14 @@ class Attention:
     bias: FloatMatrix
 
     @classmethod
-    def of(cls, told: MissionAttention) -> Self:
-        """From what the edge tells; raises ``ValueError`` where that is no attention module of its preset."""
-        arrays = {w.name: np.array(w.values, dtype=np.float32).reshape(w.shape) for w in told.weights}
-        width, d = len(arrays.get("query", ())), FEATURES[told.features]
+    def of(cls, published: MissionAttention) -> Self:
+        """The weights that the edge publishes; raises ``ValueError`` for shapes that do not fit the feature preset."""
+        arrays = {w.name: np.array(w.values, dtype=np.float32).reshape(w.shape) for w in published.weights}
+        width, d = len(arrays.get("query", ())), FEATURES[published.features]
         shapes = {"query": (width, d), "key": (width, d), "value": (width, d), "score": (1, width), "bias": (1,)}
         if not width or {name: array.shape for name, array in arrays.items()} != shapes:
-            raise ValueError(f"no attention of preset {told.features}: {[(w.name, w.shape) for w in told.weights]}")
+            got = [(w.name, w.shape) for w in published.weights]
+            raise ValueError(f"no attention of preset {published.features}: {got}")
         return cls(**arrays)
 
     def scores(self, features: FloatMatrix) -> FloatMatrix:
@@ -59,42 +60,42 @@ class Attention:
 
 
 class OnBoard:
-    """What one UAV knows of its mission by itself: what it heard, and what it was told; nothing of the others'."""
+    """One UAV's own knowledge of its mission: the beacons that it heard and the answers to it, not other UAVs'."""
 
     def __init__(self, mission_id: str, scenario: Scenario) -> None:
         self.mission_id = mission_id
         self.scenario = scenario
-        self.told: MissionAttention | None = None
+        self.published: MissionAttention | None = None
         self.etag: str | None = None
-        self.asked_at = 0
-        # Sensors and places of the last report that was answered: the edge knows where they are.
+        self.checked_at = 0
+        # Sensors and positions of the last answered report: the edge has them.
         self.surveyed: tuple[list[int], list[float], list[float]] | None = None
         self._attention: Attention | None = None
         self._records = Records(scenario)
         self._belief = FleetBelief(scenario)
         self._sent: tuple[str, int, int] | None = None
 
-    def refreshed(self, told: MissionAttention, etag: str | None) -> None:
-        """Score by these weights from now on; raises ``ValueError`` where they are none."""
-        self._attention = Attention.of(told)
-        self.told, self.etag = told, etag
+    def refreshed(self, published: MissionAttention, etag: str | None) -> None:
+        """Score by these weights from now on; raises ``ValueError`` for invalid ones."""
+        self._attention = Attention.of(published)
+        self.published, self.etag = published, etag
 
-    def hear(self, uav: UavState, step: int) -> None:
-        """What the UAV heard, and what came of its last decision."""
+    def observe(self, uav: UavState, step: int) -> None:
+        """Record the UAV's report and the outcome of its last decision."""
         if uav.outcome is not None:
-            self._settle(uav.outcome)
+            self._apply(uav.outcome)
         take_report(uav, step, self._records, self._belief)
 
     def decided(self, response: DecideResponse) -> None:
-        """The UAV was told what to do."""
+        """Record the edge's decision for the UAV."""
         if self._sent is not None:
-            # Nobody said what came of the one before.
+            # The previous decision has no outcome: its presumed visit is confirmed.
             self._records.confirm(self._sent[1], self._sent[0], self._sent[2])
         self._sent = response.decision_id, response.sensor_id, response.step
         self._records.presume(response.sensor_id, response.decision_id, response.step)
         self._belief.tell(response.uav_id, response.step, response.sensor_id, response.velocity)
 
-    def _settle(self, outcome: Outcome) -> None:
+    def _apply(self, outcome: Outcome) -> None:
         if self._sent is None or self._sent[0] != outcome.decision_id:
             return
         name, sensor, step = self._sent
@@ -104,12 +105,12 @@ class OnBoard:
             self._records.confirm(sensor, name, step)
         self._sent = None
 
-    def kept(self, uav: UavState, step: int) -> list[int]:
-        """Rows of the report to send, best first: the k that attention scores highest.
+    def selected(self, uav: UavState, step: int) -> list[int]:
+        """Rows of the report to send, best first: the k with the highest attention scores.
 
-        Where fewer can be served than k, the nearest others follow: the edge must know of some.
+        With fewer than k admissible sensors, the nearest others follow, since the edge needs some sensors.
         """
-        assert self.told is not None and self._attention is not None
+        assert self.published is not None and self._attention is not None
         state = augment(
             uav,
             step,
@@ -117,10 +118,10 @@ class OnBoard:
             visits=self._records.visits,
             rates=self._records.rates,
             reserved=(),
-            preset=self.told.features,
-            belief=self._belief if self.told.belief == "fleet" else None,
+            preset=self.published.features,
+            belief=self._belief if self.published.belief == "fleet" else None,
         )
-        return _best(state, self._attention.scores(state.features(self.scenario)), self.told.top_k)
+        return _best(state, self._attention.scores(state.features(self.scenario)), self.published.top_k)
 
 
 def _best(state: State, scores: FloatMatrix, k: int) -> list[int]:
@@ -133,55 +134,55 @@ def _best(state: State, scores: FloatMatrix, k: int) -> list[int]:
 
 
 class PrunedReports(FullReports):
-    """Uplink ``pruned``: the sensors that the mission's attention would keep, by what the UAV itself knows.
+    """Uplink ``pruned``: the sensors that the mission's attention selects, from the UAV's own knowledge.
 
-    A UAV's first report tells all sensors and where they are. It asks for the weights before its first report and every
-    ten steps, and holds those of the mission that it asked about last; without weights it reports in full.
+    A UAV's first report has all sensors and their positions. The UAV fetches the weights before its first report and
+    every ten steps, and stores those of its latest mission. Without weights it reports in full.
     """
 
     def __init__(self) -> None:
         self._uavs: dict[int, OnBoard] = {}
 
     def _of(self, mission_id: str, uav_id: int) -> OnBoard | None:
-        known = self._uavs.get(uav_id)
-        return known if known is not None and known.mission_id == mission_id else None
+        on_board = self._uavs.get(uav_id)
+        return on_board if on_board is not None and on_board.mission_id == mission_id else None
 
     def missing(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
-        """The mission's world, once; then its weights, now and then."""
-        known = self._of(mission_id, uav_id)
-        if known is None:
+        """The mission's scenario, once; then its weights, every ``REFRESH_STEPS`` steps."""
+        on_board = self._of(mission_id, uav_id)
+        if on_board is None:
             return Fetch(f"/missions/{mission_id}", MissionStatus)
-        if known.told is None or not known.asked_at <= step < known.asked_at + REFRESH_STEPS:
-            return Fetch(f"/missions/{mission_id}/attention", MissionAttention, known.etag)
+        if on_board.published is None or not on_board.checked_at <= step < on_board.checked_at + REFRESH_STEPS:
+            return Fetch(f"/missions/{mission_id}/attention", MissionAttention, on_board.etag)
         return None
 
-    def take(self, uav_id: int, step: int, told: BaseModel | None, etag: str | None) -> None:
-        """Begin with this world, or score by these weights."""
-        if isinstance(told, MissionStatus):
-            self._uavs[uav_id] = OnBoard(told.mission_id, told.scenario)
+    def take(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
+        """Begin a mission with this scenario, or score by these weights."""
+        if isinstance(fetched, MissionStatus):
+            self._uavs[uav_id] = OnBoard(fetched.mission_id, fetched.scenario)
             return
-        if isinstance(told, MissionAttention):
-            self._uavs[uav_id].refreshed(told, etag)
-        self._uavs[uav_id].asked_at = step
+        if isinstance(fetched, MissionAttention):
+            self._uavs[uav_id].refreshed(fetched, etag)
+        self._uavs[uav_id].checked_at = step
 
-    def reduced(self, mission_id: str, step: int, uav: Told) -> Told:
-        """The rows kept, without their places; all of it the first time."""
-        known = self._of(mission_id, uav.uav_id)
-        if known is None:
+    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+        """The selected rows without their positions; the full report the first time."""
+        on_board = self._of(mission_id, uav.uav_id)
+        if on_board is None:
             return uav
-        known.hear(uav, step)
-        if known.told is None or known.surveyed != (uav.sensors.id, uav.sensors.x, uav.sensors.y):
+        on_board.observe(uav, step)
+        if on_board.published is None or on_board.surveyed != (uav.sensors.id, uav.sensors.x, uav.sensors.y):
             return uav
-        return uav.model_copy(update={"sensors": unplaced(uav.sensors, known.kept(uav, step))})
+        return uav.model_copy(update={"sensors": without_positions(uav.sensors, on_board.selected(uav, step))})
 
     def answered(self, uav: UavState, response: DecideResponse) -> None:
-        """Where its sensors are is known at the edge from now on."""
-        known = self._of(response.mission_id, uav.uav_id)
-        if known is not None:
-            known.surveyed = uav.sensors.id, uav.sensors.x, uav.sensors.y
-            known.decided(response)
+        """The edge has the positions of these sensors from now on."""
+        on_board = self._of(response.mission_id, uav.uav_id)
+        if on_board is not None:
+            on_board.surveyed = uav.sensors.id, uav.sensors.x, uav.sensors.y
+            on_board.decided(response)
 
     def forget(self, uav_id: int) -> None:
-        """The edge does not know where the sensors are (any more)."""
+        """The edge lacks the sensors' positions: the next report is sent in full."""
         if uav_id in self._uavs:
             self._uavs[uav_id].surveyed = None

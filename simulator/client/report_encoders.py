@@ -1,4 +1,4 @@
-"""What of a UAV's report is sent: all of it, what changed since it was answered last, or the sensors worth it."""
+"""Encoders of a UAV's reports: the full report, or its changes since the last answered one."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pydantic import BaseModel
 
 from shared.wire import DecideResponse, SensorColumns, UavState
 
-Told = TypeVar("Told", bound=UavState)
+Report = TypeVar("Report", bound=UavState)
 
 
 @dataclass(frozen=True)
 class Fetch:
-    """What a UAV needs of the edge before it can reduce its report; ``etag`` is of what it holds of it already."""
+    """A resource that a UAV needs before it can reduce its report; ``etag`` is that of its cached copy."""
 
     path: str
     model: type[BaseModel]
@@ -22,28 +22,28 @@ class Fetch:
 
 
 class FullReports:
-    """Uplink ``full``: every report as it is. What the other uplinks leave out they tell again once it is forgotten."""
+    """Uplink ``full``: every report in full. Encoders of the other uplinks send a full report after ``forget``."""
 
     def missing(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
-        """What is to be fetched first, one thing at a time."""
+        """The next resource to fetch before encoding; ``None`` once all are there."""
         return None
 
-    def take(self, uav_id: int, step: int, told: BaseModel | None, etag: str | None) -> None:
-        """What was fetched; ``None`` where it is as it was."""
+    def take(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
+        """Use a fetched resource; ``None`` means that it has not changed."""
 
-    def reduced(self, mission_id: str, step: int, uav: Told) -> Told:
-        """What to send of a full report."""
+    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+        """The part of a full report to send."""
         return uav
 
     def answered(self, uav: UavState, response: DecideResponse) -> None:
-        """The edge has this full report, whatever was sent of it, and decided."""
+        """The edge decided on this report and can complete it; ``uav`` is the full report, whatever part was sent."""
 
     def forget(self, uav_id: int) -> None:
-        """The edge does not hold what it was told: the next report is sent in full."""
+        """The edge lost the earlier reports: the next report is sent in full."""
 
 
 @dataclass(frozen=True)
-class _Held:
+class _Answered:
     mission_id: str
     step: int
     decision_id: str
@@ -51,41 +51,41 @@ class _Held:
 
 
 class DeltaReports(FullReports):
-    """Uplink ``delta``: the sensors that changed since this UAV's last report that was answered, without their places.
+    """Uplink ``delta``: the sensors that changed since this UAV's last answered report, without their positions.
 
-    Kept of each UAV is one report, of the mission that it asked about last.
+    The encoder stores one report a UAV, that of the UAV's latest mission.
     """
 
     def __init__(self) -> None:
-        self._held: dict[int, _Held] = {}
+        self._answered: dict[int, _Answered] = {}
 
-    def reduced(self, mission_id: str, step: int, uav: Told) -> Told:
-        """The rows that changed; all of it where there is nothing to build on, or other sensors or places."""
-        held, now = self._held.get(uav.uav_id), uav.sensors
+    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+        """The changed rows; the full report without a reference report, or after sensors or positions changed."""
+        reference, now = self._answered.get(uav.uav_id), uav.sensors
         if (
-            held is None
-            or held.mission_id != mission_id
-            or held.step > step
-            or (held.sensors.id, held.sensors.x, held.sensors.y) != (now.id, now.x, now.y)
+            reference is None
+            or reference.mission_id != mission_id
+            or reference.step > step
+            or (reference.sensors.id, reference.sensors.x, reference.sensors.y) != (now.id, now.x, now.y)
         ):
             return uav.model_copy(update={"uplink": "delta"})
-        old = held.sensors
+        old = reference.sensors
         before = zip(old.queue, old.battery, old.channel_gain, old.last_seen, strict=True)
         after = zip(now.queue, now.battery, now.channel_gain, now.last_seen, strict=True)
         changed = [row for row, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
-        return uav.model_copy(update={"base": held.decision_id, "sensors": unplaced(now, changed)})
+        return uav.model_copy(update={"base": reference.decision_id, "sensors": without_positions(now, changed)})
 
     def answered(self, uav: UavState, response: DecideResponse) -> None:
-        """Build on it next time."""
-        self._held[uav.uav_id] = _Held(response.mission_id, response.step, response.decision_id, uav.sensors)
+        """Use it as the reference of the next report."""
+        self._answered[uav.uav_id] = _Answered(response.mission_id, response.step, response.decision_id, uav.sensors)
 
     def forget(self, uav_id: int) -> None:
-        """Tell all of it next time."""
-        self._held.pop(uav_id, None)
+        """Send the next report in full."""
+        self._answered.pop(uav_id, None)
 
 
-def unplaced(sensors: SensorColumns, rows: list[int]) -> SensorColumns:
-    """Some rows of a report, without their places."""
+def without_positions(sensors: SensorColumns, rows: list[int]) -> SensorColumns:
+    """Some rows of a report, without their positions."""
     return SensorColumns.model_construct(
         id=[sensors.id[row] for row in rows],
         queue=[sensors.queue[row] for row in rows],

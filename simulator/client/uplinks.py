@@ -7,14 +7,14 @@ from simulator.client.report_encoders import DeltaReports, FullReports
 
 
 def encoder_of(uplink: Uplink) -> FullReports:
-    """How reports are sent on that uplink."""
+    """The encoder of reports for that uplink."""
     match uplink:
         case "full":
             return FullReports()
         case "delta":
             return DeltaReports()
         case "pruned":
-            # The features take a while to import, which the other uplinks need not wait for.
+            # The features take a while to import, and only this uplink needs them.
             from simulator.client.pruned_reports import PrunedReports
 
             return PrunedReports()

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 class BoundOptions:
     """Find the least packets that any fleet could have lost in one world.
 
-    A planner that knows every arrival beforehand (no UAV does) looks for the best flight with OR-Tools CP-SAT
-    and proves how much better another could at most be. No scheme loses less than the proven bound; what a scheme
-    loses above it is what better decisions could still save.
+    A planner that knows every arrival beforehand, as no UAV does, searches for the best flight with OR-Tools CP-SAT and
+    proves a bound on any better one. No scheme loses less than the proven bound. A scheme's losses above it are those
+    that better decisions could save.
 
-    Printed: the proven bound, the best plan found, the gap between them, and what EOF loses in the same world. The
-    plan is flown in the simulated world, which must lose exactly what the plan says.
+    Printed: the proven bound, the losses of the best plan found, the gap between them, and EOF's losses in the same
+    world. The plan is flown in the simulated world, which must lose exactly the packets of the plan.
 
       aicvds bound --seed 0
 
@@ -42,21 +42,21 @@ class BoundOptions:
     """
 
     seed: Annotated[int, arg(metavar="N")]
-    """Of the world, 0 to 4294967295."""
+    """Seed of the world, 0 to 4294967295."""
     scenario: Annotated[str | None, arg(metavar="NAME")] = None
     """A ready-made world: paper (the default), pipeline, stress, dense or lossy_uplink."""
     world: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """A world of your own, instead of --scenario; `aicvds simulate --help` says what is in the folder."""
+    """A world of your own, instead of --scenario; `aicvds simulate --help` describes the folder."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Waypoints to fly, 1 to 10000. Default: the scenario's (30)."""
     time_limit_s: Annotated[float, arg(metavar="S")] = 60.0
-    """Seconds to search, 0.1 to 86400; less is used where the proof is done sooner."""
+    """Seconds of search at most, 0.1 to 86400."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """JSON file to write the bound and the plan to."""
 
 
 class BoundRecord(Record):
-    """The JSON file: a :class:`Bound`, the world it is of, and what EOF loses there."""
+    """The JSON file: a :class:`Bound`, its world, and EOF's losses there."""
 
     scenario: str
     seed: int
@@ -71,7 +71,7 @@ class BoundRecord(Record):
 
 
 def main(argv: list[str]) -> int:
-    """Bound the world that the command line describes; returns the exit code."""
+    """Run ``aicvds bound``; returns the exit code."""
     return command_main(BoundOptions, "aicvds bound", argv, _run)
 
 
@@ -90,11 +90,11 @@ def _run(options: BoundOptions, console: Console) -> int:
 
     with console.status("Searching for the best flight") as status:
 
-        def told(news: News) -> None:
+        def show_news(news: News) -> None:
             status.update(f"Searching: best so far {news.objective:.0f} lost, proven at least {news.lower_bound:.0f}")
 
         try:
-            bound = clairvoyant(site, options.seed, options.time_limit_s, on_news=told)
+            bound = clairvoyant(site, options.seed, options.time_limit_s, on_news=show_news)
         except Interrupted as stopped:
             bound = confirmed(site, options.seed, stopped.plan)
     eof = sum(tally.lost_packets for tally in rollout(site.world(), policy_named("eof"), options.seed))

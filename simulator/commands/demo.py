@@ -22,9 +22,9 @@ EDGE_LOG = "edge.log"
 class Demo:
     """Start an edge on this machine, fly a mission against it, and compare with EOF and WQCS.
 
-    The edge loads its LLM (the embedded one, or the one that the AICVDS_LLM_* variables name), decides for
-    three UAVs at thirty waypoints each, and is stopped again. Written to --out: report.html (open it in a
-    browser), summary.json, decisions.jsonl and edge.log. What an earlier demo left there is overwritten.
+    The edge loads its LLM (the embedded one, or that of the AICVDS_LLM_* variables), decides for three UAVs at thirty
+    waypoints each, and stops. Written to --out: report.html (open it in a browser), summary.json, decisions.jsonl and
+    edge.log. The results of an earlier demo there are overwritten.
 
     Try it:  aicvds demo --out runs/demo
 
@@ -34,12 +34,12 @@ class Demo:
     out: Path = Path("runs/demo")
     """Folder to write to, made if missing."""
     seed: int = 0
-    """Of the world, 0 to 4294967295; the same seed is the same world."""
+    """Seed of the world, 0 to 4294967295; the same seed gives the same world."""
     scenario: str | None = None
     """A ready-made world: paper (the default), pipeline, stress, dense or lossy_uplink; `aicvds simulate --help`
-    says what they are."""
+    describes them."""
     world: Path | None = None
-    """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` says what is in it."""
+    """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` describes its files."""
     port: int = 0
     """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
     wait_s: float = 300.0
@@ -47,16 +47,16 @@ class Demo:
 
 
 def main(argv: list[str]) -> int:
-    """Run the demo that the command line describes; returns the exit code."""
+    """Run ``aicvds demo``; returns the exit code."""
     command = shlex.join(["aicvds", "demo", *argv])
     return command_main(Demo, "aicvds demo", argv, lambda options, console: demo(options, command, console))
 
 
 def demo(options: Demo, command: str, console: Console) -> int:
-    """Serve, fly, stop; returns the exit code.
+    """Start the edge, fly, stop the edge; returns the exit code.
 
     Raises:
-        UsageError: the options make no demo, or the folder cannot be written.
+        UsageError: the options are unusable, or the folder cannot be written.
         EdgeError: the edge died at start, or never became ready.
     """
     site = chosen_site(options.scenario, options.world)
@@ -77,7 +77,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         wait_s=options.wait_s,
     )
     log = options.out / EDGE_LOG
-    # Not the store of an edge that may run here already.
+    # A store of its own, apart from that of another edge on this machine.
     environment = {**os.environ, "AICVDS_STORE": str(options.out.resolve() / "missions.db")}
     with edge_process(port, log, environment) as process:
         console.print(

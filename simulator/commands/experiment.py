@@ -32,10 +32,10 @@ class Options:
     NAME is one of these, or `{ALL}` for every one:
 
     {"    ".join(f"{name}: {experiment.summary}.{chr(10) * 2}" for name, experiment in EXPERIMENTS.items())}
-    A mission that a scheme flew in a world is kept in --out's flights/ and never flown twice: experiments share
-    them, and the same command after Ctrl-C, or a crash, goes on where it stopped. The edges that it asks over HTTP it
-    starts itself. Written to --out/NAME: results.json (means with 95% bootstrap intervals over seeds,
-    comparisons paired by seed), results.csv (a line a scheme, seed and measure), and the figures.
+    A scheme's mission in a world is stored in --out's flights/ and never flown twice: experiments share it, and the
+    same command continues after Ctrl-C or a crash. The command starts the edges that it needs. Written to --out/NAME:
+    results.json (means with 95% bootstrap intervals over seeds, comparisons paired by seed), results.csv (a line a
+    scheme, seed and measure), and the figures.
 
     Try it:  aicvds experiment scheduler --quick
 
@@ -49,32 +49,32 @@ class Options:
     name: Positional[Annotated[str, arg(metavar="NAME")]]
     """The experiment, or all."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("runs/experiments")
-    """Folder to write to, made if missing; the flights in it are used again."""
+    """Folder to write to, made if missing; its stored flights are used again."""
     quick: Annotated[bool, FlagCreatePairsOff] = False
-    """Few seeds, and short missions where an LLM takes part: shows that a figure can be made, not what it says."""
+    """Few seeds, and short missions with an LLM: a check that the figures can be made, without a valid result."""
     seeds: Annotated[int | None, arg(metavar="N")] = None
-    """Worlds for schemes that ask no LLM: seeds 0 to N - 1. Default: 30, quick 5."""
+    """Worlds for schemes without an LLM: seeds 0 to N - 1. Default: 30, quick 5."""
     llm_seeds: Annotated[int | None, arg(metavar="N")] = None
-    """Worlds for schemes that ask an LLM, which takes a minute each. Default: 10, quick 2, at most --seeds."""
+    """Worlds for schemes with an LLM, a minute each. Default: 10, quick 2, at most --seeds."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Waypoints of a mission. Default: the world's own (30)."""
     llm: Annotated[str, arg(metavar="embedded|none|URL")] = "embedded"
     """The LLM: the embedded one, none (its schemes are left out), or an OpenAI-compatible server's address such as
     http://127.0.0.1:8080/v1 (AICVDS_LLM_MODEL and AICVDS_LLM_API_KEY apply to it)."""
     edge: Annotated[str | None, arg(metavar="URL")] = None
-    """Ask this running edge for the schemes with an LLM, instead of starting one. Its settings then count."""
+    """Use this running edge for the schemes with an LLM, with its settings, instead of starting one."""
     model: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="FILE.gguf")] = ()
-    """For llm-models: another model to embed; may be given several times."""
+    """For llm-models: another model to embed; repeatable."""
     scenario: Annotated[str | None, arg(metavar="NAME")] = None
     """The world: paper (default), pipeline, stress, dense or lossy_uplink; see `aicvds simulate --help`."""
     world: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
     workers: Annotated[int, arg(metavar="N")] = 1
-    """Processes that fly what needs no edge."""
+    """Processes for the flights without an edge."""
 
 
 def main(argv: list[str]) -> int:
-    """Make what the command line asks for; returns the exit code."""
+    """Run ``aicvds experiment``; returns the exit code."""
     if argv[:1] == [PAGE]:
         from simulator.experiments import page
 
@@ -83,11 +83,11 @@ def main(argv: list[str]) -> int:
 
 
 def experiment(options: Options, argv: list[str], console: Console) -> int:
-    """Fly what is missing, write, print; returns the exit code.
+    """Fly the missing flights, write, print; returns the exit code.
 
     Raises:
-        UsageError: the options make no experiment, or the folder cannot be written.
-        EdgeError: an edge died, or has no LLM though it should have one.
+        UsageError: the options are unusable, or the folder cannot be written.
+        EdgeError: an edge died, or lacks an LLM that it needs.
     """
     chosen = _chosen(options.name)
     setup = setup_of(options)
@@ -97,7 +97,7 @@ def experiment(options: Options, argv: list[str], console: Console) -> int:
     try:
         results = run.make(chosen)
     except KeyboardInterrupt:
-        console.print(f"interrupted; {run.flown} flights were added and are kept: the same command goes on")
+        console.print(f"interrupted; {run.flown} new flights are stored: the same command continues")
         raise
     for result in results:
         show(result, console)
@@ -105,7 +105,7 @@ def experiment(options: Options, argv: list[str], console: Console) -> int:
 
 
 def setup_of(options: Options) -> Setup:
-    """The setup that the options say; raises ``UsageError`` for the first that is out of its bounds."""
+    """The setup from the options; raises ``UsageError`` for the first option out of bounds."""
     seeds = options.seeds if options.seeds is not None else QUICK_SEEDS if options.quick else SEEDS
     llm_seeds = options.llm_seeds if options.llm_seeds is not None else QUICK_LLM_SEEDS if options.quick else LLM_SEEDS
     check_between("--seeds", seeds, 1, 10_000)
@@ -126,7 +126,7 @@ def setup_of(options: Options) -> Setup:
 
 
 def show(result: Result, console: Console) -> None:
-    """Print what each scheme scored in the experiment's first three measures, and the run's notes."""
+    """Print each scheme's values of the experiment's first three measures, and the run's notes."""
     measures = list(dict.fromkeys(name for scheme in result.schemes.values() for name in scheme))[:3]
     table = Table("", *(result.labels[name] for name in measures), title=f"{result.title} ({result.experiment})")
     for name, found in result.schemes.items():

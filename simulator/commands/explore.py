@@ -23,46 +23,46 @@ from simulator.flying.exploration import explore
 if TYPE_CHECKING:
     from simulator.flying.teachers import TeacherName
 
-Asked = Literal["both", "planner", "clairvoyant"]
+TeacherOption = Literal["both", "planner", "clairvoyant"]
 _BEHAVIOUR = "taught: mostly the reference's; untaught: half EOF or WQCS, half a random sensor; a random velocity"
 
 
 @dataclass(frozen=True)
 class Explore:
-    """Fly training worlds with exploring UAVs and record what they saw, did and paid, and what a teacher would do.
+    """Fly training worlds with exploring UAVs, and record each decision, its cost, and a teacher's reference action.
 
     The worlds' seeds start at 1,000,000, apart from every evaluation seed. The file feeds `aicvds pretrain` and
     `aicvds demonstrate`.
 
       aicvds explore --workers 2 --out runs/rollouts.jsonl.gz
 
-    The planner (partial observations, some 4 s a world) and a clairvoyant (all arrivals known, 1 to 3 s) take turns,
-    a world each. A UAV mostly flies as its teacher says. In up to half (planner) or a fifth (clairvoyant) of a world's
-    steps the fleet deviates, so that states off the teacher's way are covered: then half of the sensors are EOF's or
-    WQCS's, half random, and velocities are random; a third of the deviations keep the planner's sensor, a third its
-    velocity. What is recorded as the reference is what the teacher would do in that state; a clairvoyant gives none
-    while the fleet deviates, and plans anew after.
+    The teacher alternates by world between the planner (partial observations, about 4 s a world) and a clairvoyant (all
+    arrivals known, 1 to 3 s). A UAV mostly flies the teacher's actions. In up to half (planner) or a fifth
+    (clairvoyant) of a world's steps the fleet deviates, so that the records cover other states: then half of the
+    sensors are EOF's or WQCS's, half random, and velocities are random; a third of the deviations use the teacher's
+    sensor, a third its velocity. The reference is the teacher's action in the state recorded. A clairvoyant has none
+    while the fleet deviates, and plans again afterwards.
 
-    In more worlds nobody teaches, and every step deviates. The same command writes the same decisions, whatever the
-    workers.
+    Further worlds have no teacher, and every step deviates. The same command writes the same decisions, whatever the
+    number of workers.
     """
 
     out: Annotated[Path, arg(metavar="FILE")]
     """File to write, such as runs/rollouts.jsonl.gz."""
     missions: Annotated[int, arg(metavar="N")] = 400
-    """Worlds that are taught in. They need the extra `planner`."""
+    """Worlds with a teacher. They need the extra `planner`."""
     untaught: Annotated[int, arg(metavar="N")] = 300
-    """Worlds after these, without a teacher."""
-    teacher: Asked = "both"
-    """Who gives the reference actions: the planner, a clairvoyant, or both in turns."""
+    """Further worlds without a teacher."""
+    teacher: TeacherOption = "both"
+    """The teacher: the planner, a clairvoyant, or both in alternation."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
-    """Their scenario."""
+    """The worlds' scenario."""
     workers: Annotated[int, arg(metavar="N")] = 1
-    """Processes to fly them in, 1 to 64."""
+    """Processes that fly the worlds, 1 to 64."""
 
 
 def main(argv: list[str]) -> int:
-    """Record the rollouts that the command line describes; returns the exit code."""
+    """Run ``aicvds explore``; returns the exit code."""
     args = tyro.cli(Explore, prog="aicvds explore", args=argv)
     try:
         scenario = scenario_named(args.scenario)
@@ -90,13 +90,13 @@ def main(argv: list[str]) -> int:
 def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
     teachers = [teacher_of(args.teacher, mission) for mission in range(args.missions)] + [None] * args.untaught
     fly = partial(_mission, scenario)
-    told = partial(track, description="Exploring", total=len(teachers), console=Console(stderr=True))
+    tracked = partial(track, description="Exploring", total=len(teachers), console=Console(stderr=True))
     if args.workers == 1:
-        for steps in told(map(fly, enumerate(teachers))):
+        for steps in tracked(map(fly, enumerate(teachers))):
             yield from steps
         return
     with get_context("spawn").Pool(args.workers) as pool:
-        for steps in told(pool.imap(fly, enumerate(teachers))):
+        for steps in tracked(pool.imap(fly, enumerate(teachers))):
             yield from steps
 
 
@@ -105,8 +105,8 @@ def _mission(scenario: Scenario, numbered: tuple[int, TeacherName | None]) -> li
     return list(explore(scenario, mission, teacher))
 
 
-def teacher_of(asked: Asked, mission: int) -> TeacherName:
-    """Who teaches in that training world; with both, the planner in even ones."""
-    if asked == "both":
+def teacher_of(option: TeacherOption, mission: int) -> TeacherName:
+    """The teacher of that training world; with ``both``, the planner in even ones."""
+    if option == "both":
         return "clairvoyant" if mission % 2 else "planner"
-    return asked
+    return option

@@ -1,4 +1,4 @@
-"""``aicvds replay``: ask a logged mission again, of another model, prompt, k or mode."""
+"""``aicvds replay``: send a logged mission's requests again, to another model, prompt, k or mode."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ REPLAY, REPLAYED = "replay.json", "replayed.jsonl"
 
 @dataclass(frozen=True)
 class Replay:
-    """Ask a logged mission again: the same states, of another model, prompt format, k or mode.
+    """Send the requests of a logged mission again, to another model, prompt format, k or mode.
 
-    Fly and log a mission, then start an edge with another LLM (or other settings) and ask that:
+    Fly and log a mission, then start an edge with another LLM (or other settings) and replay against it:
 
       aicvds simulate --edge http://127.0.0.1:8000 --out runs/first
 
@@ -49,48 +49,48 @@ class Replay:
 
       aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value
 
-    What it would have cost at a provider's prices, logged and replayed alike:
+    With the costs of both missions at a provider's prices:
 
       aicvds replay runs/first --edge URL --price-input 0.15 --price-cached 0.075 --price-output 0.6
 
-    Nobody flies: the states are the logged ones, whatever is decided now. So this measures agreement, tokens, latency
-    and cost, and no losses. A logged outcome is fed back only where the decision is the same: of another sensor or
-    velocity nobody knows what it would have cost. Where decisions differ, the edge's records of visits, and with
-    them the ages in its prompts, follow its own decisions and not the flight.
+    No UAV flies: the states are the logged ones, whatever the new decisions. A replay therefore measures agreement,
+    tokens, latency and cost, and no losses. A logged outcome is fed back only if the decision is the same; the cost of
+    another sensor or velocity is unknown. After different decisions, the edge's records of visits, and with them the
+    ages in its prompts, follow its own decisions and not the flight.
 
-    Written to --out: replay.json (agreement, by who decided; tokens, latency and cost of both) and replayed.jsonl
-    (each decision beside the logged one). Exit code: 0 asked to the end, 1 no edge or lost on the way (what was
-    asked is written), 2 bad use, 130 interrupted (written too). The key of an edge is read from AICVDS_API_KEY.
+    Written to --out: replay.json (agreement by source; tokens, latency and cost of both missions) and replayed.jsonl
+    (each decision beside the logged one). Exit code: 0 complete, 1 no edge, or the edge was lost (the decisions so far
+    are written), 2 bad use, 130 interrupted (written too). The key of an edge is read from AICVDS_API_KEY.
     """
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
-    """Folder that `aicvds simulate --edge` wrote."""
+    """Folder of `aicvds simulate --edge`."""
     edge: Annotated[str | None, arg(metavar="URL")] = None
-    """The edge's address, such as http://127.0.0.1:8000. Needed."""
+    """The edge's address, such as http://127.0.0.1:8000. Required."""
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
-    """How the edge decides. This option and the next: what is not given stays as it was logged."""
+    """The edge's mode. Default, of this option and the next ones: as logged."""
     top_k: Annotated[int | None, arg(metavar="K")] = None
     """Sensors that attention keeps for the prompt, 1 to 100."""
     attention: Literal["on", "off"] | None = None
     """off: every admissible sensor is in the prompt."""
     features: Features | None = None
-    """What the modules see."""
+    """The modules' features."""
     init: Init | None = None
-    """The modules' start."""
+    """The modules' initial weights."""
     format: Literal["csv", "json", "markdown"] | None = None
-    """How the prompt shows the sensors."""
+    """The format of the prompt's rows."""
     order: Literal["score", "shuffled"] | None = None
     """The rows' order."""
     experiences: Annotated[int | None, arg(metavar="N")] = None
     """Experiences in the prompt, 0 to 100."""
     selection: Selection | None = None
-    """Which experiences stay when there are too many."""
+    """The selection of experiences beyond that number."""
     demonstrations: Annotated[int | None, arg(metavar="N")] = None
     """Worked examples in the prompt, 0 to 20."""
     deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
-    """Milliseconds that the edge may take for one decision, 10 to 60000. Default: as each was asked."""
+    """Milliseconds that the edge may take for one decision, 10 to 60000. Default: as in each request."""
     price_input: Annotated[float | None, arg(metavar="USD")] = None
-    """US dollars a million prompt tokens. Default: the cost is what each edge said by its own prices."""
+    """US dollars a million prompt tokens. Default: the cost is each edge's estimate by its own prices."""
     price_cached: Annotated[float | None, arg(metavar="USD")] = None
     """US dollars a million prompt tokens read from a prefix cache. Default: --price-input."""
     price_output: Annotated[float | None, arg(metavar="USD")] = None
@@ -100,7 +100,7 @@ class Replay:
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to write to, made if missing. Default: runs/ and the new mission's ID."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
-    """Write even where a replay's result is already."""
+    """Overwrite an earlier replay's result."""
 
 
 _OF_SPEC = ("mode", "top_k", "attention", "features", "init")
@@ -108,26 +108,26 @@ _OF_PROMPT = ("format", "order", "experiences", "selection", "demonstrations")
 
 
 def main(argv: list[str]) -> int:
-    """Ask again as the command line says; returns the exit code."""
+    """Run ``aicvds replay``; returns the exit code."""
     command = shlex.join(["aicvds", "replay", *argv])
     return command_main(Replay, "aicvds replay", argv, lambda options, console: replay(options, command, console))
 
 
 @dataclass(frozen=True)
 class Logged:
-    """A mission as it was flown: its spec, and each request with the decision that was flown."""
+    """A logged mission: its spec, and each request with the decision flown."""
 
     spec: MissionSpec
     decisions: list[tuple[DecideRequest, Decision]]
 
 
 def logged_mission(run: Path) -> Logged:
-    """What ``aicvds simulate`` left; raises ``UsageError`` where that cannot be asked again."""
+    """The mission in a folder of ``aicvds simulate``; raises ``UsageError`` if it cannot be replayed."""
     if not run.is_dir():
         raise UsageError(f"{run} is no folder; name one that `aicvds simulate --edge URL` wrote")
     if not (run / REQUESTS).exists():
         raise UsageError(
-            f"{run} holds no {REQUESTS}: `aicvds simulate --edge URL` writes it, and a local --policy asks nothing. "
+            f"{run} has no {REQUESTS}: `aicvds simulate --edge URL` writes it, and a local --policy sends no request. "
             "Fly the mission again"
         )
     try:
@@ -138,19 +138,19 @@ def logged_mission(run: Path) -> Logged:
     except ValueError as error:
         raise UsageError(str(error)) from None
     pairs = [(request, (request.step, request.uav_id)) for request in requests]
-    # A mission that was interrupted asked a little more than it flew.
+    # An interrupted mission has a few requests without a flown decision.
     decisions = [(request, flown[key]) for request, key in pairs if key in flown]
     if not decisions:
-        raise UsageError(f"{run} holds no decision to ask again")
+        raise UsageError(f"{run} has no decision to replay")
     return Logged(spec, decisions)
 
 
 def replay(options: Replay, command: str, console: Console) -> int:
-    """Ask, compare, write, print; returns the exit code.
+    """Send the requests, compare, write, print; returns the exit code.
 
     Raises:
-        UsageError: the options or the folder do not make a replay.
-        EdgeError: no edge answers as one, or it does not take the changed mission.
+        UsageError: the options or the folder are unusable.
+        EdgeError: no edge is ready, or the edge refuses the changed mission.
     """
     check(options)
     edge = checked_edge(options.edge)
@@ -165,10 +165,10 @@ def replay(options: Replay, command: str, console: Console) -> int:
         await_edge(client, options.wait_s, console)
         client.put_mission(mission_id, spec)
         fresh_folder(out, (REPLAY, REPLAYED))
-        asked = Asking(client, mission_id, options.deadline_ms)
-        code = _ask_all(asked, logged, out, console)
+        replayer = Replayer(client, mission_id, options.deadline_ms)
+        code = _replay_all(replayer, logged, out, console)
     facts = {"run": str(options.run), "edge": edge, "mission_id": mission_id, "command": command}
-    summary = summarise(logged, spec, asked.compared, prices(options), **facts)
+    summary = summarise(logged, spec, replayer.compared, prices(options), **facts)
     with naming_out(out):
         (out / REPLAY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
     show(summary, console)
@@ -180,7 +180,7 @@ def replay(options: Replay, command: str, console: Console) -> int:
 def summarise(
     logged: Logged, spec: MissionSpec, compared: list[Compared], prices: Prices | None, **facts: str
 ) -> ReplaySummary:
-    """The summary of what was asked, of a mission asked again with ``spec``."""
+    """The summary of a replay with ``spec``."""
     return ReplaySummary(
         **facts,
         version=version("aic-vds"),
@@ -196,62 +196,62 @@ def summarise(
     )
 
 
-class Asking:
-    """Asks an edge the logged requests; ``compared`` is what came of it so far."""
+class Replayer:
+    """Sends logged requests to an edge; ``compared`` has the decisions so far beside the logged ones."""
 
     def __init__(self, client: EdgeClient, mission_id: str, deadline_ms: int | None) -> None:
         self._client = client
         self._mission_id = mission_id
         self._deadline_ms = deadline_ms
-        self._owed: dict[int, Outcome] = {}
+        self._pending: dict[int, Outcome] = {}
         self.compared: list[Compared] = []
 
-    def ask(self, request: DecideRequest, flown: Decision) -> Compared:
-        """Ask one again, with the outcome of this UAV's last decision if that was the logged one.
+    def replay(self, request: DecideRequest, flown: Decision) -> Compared:
+        """Send one request, with the outcome of this UAV's last decision if that equalled the logged one.
 
         Raises:
-            EdgeError: there is no usable answer.
+            EdgeError: the edge gives no usable answer.
         """
-        changes: dict[str, Any] = {"mission_id": self._mission_id, "outcome": self._owed.pop(request.uav_id, None)}
+        changes: dict[str, Any] = {"mission_id": self._mission_id, "outcome": self._pending.pop(request.uav_id, None)}
         if self._deadline_ms is not None:
             changes["deadline_ms"] = self._deadline_ms
         exchange = self._client.decide(request.model_copy(update=changes))
         compared = Compared(logged=flown, replayed=_decision(flown, exchange))
         if compared.same:
-            self._owed[request.uav_id] = exchange.outcome(flown.cost, flown.failed)
+            self._pending[request.uav_id] = exchange.outcome(flown.cost, flown.failed)
             compared = compared.model_copy(update={"fed_back": True})
         self.compared.append(compared)
         return compared
 
     def finish(self) -> None:
-        """Feed back the outcomes that no later request carried."""
-        for uav in sorted(self._owed):
-            outcome = self._owed[uav]
+        """Send the outcomes that no later request carried."""
+        for uav in sorted(self._pending):
+            outcome = self._pending[uav]
             self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
-        self._owed.clear()
+        self._pending.clear()
 
 
-def _ask_all(asking: Asking, logged: Logged, out: Path, console: Console) -> int:
-    """Ask each in the order flown, and write each as it is answered; returns the exit code so far."""
+def _replay_all(replayer: Replayer, logged: Logged, out: Path, console: Console) -> int:
+    """Replay the requests in the order flown, and write each decision at once; returns the exit code so far."""
     with naming_out(out):
         log = (out / REPLAYED).open("w", encoding="utf-8")
     try:
         with log:
-            for request, flown in track(logged.decisions, description="Asking again", console=console):
-                log.write(asking.ask(request, flown).line() + "\n")
+            for request, flown in track(logged.decisions, description="Replaying", console=console):
+                log.write(replayer.replay(request, flown).line() + "\n")
                 log.flush()
-            asking.finish()
+            replayer.finish()
     except EdgeError as error:
-        print(f"aicvds replay: after {len(asking.compared)} decisions: {error}", file=sys.stderr)
+        print(f"aicvds replay: after {len(replayer.compared)} decisions: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        console.print(f"interrupted after {len(asking.compared)} decisions", highlight=False)
+        console.print(f"interrupted after {len(replayer.compared)} decisions", highlight=False)
         return INTERRUPTED
     return 0
 
 
 def _decision(flown: Decision, exchange: Exchange) -> Decision:
-    from simulator.flying.flight import of_the_exchange
+    from simulator.flying.flight import exchange_fields
 
     answer = exchange.response
     return Decision(
@@ -262,12 +262,12 @@ def _decision(flown: Decision, exchange: Exchange) -> Decision:
         velocity=answer.velocity,
         source=answer.source,
         reason=answer.reason,
-        **of_the_exchange(exchange),
+        **exchange_fields(exchange),
     )
 
 
 def check(options: Replay) -> None:
-    """Raises ``UsageError`` for the first option that is out of its bounds."""
+    """Raises ``UsageError`` for the first option out of bounds."""
     check_wait(options.wait_s)
     check_deadline(options.deadline_ms)
     for name in ("input", "cached", "output"):
@@ -279,7 +279,7 @@ def check(options: Replay) -> None:
 
 
 def prices(options: Replay) -> Prices | None:
-    """The prices told, if any."""
+    """The prices of the options, if any."""
     if options.price_input is None:
         return None
     cached = options.price_input if options.price_cached is None else options.price_cached
@@ -288,12 +288,12 @@ def prices(options: Replay) -> Prices | None:
 
 
 def changed_spec(spec: MissionSpec, options: Replay) -> MissionSpec:
-    """The logged spec with what the options change; raises ``UsageError`` for a value out of its bounds."""
-    told = {name: getattr(options, name) for name in _OF_SPEC if getattr(options, name) is not None}
+    """The logged spec with the options' changes; raises ``UsageError`` for a value out of bounds."""
+    fields = {name: getattr(options, name) for name in _OF_SPEC if getattr(options, name) is not None}
     prompt = {name: getattr(options, name) for name in _OF_PROMPT if getattr(options, name) is not None}
     try:
         style = spec.prompt.model_validate(spec.prompt.model_dump() | prompt)
-        return MissionSpec.model_validate(dict(spec) | told | {"prompt": style})
+        return MissionSpec.model_validate(dict(spec) | fields | {"prompt": style})
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         option = str(first["loc"][-1]).replace("_", "-")
@@ -301,7 +301,7 @@ def changed_spec(spec: MissionSpec, options: Replay) -> MissionSpec:
 
 
 def changes(before: MissionSpec, after: MissionSpec) -> dict[str, tuple[Any, Any]]:
-    """What differs, by name: before and after."""
+    """The fields that differ, as pairs of the values before and after."""
 
     def settings(spec: MissionSpec) -> Iterator[tuple[str, Any]]:
         yield from ((name, getattr(spec, name)) for name in _OF_SPEC)

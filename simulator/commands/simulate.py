@@ -21,12 +21,12 @@ from simulator.records.run_folder import refuse_old_result
 
 @dataclass(frozen=True)
 class Simulate:
-    """Fly one mission against an edge and write what came of it.
+    """Fly one mission against an edge and write its results.
 
-    The UAVs fly the scenario's world step by step, ask the edge at every waypoint, and report what each decision
-    cost. EOF and WQCS then fly the same world for comparison. Written to --out: summary.json,
-    decisions.jsonl (one decision a line, written as they happen), report.html (open it in a browser) and, where an
-    edge was asked, requests.jsonl (what it was asked, about 1 kB a decision with 10 sensors, for `aicvds replay`).
+    The UAVs fly the scenario's world step by step, ask the edge for a decision at every waypoint, and report the cost
+    of each decision. EOF and WQCS then fly the same world for comparison. Written to --out: summary.json,
+    decisions.jsonl (one decision a line, written at once), report.html (open it in a browser) and, with an edge,
+    requests.jsonl (the requests, about 1 kB a decision with 10 sensors, for `aicvds replay`).
 
     Start an edge, then fly against it from another terminal:
 
@@ -34,7 +34,7 @@ class Simulate:
 
       aicvds simulate --edge http://127.0.0.1:8000 --out runs/first
 
-    No edge at hand:
+    Without an edge:
 
       aicvds simulate --policy eof
 
@@ -42,56 +42,58 @@ class Simulate:
 
       aicvds simulate --policy eof --world examples/pipeline_world
 
-    An edge lost on the way: the UAVs decide on board with EOF, and before the next step wait up to --reconnect-s
-    seconds for the edge to come back. Steps are not real time, so without a pause the mission would be over first.
+    If the edge is lost during the flight, the UAVs decide on board with EOF, and before the next step wait up to
+    --reconnect-s seconds for the edge to come back. Steps are not real time, so without this pause the mission would
+    end first.
 
-    Ctrl-C stops the flight and still writes the report of what was flown. An edge that wants a key gets
-    the one in the environment variable AICVDS_API_KEY. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
+    Ctrl-C stops the flight and still writes the report of the steps flown. The environment variable AICVDS_API_KEY has
+    the key for an edge that needs one. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
     """
 
     edge: Annotated[str | None, arg(metavar="URL")] = None
-    """The edge's address, such as http://127.0.0.1:8000. Needed, unless --policy is a local one: that asks no edge."""
+    """The edge's address, such as http://127.0.0.1:8000. Required, unless --policy is a local one."""
     scenario: Annotated[str | None, arg(metavar="NAME")] = None
     """A ready-made world: paper (10 sensors, 3 UAVs, 30 steps; the default), pipeline (sensors in a line), stress
     (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost)."""
     world: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """A world of your own, instead of --scenario: a folder with world.geojson (sensors, trajectories) and, if you
-    like, scenario.toml (other numbers) and arrivals.csv (recorded traffic). examples/pipeline_world is one."""
+    """A world of your own, instead of --scenario: a folder with world.geojson (sensors, trajectories) and, optionally,
+    scenario.toml (other numbers) and arrivals.csv (recorded traffic). examples/pipeline_world is one."""
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Of the world: sensors, queues, arrivals and starts, as far as they are not given. 0 to 4294967295; the same
-    seed is the same world."""
+    """Seed of the world, 0 to 4294967295: it draws the sensors, queues, arrivals and starts that are not given. The
+    same seed gives the same world."""
     steps: Annotated[int | None, arg(metavar="N")] = None
     """Waypoints to fly, 1 to 10000. Default: the world's (30 in every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
-    """Who decides: edge, or with no edge at all eof (earliest overflow first), wqcs (weighted queue and
-    channel), max_gain (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner,
-    extra `planner`), madqn or mappo (trained networks, extra `marl`)."""
+    """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
+    (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner, extra `planner`),
+    madqn or mappo (trained networks, extra `marl`)."""
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
-    """How the edge decides: llm (the paper's method), guided (the LLM among other advisers), value (what its modules
-    learned) or policy (the planner). Default: the edge's."""
+    """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or
+    policy (the planner). Default: the edge's."""
     uplink: Annotated[Uplink, arg(metavar="full|delta|pruned")] = "full"
-    """What a UAV sends: all, what changed (it is decided alike), or the k sensors that attention on board keeps."""
+    """The part of each report to send: full, the sensors that changed (delta, with the same decisions), or the k
+    sensors that attention on board selects (pruned)."""
     deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
-    """Seconds to wait for the edge and its LLM. One still loading its LLM then decides without it."""
+    """Seconds to wait for the edge and its LLM. An edge that still loads its LLM then decides without it."""
     await_llm: Annotated[Literal["on", "off"], arg(metavar="on|off")] = "off"
-    """on: an LLM that is out of reach is waited for too, as one that loads is."""
+    """on: wait for an unreachable LLM as for a loading one."""
     reconnect_s: Annotated[float, arg(metavar="S")] = 10.0
-    """Seconds, in all per outage, to wait in the air for a lost edge and its LLM, 0 to 3600; 0 never waits."""
+    """Seconds to wait during the flight for a lost edge and its LLM, in all per outage, 0 to 3600; 0 never waits."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to write to, made if missing. Default: runs/ and the mission's ID, such as runs/paper-0-1f6c09ab."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
-    """Write even where a mission's result is already."""
+    """Overwrite an earlier mission's result."""
     metrics_port: Annotated[int, arg(metavar="0-65535")] = 0
-    """Port on which Prometheus finds the flight's metrics while it lasts, and until it was there once more (20 s at
-    most); 0: none."""
+    """Port of the flight's metrics for Prometheus, served during the flight and until one more scrape (at most 20 s);
+    0: none."""
     metrics_host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address for that port; 0.0.0.0 for every interface. Whoever reaches it may read."""
+    """Address for that port; 0.0.0.0 for every interface. The metrics need no key."""
 
 
 def main(argv: list[str]) -> int:
-    """Fly the mission that the command line describes; returns the exit code."""
+    """Run ``aicvds simulate``; returns the exit code."""
     command = shlex.join(["aicvds", "simulate", *argv])
     return command_main(Simulate, "aicvds simulate", argv, lambda options, console: simulate(options, command, console))
 
@@ -100,8 +102,8 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     """Fly, write, print; returns the exit code.
 
     Raises:
-        UsageError: the options make no mission, or the folder cannot be written.
-        EdgeError: no edge answers as one.
+        UsageError: the options are unusable, or the folder cannot be written.
+        EdgeError: no edge is ready.
     """
     site = chosen_site(options.scenario, options.world, options.steps)
     check(options)
@@ -127,7 +129,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     metrics = FlightMetrics(site.scenario.steps)
     with served(metrics, options.metrics_host, options.metrics_port) as server:
         code = conduct(job, console, metrics=metrics)
-        # All is written by now: Ctrl-C means only not to wait.
+        # All results are written: Ctrl-C only ends this wait.
         if server is not None and code != INTERRUPTED:
             with console.status("Waiting until Prometheus has the last numbers"), suppress(KeyboardInterrupt):
                 server.await_last_scrape()
@@ -135,7 +137,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
 
 
 def check(options: Simulate) -> None:
-    """Raises ``UsageError`` for the first option that is out of its bounds."""
+    """Raises ``UsageError`` for the first option out of bounds."""
     from simulator.policies.registry import POLICY_NAMES
 
     check_seed(options.seed)

@@ -20,7 +20,7 @@ from simulator.errors import UsageError
 from simulator.marl.plan import MOST_EPISODES, STATE, Plan
 from simulator.records.run_folder import naming_out
 
-# Torch and TorchRL take seconds to import; `--help` and bad use answer without them.
+# Torch and TorchRL take seconds to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -35,7 +35,7 @@ class Train:
 
     MADQN: independent deep Q-learning, 1000 episodes. MAPPO: actors with a centralised critic, 21600 episodes. Both
     with the paper's table of hyperparameters, on TorchRL; about ten minutes each. Written to --out: SCHEME.pt (the
-    weights, what `--policy` flies), SCHEME.csv and .png and .svg (the learning curve), tensorboard/, state.pt.
+    weights for `--policy`), SCHEME.csv and .png and .svg (the learning curve), tensorboard/, state.pt.
 
     The checkpoints that ship with the package were made by
 
@@ -43,35 +43,35 @@ class Train:
 
       aicvds train mappo --out runs/mappo
 
-    Watch a training with `tensorboard --logdir runs`. After Ctrl-C, or a crash, the same command with --resume goes
-    on, and ends with the very weights of a training that was never interrupted. The same options give the same
-    weights to the bit on the same machine. Training worlds are apart from every evaluation seed.
+    Watch a training with `tensorboard --logdir runs`. After Ctrl-C or a crash, the same command with --resume continues
+    the training, and its weights equal those of an uninterrupted one. The same options give the same weights to the bit
+    on the same machine. Training worlds are apart from every evaluation seed.
 
     Exit code: 0 trained, 2 bad use, 130 interrupted.
     """
 
     scheme: Positional[Literal["madqn", "mappo"]]
-    """What to train."""
+    """The scheme to train."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
-    """The world to train in. Weights fit only scenarios with as many sensors, UAVs and velocities."""
+    """The training's world. Weights fit only scenarios with the same numbers of sensors, UAVs and velocities."""
     episodes: Annotated[int | None, arg(metavar="N")] = None
     """Missions to fly. Default: 1000 for madqn, as in the paper, 21600 for mappo."""
     seed: Annotated[int, arg(metavar="N")] = 0
-    """Of the initial weights, the exploration and the training worlds, 0 to 4294967295."""
+    """Seed of the initial weights, the exploration and the training worlds, 0 to 4294967295."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to write to, made if missing. Default: runs/ and the scheme, such as runs/madqn."""
     resume: Annotated[bool, FlagCreatePairsOff] = False
-    """Go on with the training in --out."""
+    """Continue the training in --out."""
     threads: Annotated[int, arg(metavar="N")] = 1
-    """Of torch, 1 to 64. Other numbers round differently, so they give other weights."""
+    """Threads of torch, 1 to 64. Other numbers round differently, so they give other weights."""
     save_s: Annotated[float, arg(metavar="S")] = 30.0
-    """Seconds between the states to resume from, 0 to 3600; 0 saves after every round of missions."""
+    """Seconds between saved states for --resume, 0 to 3600; 0 saves after every round of missions."""
 
 
 def main(argv: list[str]) -> int:
-    """Train what the command line describes; returns the exit code."""
-    # Whether it was resumed does not change what it makes.
-    command = shlex.join(["aicvds", "train", *(word for word in argv if word != "--resume")])
+    """Run ``aicvds train``; returns the exit code."""
+    # A resumed training makes the same weights, so its recorded command omits the option.
+    command = shlex.join(["aicvds", "train", *(argument for argument in argv if argument != "--resume")])
     return command_main(Train, "aicvds train", argv, lambda options, console: train(options, command, console))
 
 
@@ -79,20 +79,20 @@ def train(options: Train, command: str, console: Console) -> int:
     """Train, write, print; returns the exit code.
 
     Raises:
-        UsageError: the options make no training, the folder holds another, or the extra ``marl`` is not installed.
+        UsageError: the options are unusable, the folder has another training, or the extra ``marl`` is not installed.
     """
     scenario = chosen_scenario(options.scenario)
     check(options)
     out = options.out or Path("runs") / options.scheme
     if (out / STATE).exists() and not options.resume:
-        raise UsageError(f"--out {out} holds a training: give --resume to go on with it, or another --out")
+        raise UsageError(f"--out {out} has a training: give --resume to continue it, or another --out")
     with console.status("Loading TorchRL"):
-        make, plan = _planned(options, scenario)
+        learner, plan = _planned(options, scenario)
         from simulator.marl.training import Training
 
-    # It tells of every replay buffer that it makes.
+    # TorchRL logs every replay buffer at level INFO.
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    training = Training(plan, make, out)
+    training = Training(plan, learner, out)
     if options.resume:
         training.resume()
     try:
@@ -101,13 +101,13 @@ def train(options: Train, command: str, console: Console) -> int:
             _run(training, options, console)
             _conclude(training, command, out, console)
     except KeyboardInterrupt:
-        console.print(f"Interrupted at episode {training.episodes}. The same command with --resume goes on.")
+        console.print(f"Interrupted at episode {training.episodes}. The same command with --resume continues.")
         return INTERRUPTED
     return 0
 
 
 def check(options: Train) -> None:
-    """Raises ``UsageError`` for the first option that is out of its bounds."""
+    """Raises ``UsageError`` for the first option out of bounds."""
     if options.episodes is not None:
         check_between("--episodes", options.episodes, 1, MOST_EPISODES)
     check_seed(options.seed)
@@ -121,10 +121,10 @@ def _planned(options: Train, scenario: Scenario) -> tuple[Callable[[Scenario, in
     except ModuleNotFoundError as missing:
         raise UsageError(f"{missing.name} is not installed. {_EXTRA}") from None
 
-    make: Callable[[Scenario, int, int], Learner] = madqn.Madqn if options.scheme == "madqn" else mappo.Mappo
+    learner: Callable[[Scenario, int, int], Learner] = madqn.Madqn if options.scheme == "madqn" else mappo.Mappo
     episodes = madqn.EPISODES if options.scheme == "madqn" else mappo.EPISODES
     chosen = episodes if options.episodes is None else options.episodes
-    return make, Plan(options.scheme, scenario, chosen, options.seed, options.threads)
+    return learner, Plan(options.scheme, scenario, chosen, options.seed, options.threads)
 
 
 def _run(training: Training, options: Train, console: Console) -> None:
@@ -133,20 +133,20 @@ def _run(training: Training, options: Train, console: Console) -> None:
         BarColumn(bar_width=8),
         MofNCompleteColumn(),
         TextColumn("missions"),
-        TextColumn("{task.fields[news]}"),
+        TextColumn("{task.fields[results]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as progress:
         task = progress.add_task(
-            options.scheme.upper(), total=training.plan.episodes, completed=training.episodes, news=""
+            options.scheme.upper(), total=training.plan.episodes, completed=training.episodes, results=""
         )
 
-        def told(flown: Round) -> None:
-            news = f"loss {flown.loss:.3f}, lost {flown.lost_packets:.0f}"
-            progress.update(task, completed=training.episodes, news=news)
+        def on_round(flown: Round) -> None:
+            results = f"loss {flown.loss:.3f}, lost {flown.lost_packets:.0f}"
+            progress.update(task, completed=training.episodes, results=results)
 
-        training.run(told, options.save_s)
+        training.run(on_round, options.save_s)
 
 
 def _conclude(training: Training, command: str, out: Path, console: Console) -> None:

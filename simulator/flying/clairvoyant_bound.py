@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """What is the least that can be lost in one world.
+    """A bound on the packets lost in one world, and the best flight found.
 
     Attributes:
-        lower_bound: proven: no flight loses fewer packets.
-        lost_packets: what the best flight found loses.
-        actions: that flight, shape ``(T, I, 2)``: sensor, velocity.
-        seconds: of searching.
+        lower_bound: proven; no flight loses fewer packets.
+        lost_packets: of the best flight found.
+        actions: of that flight, shape ``(T, I, 2)``: sensor, velocity.
+        seconds: of the search.
     """
 
     lower_bound: int
@@ -39,29 +39,29 @@ class Bound:
 
     @property
     def gap(self) -> int:
-        """Packets between the flight and the bound."""
+        """Packets that the flight loses above the bound."""
         return self.lost_packets - self.lower_bound
 
 
 def clairvoyant(
     site: Site, seed: int, time_limit_s: float = 60.0, workers: int = 8, on_news: Callable[[News], None] | None = None
 ) -> Bound:
-    """Bound one world, knowing all its arrivals.
+    """Bound one world with all its arrivals known.
 
-    Batteries are left out of the bound where a link's strength decides what a packet costs, which can only lower it;
-    the flight found is flown with batteries as they are.
+    The bound omits batteries where a link's strength decides the energy of a packet, which can only lower it. The
+    flight found is flown with the true batteries.
 
     Args:
         site: the scenario, and its trace if it has one.
         seed: of the world.
-        time_limit_s: seconds to search; the bound and the flight hold whenever it ends, but depend on the machine.
-        workers: threads of the solver, for worlds that one does not solve quickly.
+        time_limit_s: of the search; the bound and the flight are valid whenever it ends, but depend on the machine.
+        workers: threads of the solver, for worlds that one thread does not solve quickly.
         on_news: called with each better plan or bound, from a thread of the solver.
 
     Raises:
-        RuntimeError: the world did not lose what the plan says, so that one of the two is wrong.
+        RuntimeError: the world lost another number of packets than the plan, so one of the two is wrong.
         ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
-        Interrupted: by Ctrl-C; it carries the best plan so far.
+        Interrupted: by Ctrl-C, with the best plan so far.
     """
     from shared.fleetplan import least_loss
 
@@ -69,21 +69,21 @@ def clairvoyant(
 
 
 def confirmed(site: Site, seed: int, plan: Plan) -> Bound:
-    """The bound that a plan of the whole mission proves, after flying it in the world.
+    """The bound that a plan of the whole mission proves, confirmed by a flight of the plan in the world.
 
     Raises:
-        RuntimeError: the world did not lose what the plan says.
+        RuntimeError: the world lost another number of packets than the plan.
     """
     flown = replay(site, seed, plan.actions)
     if flown != plan.lost_packets:
         raise RuntimeError(f"the plan of seed {seed} loses {plan.lost_packets} packets, flown in the world {flown}")
-    # Lost packets are whole; the margin is for the solver's own rounding.
+    # Lost packets are whole numbers; the margin covers the solver's rounding.
     proven = int(np.ceil(plan.lower_bound - 1e-6))
     return Bound(proven, plan.lost_packets, plan.actions, plan.seconds)
 
 
 def problem_of(site: Site, seed: int) -> FleetProblem:
-    """The whole mission as a planning problem, with what only the world knows."""
+    """The whole mission as a planning problem, with the world's hidden state."""
     from shared.fleetplan import FleetProblem
 
     world = site.world()

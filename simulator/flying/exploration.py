@@ -11,7 +11,7 @@ from shared.rollouts import Reference, RolloutStep
 from shared.scenario import Scenario
 from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
-# The world and the planner take seconds to import; `--help` and bad use answer without them.
+# The world and the planner take seconds to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:
     from simulator.flying.teachers import Action, Teacher, TeacherName
     from simulator.world import Observation
@@ -31,19 +31,22 @@ def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None
     world = PipelineWorld(scenario)
     observations, _ = world.reset(seed=FIRST_TRAINING_SEED + mission)
     deviation = _Deviation(scenario, mission, rng)
-    asked: Teacher | None = None if teacher is None else TEACHERS[teacher](world)
-    share = 1.0 if asked is None else rng.uniform(0.0, asked.deviations)
+    guide: Teacher | None = None if teacher is None else TEACHERS[teacher](world)
+    share = 1.0 if guide is None else rng.uniform(0.0, guide.deviations)
     for step in range(scenario.steps):
         deviating = bool(rng.random() < share)
         choices: list[Action] = []
         references: list[Reference | None] = []
         for uav in range(scenario.uavs):
             observation, taken = observations[f"uav_{uav}"], frozenset(sensor for sensor, _ in choices)
-            told = None if asked is None else asked.refer(uav, observation, taken, deviating)
-            choices.append(told if told and not deviating else deviation.instead_of(told, uav, observation, taken))
-            references.append(_reference(teacher, told))
-            if asked is not None:
-                asked.flown(uav, step, choices[-1])
+            advised = None if guide is None else guide.refer(uav, observation, taken, deviating)
+            if advised is not None and not deviating:
+                choices.append(advised)
+            else:
+                choices.append(deviation.action(advised, uav, observation, taken))
+            references.append(_reference(teacher, advised))
+            if guide is not None:
+                guide.flown(uav, step, choices[-1])
         requests = [decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in range(scenario.uavs)]
         observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in enumerate(choices)})
         for uav, (sensor, velocity) in enumerate(choices):
@@ -59,14 +62,14 @@ def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None
             )
 
 
-def _reference(teacher: TeacherName | None, told: Action | None) -> Reference | None:
-    if teacher is None or told is None:
+def _reference(teacher: TeacherName | None, advised: Action | None) -> Reference | None:
+    if teacher is None or advised is None:
         return None
-    return Reference(teacher=teacher, sensor_id=told[0], velocity=told[1])
+    return Reference(teacher=teacher, sensor_id=advised[0], velocity=advised[1])
 
 
 class _Deviation:
-    """What a fleet does that leaves its teacher's way, or has none."""
+    """The exploring actions of a fleet that deviates from its teacher or has none."""
 
     def __init__(self, scenario: Scenario, mission: int, rng: np.random.Generator) -> None:
         from simulator.policies.registry import policy_named
@@ -77,15 +80,15 @@ class _Deviation:
         for guide in self._guides:
             guide.reset(scenario, mission)
 
-    def instead_of(self, told: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
-        """A sensor of EOF's, WQCS's or at random, and a random velocity; or one of both as the teacher says."""
+    def action(self, advised: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
+        """A random velocity, and a sensor of EOF, of WQCS or at random; sometimes one of the two is the teacher's."""
         rng = self._rng
         sensor, _ = self._guides[rng.integers(2)].decide(uav, observation, taken)
         heard = np.flatnonzero(observation["last_heard"] >= 0)
         if rng.random() < 0.5 and len(heard):
             sensor = int(rng.choice(heard))
         velocity = int(rng.integers(self._levels))
-        if told is not None:
-            kept = rng.integers(3)
-            return (told[0] if kept == 1 else sensor), (told[1] if kept == 2 else velocity)
+        if advised is not None:
+            followed = rng.integers(3)
+            return (advised[0] if followed == 1 else sensor), (advised[1] if followed == 2 else velocity)
         return sensor, velocity

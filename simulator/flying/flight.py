@@ -17,16 +17,16 @@ from simulator.client import Exchange
 from simulator.flying.pilots import Choice, Pilot
 from simulator.records.decision import Decision
 from simulator.records.decision_log import DecisionLog
-from simulator.records.summary import Flown
+from simulator.records.summary import FlightFacts
 from simulator.sites.site import Site
 from simulator.world import Info, Observation, StepTally
 
 
 @dataclass
 class Flight:
-    """A mission as far as it was flown: whole steps only.
+    """The whole steps of a mission that were flown.
 
-    ``decisions`` in order of step and UAV; ``tally`` one entry a step; ``sensor_xy`` (J, 2) metres.
+    ``decisions`` are in order of step and UAV. ``tally`` has one entry a step. ``sensor_xy`` has shape (J, 2), metres.
     """
 
     scenario: Scenario
@@ -40,7 +40,7 @@ class Flight:
 
     @property
     def steps_flown(self) -> int:
-        """Whole steps that every UAV flew."""
+        """The number of whole steps flown."""
         return len(self.tally)
 
     def facts(
@@ -54,9 +54,9 @@ class Flight:
         model: str | None,
         deadline_ms: int | None,
         command: str,
-    ) -> Flown:
+    ) -> FlightFacts:
         """The facts for ``simulator.records.summary.summarise``."""
-        return Flown(
+        return FlightFacts(
             scenario=self.scenario.name,
             seed=self.seed,
             steps=self.scenario.steps,
@@ -86,13 +86,13 @@ def fly(
     on_decision: Callable[[Choice], None] | None = None,
     on_step: Callable[[Flight], None] | None = None,
 ) -> Flight:
-    """Fly one mission, or as much of it as a KeyboardInterrupt lets it: then ``interrupted`` is true.
+    """Fly one mission; a KeyboardInterrupt ends it after the last whole step, with ``interrupted`` true.
 
     Args:
-        site: where.
-        pilot: who decides; it hears the outcomes, and at the end it is told to land.
+        site: the scenario, and its trace if it has one.
+        pilot: decides for every UAV, gets the outcomes, and lands at the end.
         seed: of the world.
-        log: takes every decision of each whole step.
+        log: gets the decisions of each whole step.
         on_decision: called after every decision.
         on_step: called after every step with the flight so far.
     """
@@ -113,7 +113,7 @@ def fly(
             actions = {f"uav_{i}": np.array([c.sensor, c.velocity], dtype=np.int64) for i, c in enumerate(choices)}
             before = observations
             observations, _, _, _, infos = world.step(actions)
-            _book(flight, before, choices, infos, log)
+            _record(flight, before, choices, infos, log)
             for uav, choice in enumerate(choices):
                 info = infos[f"uav_{uav}"]
                 pilot.learn(uav, choice, float(info["cost"]), bool(info["failed"]))
@@ -125,12 +125,12 @@ def fly(
         flight.interrupted = True
         del flight.decisions[flight.steps_flown * scenario.uavs :]
         if log is not None:
-            log.keep(flight.decisions)
+            log.rewrite(flight.decisions)
     flight.duration_s = time.monotonic() - began
     return flight
 
 
-def _book(
+def _record(
     flight: Flight,
     observations: Mapping[str, Observation],
     choices: list[Choice],
@@ -152,15 +152,15 @@ def _book(
             collected=int(info["collected"]),
             lost_packets=int(info["lost_packets"]),
             cost=float(info["cost"]),
-            **of_the_exchange(choice.exchange),
+            **exchange_fields(choice.exchange),
         )
         flight.decisions.append(decision)
         if log is not None:
             log.append(decision)
 
 
-def of_the_exchange(exchange: Exchange | None) -> dict[str, Any]:
-    """What a ``Decision`` takes over from the edge's answer; nothing where there was none."""
+def exchange_fields(exchange: Exchange | None) -> dict[str, Any]:
+    """The fields of a ``Decision`` that come from the edge's answer; empty without an exchange."""
     if exchange is None:
         return {}
     answer = exchange.response

@@ -1,4 +1,4 @@
-"""What a flight tells Prometheus while it lasts. No label carries a mission, UAV or sensor: cardinality."""
+"""Prometheus metrics of a running flight. To bound their cardinality, no label has a mission, UAV or sensor."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _ROUND_TRIP_BUCKETS = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3
 
 
 class FlightMetrics:
-    """The metrics of one flight, in a registry of their own.
+    """The metrics of one flight, in a separate registry.
 
     Args:
-        steps: that the mission has.
+        steps: of the mission.
     """
 
     def __init__(self, steps: int) -> None:
@@ -48,13 +48,13 @@ class FlightMetrics:
         Gauge("aicvds_flight_steps", "Steps that the mission has", registry=r).set(steps)
 
     def decided(self, choice: Choice) -> None:
-        """One UAV knows where to go."""
+        """Count one decision."""
         self._decisions.labels(choice.source, choice.reason or "none").inc()
         if choice.exchange is not None:
             self._round_trip.observe(choice.exchange.rtt_ms / 1e3)
 
     def stepped(self, flight: Flight) -> None:
-        """The whole fleet has flown a step."""
+        """Count one step of the whole fleet."""
         tally = flight.tally[-1]
         self._lost.inc(tally.lost_packets)
         self._overflows.inc(tally.overflows)
@@ -68,35 +68,35 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 
 class _Quiet(WSGIRequestHandler):
-    # Who asks and says nothing is hung up on, seconds.
+    # Seconds until a silent connection is closed.
     timeout = 10
 
     def log_message(self, format: str, *args: object) -> None:
-        """Scrapes are no news."""
+        """Log no scrape."""
 
 
-class _Told:
-    """A response's body that tells when all of it was sent: then the server closes it."""
+class _CountedBody:
+    """A response body that calls ``on_sent`` after its last byte, when the server closes it."""
 
-    def __init__(self, body: Iterable[bytes], sent: Callable[[], None]) -> None:
+    def __init__(self, body: Iterable[bytes], on_sent: Callable[[], None]) -> None:
         self._body = body
-        self.close = sent
+        self.close = on_sent
 
     def __iter__(self) -> Iterator[bytes]:
         return iter(self._body)
 
 
 class MetricsServer:
-    """Answers Prometheus in a thread, and counts how often.
+    """An HTTP server in a thread that answers Prometheus and counts the scrapes.
 
     Raises:
-        UsageError: it cannot listen there.
+        UsageError: the address is unusable or in use.
     """
 
     def __init__(self, registry: CollectorRegistry, host: str, port: int) -> None:
         self._app = make_wsgi_app(registry)
-        self._sent = 0
-        self._news = threading.Condition()
+        self._scrapes = 0
+        self._scraped = threading.Condition()
         try:
             self._server = make_server(host, port, self._answer, server_class=_Server, handler_class=_Quiet)
         except OSError as error:
@@ -108,27 +108,27 @@ class MetricsServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port on which it listens."""
         return self._server.server_port
 
     def _answer(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        return _Told(self._app(environ, start_response), self._count)
+        return _CountedBody(self._app(environ, start_response), self._count)
 
     def _count(self) -> None:
-        with self._news:
-            self._sent += 1
-            self._news.notify_all()
+        with self._scraped:
+            self._scrapes += 1
+            self._scraped.notify_all()
 
     def await_last_scrape(self) -> None:
-        """Wait until it is asked once more, if it ever was: a flight's last numbers are the ones to keep."""
-        ends = time.monotonic() + LONGEST_LAST_SCRAPE_S
-        with self._news:
-            before = self._sent
-            while before and self._sent == before and (left := ends - time.monotonic()) > 0:
-                self._news.wait(left)
+        """Wait for one more scrape, if there was any, so that Prometheus has the flight's final numbers."""
+        deadline = time.monotonic() + LONGEST_LAST_SCRAPE_S
+        with self._scraped:
+            before = self._scrapes
+            while before and self._scrapes == before and (remaining_s := deadline - time.monotonic()) > 0:
+                self._scraped.wait(remaining_s)
 
     def close(self) -> None:
-        """Answer nobody any more."""
+        """Stop the server and its thread."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -136,10 +136,10 @@ class MetricsServer:
 
 @contextmanager
 def served(metrics: FlightMetrics, host: str, port: int) -> Iterator[MetricsServer | None]:
-    """Within, Prometheus finds the metrics there; with port 0 it does not.
+    """Within the context, serve the metrics to Prometheus; port 0 serves none.
 
     Raises:
-        UsageError: it cannot listen there.
+        UsageError: the address is unusable or in use.
     """
     if port == 0:
         yield None

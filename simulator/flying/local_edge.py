@@ -18,22 +18,22 @@ HOST = "127.0.0.1"
 
 
 class EdgeDied(EdgeError):
-    """The edge's process ended by itself; the text has the end of its log."""
+    """The edge's process ended unexpectedly; the text has the end of its log."""
 
 
 @contextmanager
 def edge_process(
     port: int, log: Path, environment: Mapping[str, str] | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """An edge on the loopback's ``port``, its output in ``log``; stopped on leaving, whatever the reason.
+    """Within the context, run an edge on the loopback's ``port`` with its output in ``log``.
 
-    ``environment`` has its settings; ``None``: this process's.
+    ``environment`` has its settings; ``None`` inherits this process's environment.
     """
     command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
     with naming_out(log.parent):
         output = log.open("wb")
     with output:
-        # A session of its own: Ctrl-C must reach the flight first, which still needs its edge to land.
+        # A separate session keeps Ctrl-C from the edge: the flight handles it, and still needs the edge to land.
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -61,7 +61,7 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 
 def check_alive(process: subprocess.Popen[bytes], log: Path) -> None:
-    """Raises :class:`EdgeDied` with the end of its log once the edge has ended."""
+    """Raises :class:`EdgeDied` with the end of the log if the edge's process has ended."""
     code = process.poll()
     if code is not None:
         tail = log.read_text(encoding="utf-8", errors="replace").splitlines()[-TAIL_LINES:]
@@ -69,8 +69,8 @@ def check_alive(process: subprocess.Popen[bytes], log: Path) -> None:
 
 
 def usable_port(port: int) -> int:
-    """A port of the loopback that is free: ``port``, or any for 0; raises ``UsageError`` if it is taken."""
-    # Were the port taken, the edge would die and the mission fly against whatever listens there.
+    """A free port of the loopback: ``port``, or any for 0; raises ``UsageError`` if it is in use."""
+    # With the port in use, the edge would die and the mission would ask the other server.
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -22,7 +22,7 @@ FALLBACK = "eof"
 
 @dataclass(frozen=True)
 class Choice:
-    """A sensor, a velocity in m/s, who chose them, why it was not the LLM, and the exchange if there was one."""
+    """A decision: sensor, velocity in m/s, source, the reason of a fallback, and the exchange with an edge, if any."""
 
     sensor: int
     velocity: int
@@ -32,20 +32,20 @@ class Choice:
 
 
 class Pilot(Protocol):
-    """Whoever decides for the fleet."""
+    """Decides for the fleet."""
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
-        """The choice of one UAV, given what it sees and the sensors that earlier UAVs took this step."""
+        """The choice for one UAV from its observation and the sensors that earlier UAVs of this step took."""
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
-        """What came of that choice."""
+        """Use the outcome of that choice."""
 
     def land(self) -> None:
-        """The mission is over."""
+        """Finish the mission."""
 
 
 class LocalPilot:
-    """Flies a policy of the simulator's own; every decision counts as taken on board."""
+    """The pilot of a local policy; every decision counts as taken on board."""
 
     def __init__(self, name: str, scenario: Scenario, seed: int) -> None:
         self._reason = f"policy_{name}"
@@ -58,19 +58,19 @@ class LocalPilot:
         return Choice(int(sensor), int(velocity), "onboard", self._reason)
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
-        """A local policy does not learn."""
+        """Do nothing: a local policy does not learn."""
 
     def land(self) -> None:
-        """Nothing is owed to anyone."""
+        """Do nothing: no outcome is pending."""
 
 
 class EdgePilot:
-    """Asks an edge, and decides on board with EOF when it gives no usable answer: a UAV in the air must fly on.
+    """The pilot that asks an edge; without a usable answer the UAV decides on board with EOF.
 
-    ``spec`` is the mission to make at the edge before the first decision; ``on_request`` hears each request before it
-    is asked; ``answered`` counts the edge's decisions; ``last_error`` is the last reason for going without. After a
-    step in which the edge was out of reach, the fleet waits until ``scout`` finds it ready, ``reconnect_s`` seconds in
-    all per outage at most.
+    ``spec`` is the mission to create at the edge before the first decision. ``on_request`` is called with each request
+    before it is sent. ``answered`` counts the edge's decisions, and ``last_error`` is the text of the last failure.
+    After a step with an unreachable edge the fleet waits until the client ``probe`` finds it ready, at most
+    ``reconnect_s`` seconds in all per outage.
     """
 
     def __init__(
@@ -82,22 +82,22 @@ class EdgePilot:
         *,
         mode: Mode | None = None,
         deadline_ms: int | None = None,
-        scout: EdgeClient | None = None,
+        probe: EdgeClient | None = None,
         reconnect_s: float = 0.0,
         on_wait: Callable[[str], None] | None = None,
     ) -> None:
         self._client = client
-        self._scout = scout or client
-        self._reconnect_s = self._patience_s = reconnect_s
+        self._probe = probe or client
+        self._reconnect_s = self._wait_left_s = reconnect_s
         self._on_wait = on_wait
         self._step = 0
         self._mission_id = mission_id
         self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode)
         self._deadline_ms = deadline_ms
         self._max_velocity = scenario.max_velocity
-        self._owed: dict[int, Outcome] = {}
-        # Told to an edge that could not put them on disk.
-        self._unsure: list[Outcome] = []
+        self._pending: dict[int, Outcome] = {}
+        # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
+        self._undurable: list[Outcome] = []
         self._lost = False
         self._fallback: Policy = policy_named(FALLBACK)
         self._fallback.reset(scenario, seed)
@@ -108,11 +108,11 @@ class EdgePilot:
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
         """The edge's choice, or EOF's with source ``onboard`` and the reason."""
         step = int(observation["step"][0])
-        if step != self._step and self._lost and self._patience_s > 0:
+        if step != self._step and self._lost and self._wait_left_s > 0:
             self._await_edge()
         self._step = step
         request = decide_request(
-            uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._owed.get(uav)
+            uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._pending.get(uav)
         )
         self.on_request(request)
         try:
@@ -121,38 +121,38 @@ class EdgePilot:
             self.last_error = str(error)
             sensor, velocity = self._fallback.decide(uav, observation, taken)
             return Choice(int(sensor), int(velocity), "onboard", _reason(error))
-        self._owed.pop(uav, None)
+        self._pending.pop(uav, None)
         if request.outcome is not None and not exchange.response.stored:
-            self._unsure.append(request.outcome)
+            self._undurable.append(request.outcome)
         self.answered += 1
         answer = exchange.response
         return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
     def _await_edge(self) -> None:
-        # Without an edge a step takes microseconds, so the mission would be over before a restarted edge is up.
+        # Without an edge a step takes microseconds: the mission would end before a restarted edge is up.
         began = time.monotonic()
         try:
-            self._scout.wait_ready(self._patience_s, on_wait=self._on_wait)
-            # A restarted edge must not make the mission anew from a request, with another spec.
-            self._scout.put_mission(self._mission_id, self.spec)
+            self._probe.wait_ready(self._wait_left_s, on_wait=self._on_wait)
+            # Without this, a restarted edge would create the mission from the next request, with another spec.
+            self._probe.put_mission(self._mission_id, self.spec)
         except EdgeError as error:
             self.last_error = str(error)
-        self._patience_s -= time.monotonic() - began
+        self._wait_left_s -= time.monotonic() - began
 
     def _ask(self, request: DecideRequest) -> Exchange:
         try:
-            # One attempt is enough to notice that a lost edge is back, and it delays the fleet least.
+            # A single attempt detects that a lost edge is back with the least delay.
             exchange = self._client.decide(request, attempts=1 if self._lost else None)
         except EdgeUnreachable:
             self._lost = True
             raise
         except EdgeRefused as refused:
-            # An edge that restarted knows neither the earlier decision nor the mission; that must not cost this one.
+            # A restarted edge has neither the mission nor the earlier decision: create it, and omit the outcome.
             if request.outcome is None or not refused.blames("outcome"):
                 raise
             self._client.put_mission(self._mission_id, self.spec)
             exchange = self._client.decide(request.model_copy(update={"outcome": None}))
-        self._lost, self._patience_s = False, self._reconnect_s
+        self._lost, self._wait_left_s = False, self._reconnect_s
         if exchange.response.velocity > self._max_velocity:
             raise EdgeProtocolError(
                 f"the edge chose {exchange.response.velocity} m/s, the limit is {self._max_velocity}"
@@ -160,13 +160,13 @@ class EdgePilot:
         return exchange
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
-        """Keep the outcome for this UAV's next request."""
+        """Store the outcome for this UAV's next request."""
         if choice.exchange is not None:
-            self._owed[uav] = choice.exchange.outcome(cost, failed)
+            self._pending[uav] = choice.exchange.outcome(cost, failed)
 
     def land(self) -> None:
-        """Send the outcomes that no later request carried, as far as the edge still listens."""
-        for outcome in (*self._unsure, *self._owed.values()):
+        """Send the outcomes that no later request carried, until the edge is unreachable."""
+        for outcome in (*self._undurable, *self._pending.values()):
             try:
                 self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
             except EdgeUnreachable as error:
@@ -174,8 +174,8 @@ class EdgePilot:
                 break
             except EdgeError as error:
                 self.last_error = str(error)
-        self._owed.clear()
-        self._unsure.clear()
+        self._pending.clear()
+        self._undurable.clear()
 
 
 def _reason(error: EdgeError) -> str:

@@ -13,7 +13,7 @@ BASELINES = ("eof", "wqcs")
 
 
 def baselines(site: Site, seed: int, steps: int) -> dict[str, list[StepTally]]:
-    """EOF and WQCS on the same site and seed: per policy, the first ``steps`` steps' tallies."""
+    """EOF and WQCS on the same site and seed: the tallies of the first ``steps`` steps by policy."""
     flown = {name: rollout(site.world(), policy_named(name), seed) for name in BASELINES}
     return {name: tally[:steps] for name, tally in flown.items()}
 
@@ -21,12 +21,12 @@ def baselines(site: Site, seed: int, steps: int) -> dict[str, list[StepTally]]:
 def rollout(
     world: PipelineWorld, policy: Policy, seed: int, on_step: Callable[[StepTally], None] | None = None
 ) -> list[StepTally]:
-    """Fly one mission from ``reset(seed)`` to its end; UAV 0 decides first, and later ones see what is taken.
+    """Fly one mission from ``reset(seed)`` to its end; UAV 0 decides first, and later UAVs know the sensors taken.
 
     Args:
-        world: reset here with the seed.
-        policy: reset here with the world's scenario and the seed.
-        seed: of the world, and of a policy that draws.
+        world: this function resets it with the seed.
+        policy: this function resets it with the world's scenario and the seed.
+        seed: of the world, and of a random policy.
         on_step: called after every step with its tally; the world's state is the one after the step.
 
     Returns:

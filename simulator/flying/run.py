@@ -24,10 +24,10 @@ from simulator.client.lossy_transport import LossyTransport
 from simulator.records.decision_log import DecisionLog
 from simulator.records.request_log import RequestLog, resolved
 from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, fresh_folder, naming_out
-from simulator.records.summary import BySource, summarise, told_sources
+from simulator.records.summary import BySource, sources_text, summarise
 from simulator.sites.site import Site
 
-# The world and matplotlib take a second to import; `--help` and bad use answer without them.
+# The world and matplotlib take a second to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:
     from simulator.flying.flight import Flight
     from simulator.flying.flight_metrics import FlightMetrics
@@ -35,23 +35,24 @@ if TYPE_CHECKING:
 
 
 API_KEY = "AICVDS_API_KEY"
-# Without a deadline of our own the edge's applies, and it may be as long as the paper's step.
+# Without a requested deadline the edge's default applies, which may be as long as the paper's step.
 DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
-# A poll that nobody answers must not outlast the pause that it is part of by much.
-SCOUT_TIMEOUT_S = 2.0
+# The timeout of a readiness probe during an outage, short beside the wait for the edge.
+PROBE_TIMEOUT_S = 2.0
 
 
 def new_mission_id(scenario: Scenario, seed: int) -> str:
-    """An id that no earlier run had, such as ``paper-0-1f6c09ab``."""
+    """A new, unique ID such as ``paper-0-1f6c09ab``."""
     return f"{scenario.name}-{seed}-{secrets.token_hex(4)}"
 
 
 @dataclass(frozen=True)
 class Job:
-    """One mission to conduct. ``policy`` is ``edge`` or a local policy's name; ``edge`` is ``None`` for those.
+    """One mission to conduct.
 
-    ``wait_out`` are the LLM's states that are waited out before take-off, ``wait_s`` seconds at most.
+    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. Before take-off the mission waits,
+    at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``.
     """
 
     site: Site
@@ -74,7 +75,8 @@ def conduct(
 ) -> int:
     """Wait for the edge, fly, compare, write and print; returns the exit code.
 
-    ``alive`` is called while waiting and raises if there is nothing to wait for; ``metrics`` hears of the flight.
+    ``alive`` is called during the wait, and raises if the edge's process has ended. ``metrics`` counts the decisions
+    and steps of the flight.
 
     Raises:
         UsageError: the folder cannot be written.
@@ -84,23 +86,23 @@ def conduct(
 
     if job.edge is None:
         fresh_folder(job.out)
-        flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _News(metrics))
+        flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
         return _conclude(job, flight, None, None, console)
-    with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _scout(job.edge) as scout:
+    with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _probe(job.edge) as probe:
         model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
-        news = _News(metrics)
+        progress = _ProgressText(metrics)
         pilot = EdgePilot(
             radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
-            scout=scout, reconnect_s=job.reconnect_s, on_wait=news.waiting,
+            probe=probe, reconnect_s=job.reconnect_s, on_wait=progress.waiting,
         )  # fmt: skip
-        made = ground.put_mission(job.mission_id, pilot.spec)
+        created = ground.put_mission(job.mission_id, pilot.spec)
         fresh_folder(job.out)
         with naming_out(job.out):
-            requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, made))
+            requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, created))
         with requests:
             pilot.on_request = requests.append
-            flight = _fly(job, pilot, console, news)
-    code = _conclude(job, flight, made.mode, model, console)
+            flight = _fly(job, pilot, console, progress)
+    code = _conclude(job, flight, created.mode, model, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
         print(
@@ -110,7 +112,7 @@ def conduct(
 
 
 def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
-    """The fleet's radio, or the wire on the ground, which loses nothing whatever the scenario."""
+    """The client of the fleet's radio link, or with ``airborne`` false that of a lossless link on the ground."""
     timeout_s = DEFAULT_TIMEOUT_S if job.deadline_ms is None else job.deadline_ms / 1000 + NETWORK_SLACK_S
     transport = None
     if airborne and (job.site.scenario.uplink_drop or job.site.scenario.uplink_jitter_ms):
@@ -124,8 +126,8 @@ def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
     return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport, uplink=job.uplink)
 
 
-def _scout(edge: str) -> EdgeClient:
-    return EdgeClient(edge, timeout_s=SCOUT_TIMEOUT_S, attempts=1, api_key=os.environ.get(API_KEY) or None)
+def _probe(edge: str) -> EdgeClient:
+    return EdgeClient(edge, timeout_s=PROBE_TIMEOUT_S, attempts=1, api_key=os.environ.get(API_KEY) or None)
 
 
 def await_edge(
@@ -135,10 +137,10 @@ def await_edge(
     alive: Callable[[], None] = lambda: None,
     wait_out: tuple[str, ...] = ("loading",),
 ) -> str | None:
-    """Wait until the edge can decide and its LLM is none of ``wait_out``; returns the LLM's name, if it has one.
+    """Wait until the edge can decide and its LLM's state is none of ``wait_out``; returns the LLM's name, if any.
 
     Raises:
-        EdgeError: no edge answers as one within ``wait_s`` seconds.
+        EdgeError: no edge is ready within ``wait_s`` seconds.
     """
     with console.status(f"Waiting for the edge at {ground.base_url}") as status:
 
@@ -158,10 +160,10 @@ def await_edge(
     return readiness.model
 
 
-class _News:
-    """What the progress line says: the packets lost and the deciders so far, and what is being waited for.
+class _ProgressText:
+    """The text of the progress line: packets lost and sources so far, or the cause of a wait.
 
-    ``metrics`` hears of the flight too.
+    It also forwards decisions and steps to ``metrics``.
     """
 
     def __init__(self, metrics: FlightMetrics | None) -> None:
@@ -170,16 +172,16 @@ class _News:
         self._lost = 0
         self._sources: Counter[str] = Counter()
 
-    def tell(self, update: Callable[[str], None]) -> None:
-        """Say it with ``update`` from now on."""
+    def show_with(self, update: Callable[[str], None]) -> None:
+        """Display the text by calling ``update``."""
         self._update = update
 
     def waiting(self, cause: str) -> None:
-        """The edge is lost, and the fleet waits for it."""
+        """Show that the fleet waits for a lost edge."""
         self._update(f"waiting for the edge: {escape(cause)}")
 
     def decided(self, choice: Choice) -> None:
-        """One UAV knows where to go."""
+        """Count and show a decision."""
         if self._metrics is not None:
             self._metrics.decided(choice)
         self._sources[choice.source] += 1
@@ -187,14 +189,14 @@ class _News:
         self._update(f"{self._lost} lost; {choice.source} decides{trip}")
 
     def stepped(self, flight: Flight) -> None:
-        """The whole fleet has flown a step."""
+        """Count and show a step of the whole fleet."""
         if self._metrics is not None:
             self._metrics.stepped(flight)
         self._lost += flight.tally[-1].lost_packets
-        self._update(f"{self._lost} lost; {told_sources(BySource(**self._sources))}")
+        self._update(f"{self._lost} lost; {sources_text(BySource(**self._sources))}")
 
 
-def _fly(job: Job, pilot: Pilot, console: Console, news: _News) -> Flight:
+def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Flight:
     from simulator.flying.flight import fly
 
     with naming_out(job.out):
@@ -204,20 +206,20 @@ def _fly(job: Job, pilot: Pilot, console: Console, news: _News) -> Flight:
         BarColumn(bar_width=12),
         MofNCompleteColumn(),
         TextColumn("steps"),
-        TextColumn("{task.fields[news]}"),
+        TextColumn("{task.fields[text]}"),
         TimeElapsedColumn(),
     )
     with log, Progress(*columns, console=console) as progress:
-        task = progress.add_task("Flying", total=job.site.scenario.steps, news="")
-        news.tell(lambda text: progress.update(task, news=text))
+        task = progress.add_task("Flying", total=job.site.scenario.steps, text="")
+        text.show_with(lambda shown: progress.update(task, text=shown))
 
         def stepped(flight: Flight) -> None:
             progress.advance(task)
-            news.stepped(flight)
+            text.stepped(flight)
 
-        flight = fly(job.site, pilot, job.seed, log, news.decided, stepped)
+        flight = fly(job.site, pilot, job.seed, log, text.decided, stepped)
     if flight.interrupted:
-        console.print(f"interrupted after {flight.steps_flown} steps; writing what was flown", highlight=False)
+        console.print(f"interrupted after {flight.steps_flown} steps; writing their results", highlight=False)
     return flight
 
 

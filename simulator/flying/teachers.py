@@ -1,4 +1,4 @@
-"""Whose decisions the edge's modules learn to rank first: the planner, and one who knows every arrival beforehand."""
+"""Teachers of the edge's modules: the planner, and a clairvoyant that knows every arrival beforehand."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from simulator.world import Observation, PipelineWorld
 TeacherName = Literal["planner", "clairvoyant"]
 Action = tuple[int, int]
 
-# Deterministic seconds of search for what is left of a mission; most worlds of scenario `paper` are solved in a third.
+# Deterministic seconds of search for the rest of a mission; most worlds of scenario `paper` need a third of them.
 _CLAIRVOYANT_WORK = 2.0
 
 
 class Teacher(Protocol):
-    """Says what it would do for each UAV in turn, and hears what was flown instead.
+    """Gives a reference action for each UAV, one after the other, and gets the action flown.
 
     Attributes:
-        deviations: share of the steps in which the fleet leaves the teacher's way, at most.
+        deviations: the largest share of steps in which the fleet deviates from the teacher's actions.
     """
 
     deviations: float
 
     def refer(self, uav: int, observation: Observation, taken: frozenset[int], deviating: bool) -> Action | None:
-        """Sensor and velocity; None where it has no answer.
+        """The reference action, sensor and velocity; None without one.
 
         Args:
             uav: index of the UAV.
-            observation: what the UAV knows.
-            taken: sensors that UAVs decided earlier in this step chose.
-            deviating: whether the fleet leaves the teacher's way in this step.
+            observation: of that UAV.
+            taken: sensors chosen by earlier UAVs of this step.
+            deviating: whether the fleet deviates from the teacher's actions in this step.
         """
 
     def flown(self, uav: int, step: int, action: Action) -> None:
-        """What the UAV did in that step, which may be another thing."""
+        """Record the UAV's action in that step, which may differ from the reference."""
 
 
 class Planner(RecedingHorizon):
-    """The receding-horizon planner, which learns from the UAVs what a fleet learns, and answers at every step."""
+    """The receding-horizon planner with the fleet's belief; it has a reference action at every step."""
 
     deviations = 0.5
 
@@ -49,18 +49,18 @@ class Planner(RecedingHorizon):
         self.reset(world.scenario, 0)
 
     def refer(self, uav: int, observation: Observation, taken: frozenset[int], deviating: bool) -> Action | None:
-        """The first action of a plan that begins with what was flown so far."""
+        """The first action of a plan that continues the flight so far."""
         return self.decide(uav, observation, taken)
 
     def flown(self, uav: int, step: int, action: Action) -> None:
-        """Plans go on from this."""
+        """Fix the action for later plans."""
         self.belief.tell(uav, step, *action)
 
 
 class Clairvoyant:
-    """Knows the true state of a world and all that will arrive; plans to the mission's end, and anew once it is left.
+    """Plans to the mission's end with the true state of the world and all arrivals, and again after a deviation.
 
-    It has no answer in a step in which the fleet leaves its way.
+    It has no reference action in a step in which the fleet deviates.
     """
 
     deviations = 0.2
@@ -68,7 +68,7 @@ class Clairvoyant:
     def __init__(self, world: PipelineWorld) -> None:
         self._world = world
         self._plan: NDArray[np.int64] | None = None
-        self._begun = 0
+        self._first_step = 0
 
     def refer(self, uav: int, observation: Observation, taken: frozenset[int], deviating: bool) -> Action | None:
         """The plan's action for this UAV."""
@@ -76,17 +76,17 @@ class Clairvoyant:
             return None
         step = int(observation["step"][0])
         if self._plan is None:
-            self._plan, self._begun = self._planned(step), step
-        sensor, velocity = self._plan[step - self._begun, uav].tolist()
+            self._plan, self._first_step = self._planned(step), step
+        sensor, velocity = self._plan[step - self._first_step, uav].tolist()
         return int(sensor), int(velocity)
 
     def flown(self, uav: int, step: int, action: Action) -> None:
-        """Another action than the plan's ends it."""
-        if self._plan is not None and tuple(self._plan[step - self._begun, uav]) != action:
+        """Discard the plan after another action than the plan's."""
+        if self._plan is not None and tuple(self._plan[step - self._first_step, uav]) != action:
             self._plan = None
 
     def _planned(self, step: int) -> NDArray[np.int64]:
-        """The best flight ``(H, I, 2)`` found from the world as it is to its end."""
+        """The best flight ``(H, I, 2)`` found from the world's current state to its end."""
         from shared.fleetplan import Budget, FleetProblem, look_ahead, plan
 
         sensors, fleet = self._world.sensors, self._world.fleet
@@ -99,7 +99,7 @@ class Clairvoyant:
             battery=sensors.battery,
             arrivals=sensors.arrivals[step:],
         )
-        # Not simulator.flying.clairvoyant_bound: its search ends by the clock, and rollouts should repeat to the bit.
+        # The search of simulator.flying.clairvoyant_bound ends by the clock; rollouts must repeat to the bit.
         return plan(problem, Budget(work=_CLAIRVOYANT_WORK), "cautious", look_ahead(problem)).actions
 
 

@@ -9,7 +9,7 @@ from simulator.world import Observation
 
 
 class Policy(Protocol):
-    """Decides for a fleet, one UAV at a time, from what that UAV knows and nothing else."""
+    """Decides for a fleet, one UAV at a time, from that UAV's observation alone."""
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission. Called before the first ``decide``."""
@@ -20,7 +20,7 @@ class Policy(Protocol):
 
         Args:
             uav: index of the UAV.
-            observation: what it knows.
-            taken: sensors that UAVs decided earlier in this step chose.
+            observation: of that UAV.
+            taken: sensors chosen by earlier UAVs of this step.
         """
         ...

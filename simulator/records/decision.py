@@ -7,8 +7,8 @@ from typing import Literal
 from shared.wire import Candidate, Tokens
 from simulator.records.record import Record
 
-# Reasons with which the LLM was asked, and its answer or its silence not used.
-_ASKED_IN_VAIN = frozenset(
+# Fallback reasons of decisions for which the LLM was queried, and its answer was missing or unusable.
+_LLM_QUERIED_IN_VAIN = frozenset(
     {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
 )
 
@@ -17,12 +17,12 @@ DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
 
 
 class Decision(Record):
-    """One decision and what came of it.
+    """One decision and its outcome.
 
-    ``position`` is where it was taken, metres. ``source`` is ``onboard`` when the UAV decided itself, and then
-    ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null`` and ``attempts``, ``request_bytes``,
-    ``response_bytes`` and ``attention_bytes`` 0. ``rtt_ms`` includes retries; ``lost_packets`` and ``cost`` are this
-    UAV's share.
+    ``position`` is the UAV's position at the decision, metres. ``source`` is ``onboard`` for a decision of the UAV
+    itself; then ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null``, and ``attempts``,
+    ``request_bytes``, ``response_bytes`` and ``attention_bytes`` are 0. ``rtt_ms`` includes retries. ``lost_packets``
+    and ``cost`` are this UAV's share.
     """
 
     step: int
@@ -49,8 +49,8 @@ class Decision(Record):
     cost: float = 0.0
 
 
-def asked_llm(decision: Decision) -> bool:
-    """Whether the LLM was asked for it, in vain or not."""
-    if decision.source in ("llm", "guided") or decision.reason in _ASKED_IN_VAIN:
+def queried_llm(decision: Decision) -> bool:
+    """Whether the LLM was queried for it, with a usable answer or not."""
+    if decision.source in ("llm", "guided") or decision.reason in _LLM_QUERIED_IN_VAIN:
         return True
     return decision.tokens is not None and decision.tokens.server_prompt is not None

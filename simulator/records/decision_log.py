@@ -14,7 +14,7 @@ from simulator.records.json_lines import read_lines
 
 
 class DecisionLog:
-    """Appends decisions to a new file and flushes each, so that a killed mission loses half a line at most.
+    """Appends decisions to a new file and flushes each one, so that a killed mission loses at most half a line.
 
     Raises:
         OSError: the file cannot be written.
@@ -34,8 +34,8 @@ class DecisionLog:
         self._file.write(decision.model_dump_json() + "\n")
         self._file.flush()
 
-    def keep(self, decisions: Iterable[Decision]) -> None:
-        """Make these the file's only lines, after an interrupt that may have come in the middle of one."""
+    def rewrite(self, decisions: Iterable[Decision]) -> None:
+        """Replace the file's lines by these, after an interrupt that may have torn the last line."""
         self._file.seek(0)
         self._file.truncate()
         self._file.writelines(decision.model_dump_json() + "\n" for decision in decisions)
@@ -43,10 +43,10 @@ class DecisionLog:
 
 
 def read_decisions(path: Path) -> list[Decision]:
-    """The decisions of a ``decisions.jsonl``; a last line cut off by a crash is left out.
+    """The decisions of a ``decisions.jsonl``, without a last line that a crash cut off.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a line that is not the last is no decision; the text names the line.
+        ValueError: a line before the last is no decision; the text names the line.
     """
     return read_lines(path, TypeAdapter(Decision))

@@ -11,11 +11,11 @@ Line = TypeVar("Line")
 
 
 def read_lines(path: Path, line: TypeAdapter[Line]) -> list[Line]:
-    """The lines of a JSON Lines file; a last one cut off by a crash is left out.
+    """The lines of a JSON Lines file, without a last line that a crash cut off.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a line that is not the last is none; the text names it.
+        ValueError: a line before the last is invalid; the text names it.
     """
     lines = path.read_bytes().split(b"\n")
     parsed = []

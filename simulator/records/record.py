@@ -6,6 +6,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Record(BaseModel):
-    """Files written by an older version may lack a field and those by a newer one have more."""
+    """A record in a file; files of older versions may lack fields, and those of newer versions may have more."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")

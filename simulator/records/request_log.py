@@ -1,8 +1,8 @@
-"""``requests.jsonl``: what a mission asked its edge, so that ``aicvds replay`` can ask it again.
+"""``requests.jsonl``: the requests of a mission to its edge, for ``aicvds replay``.
 
-The first line is the mission's spec as the edge made it, its defaults resolved and its scenario in full; then one
-``POST /decide`` a line, in the order asked and in full whatever the uplink, the outcome that it carried included. What
-came of the last decisions is in ``decisions.jsonl``.
+The first line is the mission's spec with the edge's defaults resolved and its scenario in full. Each further line is
+one ``POST /decide`` in the order sent. A request is the full report whatever the uplink, with the outcome that it
+carried. The outcomes of the last decisions are in ``decisions.jsonl``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LINE: TypeAdapter[MissionSpec | DecideRequest] = TypeAdapter(MissionSpec | Deci
 
 
 class RequestLog:
-    """Writes the spec, then each request as it is asked, flushed as decisions are.
+    """Writes the spec, then each request when it is sent, and flushes each line.
 
     Raises:
         OSError: the file cannot be written.
@@ -44,16 +44,16 @@ class RequestLog:
 
 
 def resolved(spec: MissionSpec, status: MissionStatus) -> MissionSpec:
-    """The spec with the defaults of the edge that made the mission, so that another edge's cannot change it."""
+    """The spec with the defaults of the edge that made the mission, independent of another edge's defaults."""
     return spec.model_copy(update={"mode": status.mode, "top_k": status.top_k, "prompt": status.prompt})
 
 
 def read_requests(path: Path) -> tuple[MissionSpec, list[DecideRequest]]:
-    """The spec and the requests; a last line cut off by a crash is left out.
+    """The spec and the requests, without a last line that a crash cut off.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a line is not what it should be; the text names it.
+        ValueError: a line is invalid; the text names it.
     """
     lines = read_lines(path, _LINE)
     if not lines or not isinstance(spec := lines[0], MissionSpec):

@@ -10,7 +10,7 @@ from simulator.errors import UsageError
 
 SUMMARY, DECISIONS, REPORT, REQUESTS = "summary.json", "decisions.jsonl", "report.html", "requests.jsonl"
 FIGURES = "figures"
-# The figures that a mission may have, for print.
+# The figures for print that a mission may have.
 DRAWN = tuple(
     f"{FIGURES}/{name}.{kind}"
     for name in ("latency-map", "latency-steps", "losses", "tokens", "visits", "deciders")
@@ -19,21 +19,21 @@ DRAWN = tuple(
 
 
 def refuse_old_result(out: Path, overwrite: bool, result: str = SUMMARY) -> None:
-    """Raises ``UsageError`` when ``out`` is no folder, or holds a result that may not be overwritten."""
+    """Raises ``UsageError`` if ``out`` is no folder, or contains a result and ``overwrite`` is false."""
     with naming_out(out):
         if out.exists() and not out.is_dir():
             raise UsageError(f"--out {out} is a file; name a folder")
-        held = (out / result).exists()
-    if held and not overwrite:
+        present = (out / result).exists()
+    if present and not overwrite:
         what = "a mission's result" if result == SUMMARY else f"a {result}"
-        raise UsageError(f"--out {out} holds {what} already; choose another folder or add --overwrite")
+        raise UsageError(f"--out {out} already has {what}; choose another folder or add --overwrite")
 
 
 def fresh_folder(out: Path, stale: Iterable[str] = (SUMMARY, REPORT, REQUESTS, *DRAWN)) -> None:
-    """Make the folder, without the earlier mission's files that would stand beside another's decisions.
+    """Make the folder, and delete stale files of an earlier mission in it.
 
     Raises:
-        UsageError: it cannot be written.
+        UsageError: the folder cannot be written.
     """
     with naming_out(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def fresh_folder(out: Path, stale: Iterable[str] = (SUMMARY, REPORT, REQUESTS, *
 
 @contextmanager
 def naming_out(out: Path) -> Iterator[None]:
-    """Within, an ``OSError`` becomes a ``UsageError`` that names the option to change."""
+    """Within the context, an ``OSError`` becomes a ``UsageError`` that names the option ``--out``."""
     try:
         yield
     except OSError as error:

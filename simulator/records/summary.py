@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Protocol
 
 from shared.wire import Tokens, Uplink
-from simulator.records.decision import Decision, asked_llm
+from simulator.records.decision import Decision, queried_llm
 from simulator.records.record import Record
 from simulator.records.statistics import jain_index, mean, percentile, visits_per_sensor
 
@@ -16,7 +16,7 @@ LATE_SLACK_MS = 50.0
 
 
 class BySource(Record):
-    """Decisions, by who took them; ``value`` is what the edge's modules learned, ``policy`` its LLM-free policy."""
+    """Numbers of decisions by source; ``value`` are the edge's learned modules, ``policy`` is its LLM-free policy."""
 
     llm: int = 0
     guided: int = 0
@@ -25,19 +25,19 @@ class BySource(Record):
     onboard: int = 0
 
     def present(self) -> dict[str, int]:
-        """Those who took any, most decisions first."""
+        """The sources with any decision, the most frequent first."""
         return dict(sorted(((k, n) for k, n in self.model_dump().items() if n), key=lambda item: -item[1]))
 
 
-def told_sources(by_source: BySource) -> str:
-    """Who decided, as people write it: ``87 llm, 3 policy``."""
+def sources_text(by_source: BySource) -> str:
+    """The counts in words: ``87 llm, 3 policy``."""
     return ", ".join(f"{count} {name}" for name, count in by_source.present().items()) or "none"
 
 
 class TokenSummary(Record):
-    """Means over the decisions that the edge took, ``null`` when it took none or did not say.
+    """Means over the edge's decisions, ``null`` without any or without token counts.
 
-    ``cached_pct`` is what the LLM server read from its prefix cache, of the prompt tokens that it counted itself.
+    ``cached_pct`` is the share of the prompt tokens, by the LLM server's own count, that came from its prefix cache.
     """
 
     prompt_mean: float | None = None
@@ -51,18 +51,18 @@ class TokenSummary(Record):
 
 
 class RoundTrips(Record):
-    """Percentiles over the decisions that the edge took, milliseconds."""
+    """Percentiles of the round-trip time over the edge's decisions, milliseconds."""
 
     p50: float | None = None
     p99: float | None = None
 
 
-class Flown(Record):
-    """The mission's facts that no single decision holds.
+class FlightFacts(Record):
+    """The facts of a mission beyond its decisions.
 
-    ``steps`` were asked for and ``steps_flown`` flown; ``policy`` is ``edge`` or a local policy's name;
-    ``deadline_ms`` is what the edge said last, or what it was asked for. ``uplink`` says how much of a report was sent,
-    ``null`` where no edge was asked.
+    ``steps`` is the planned and ``steps_flown`` the actual number of steps. ``policy`` is ``edge`` or a local policy's
+    name. ``deadline_ms`` is the last deadline that the edge reported, or the requested one. ``uplink`` is ``null``
+    without an edge.
     """
 
     scenario: str
@@ -85,14 +85,15 @@ class Flown(Record):
     command: str
 
 
-class Summary(Flown):
+class Summary(FlightFacts):
     """``summary.json``.
 
-    ``lost_packets`` and ``loss_events`` are by policy: ``aic_vds`` (or the local policy that was flown), ``eof``
-    and ``wqcs``, all over ``steps_flown`` steps of one world. ``late`` counts decisions whose round trip took more than
-    their deadline + 50 ms. ``jain`` is Jain's index of the sensors' served visits, ``null`` when none was served;
-    ``failures`` are failed transmissions; ``llm_asked`` counts decisions for which the LLM was asked, in vain or not.
-    ``uplink_bytes_mean`` is a decision's request, ``attention_bytes_mean`` what its UAV was sent to prune by.
+    ``lost_packets`` and ``loss_events`` are by policy: ``aic_vds`` (or the local policy flown), ``eof`` and ``wqcs``,
+    all over ``steps_flown`` steps of one world. ``late`` counts decisions with a round trip beyond their deadline + 50
+    ms. ``jain`` is Jain's index of the sensors' successful visits, ``null`` without any. ``failures`` are failed
+    transmissions. ``llm_asked`` counts decisions for which the LLM was queried, with a usable answer or not.
+    ``uplink_bytes_mean`` is the mean size of a request, ``attention_bytes_mean`` the mean size of the attention weights
+    that a UAV fetched for its decision.
     """
 
     decisions: int
@@ -111,7 +112,7 @@ class Summary(Flown):
 
 
 class Tally(Protocol):
-    """One step's losses, as ``simulator.world.StepTally`` counts them."""
+    """The losses of one step; ``simulator.world.StepTally`` is one."""
 
     @property
     def failures(self) -> int: ...
@@ -121,13 +122,13 @@ class Tally(Protocol):
     def lost_packets(self) -> int: ...
 
 
-def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str, Sequence[Tally]]) -> Summary:
+def summarise(flown: FlightFacts, decisions: Sequence[Decision], tallies: Mapping[str, Sequence[Tally]]) -> Summary:
     """The summary of one mission.
 
     Args:
         flown: the mission's facts.
-        decisions: every decision of its ``steps_flown`` steps.
-        tallies: per policy, one tally a step flown.
+        decisions: all decisions of its ``steps_flown`` steps.
+        tallies: by policy, one tally a step flown.
     """
     from_edge = [d for d in decisions if d.rtt_ms is not None]
     return Summary(
@@ -144,12 +145,12 @@ def summarise(flown: Flown, decisions: Sequence[Decision], tallies: Mapping[str,
         uplink_bytes_mean=mean([d.request_bytes for d in from_edge]),
         attention_bytes_mean=mean([d.attention_bytes for d in from_edge]),
         jain=jain_index(visits_per_sensor(decisions, flown.sensors)),
-        llm_asked=sum(asked_llm(d) for d in decisions),
+        llm_asked=sum(queried_llm(d) for d in decisions),
     )
 
 
 def round_trips(decisions: Iterable[Decision]) -> RoundTrips:
-    """Over the decisions that the edge took."""
+    """The percentiles over the edge's decisions."""
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
     return RoundTrips(p50=percentile(trips, 50), p99=percentile(trips, 99))
 
@@ -176,9 +177,9 @@ def _tokens(counts: list[Tokens]) -> TokenSummary:
 
 
 def _cached_pct(counts: list[Tokens]) -> float | None:
-    told = [(t.cached, t.server_prompt) for t in counts if t.cached is not None and t.server_prompt]
-    return 100 * sum(cached for cached, _ in told) / sum(prompt for _, prompt in told) if told else None
+    counted = [(t.cached, t.server_prompt) for t in counts if t.cached is not None and t.server_prompt]
+    return 100 * sum(cached for cached, _ in counted) / sum(prompt for _, prompt in counted) if counted else None
 
 
-def _saved_pct(kept: float | None, whole: float | None) -> float | None:
-    return 100 * (1 - kept / whole) if kept is not None and whole else None
+def _saved_pct(pruned: float | None, whole: float | None) -> float | None:
+    return 100 * (1 - pruned / whole) if pruned is not None and whole else None

@@ -1,6 +1,7 @@
 """The report's figures.
 
-Colours are Okabe and Ito's, which stay apart for colour-blind readers; lines differ in dashes and markers too.
+The colours are those of Okabe and Ito, distinguishable for colour-blind readers. Lines differ in dashes and markers
+too.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from shared.trajectory import trajectories
 from simulator.records.decision import Decision
 from simulator.records.statistics import visits_per_sensor
 from simulator.records.summary import Tally
-from simulator.reporting.figure_style import Drawing, drawn
+from simulator.reporting.figure_style import PaperFigure, drawn
 
 INK = "#222222"
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#767676"
 SKY = "#56B4E9"
 AS_SENT, IN_FULL = (BLUE, "-", "o"), (ORANGE, "--", "s")
-# A policy looks alike on every page, whoever else flies.
+# Colour, dash and marker of each policy, the same on every page.
 POLICIES = {
     "aic_vds": (BLUE, "-", "o"),
     "eof": (ORANGE, "--", "s"),
@@ -62,7 +63,7 @@ OTHER_POLICY = (GREY, "-", "x")
 SOURCES = {"llm": BLUE, "guided": PURPLE, "value": GREEN, "policy": ORANGE, "onboard": RED}
 MARKERS = {"llm": "o", "guided": "P", "value": "^", "policy": "D", "onboard": "o"}
 MAPS = 9
-# Of the area's side, from a sensor to its number.
+# The distance from a sensor to its number, as a share of the area's side.
 LABEL_OFFSET = 0.06
 _HALO = [withStroke(linewidth=2.5, foreground="white")]
 
@@ -80,7 +81,7 @@ def _legend_above(axes: Axes) -> None:
 
 
 def plain(axes: Axes) -> None:
-    """Two spines, ticks outside, a faint grid across."""
+    """Style axes: two spines, ticks outside, and faint horizontal grid lines."""
     axes.minorticks_off()
     axes.tick_params(top=False, right=False, direction="out")
     axes.spines[["top", "right"]].set_visible(False)
@@ -88,17 +89,17 @@ def plain(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> Drawing:
-    """One map a UAV (the first nine): its trajectory, its waypoints coloured by round trip, all sensors.
+def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[Decision]) -> PaperFigure:
+    """A map for each of the first nine UAVs: its trajectory, its waypoints coloured by round trip, and all sensors.
 
-    ``sensor_xy`` is (J, 2) in metres. The marker says who decided; what was decided on board is hollow.
+    ``sensor_xy`` is (J, 2) in metres. The marker shows the source of a decision; those taken on board are hollow.
     """
     shown = min(scenario.uavs, MAPS)
     columns = min(3, shown)
     rows = -(-shown // columns)
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
     scale = Normalize(min(trips), max(trips)) if trips else Normalize(0.0, 1.0)
-    out: list[Drawing] = []
+    out: list[PaperFigure] = []
     with drawn("latency-map", 2.1 * rows + 0.4, (rows, columns), out) as panels:
         for extra in panels[shown:]:
             extra.set_visible(False)
@@ -147,11 +148,11 @@ def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Dec
     path = trajectories(scenario)[uav]
     axes.plot(*path.at(np.linspace(0.0, path.length_m, 361)).T, color=GREY, linewidth=0.8, linestyle="--")
     flown = [np.array(d.position) for d in mine]
-    moved = next((place for place in flown if np.hypot(*(place - flown[0])) > 1.0), None)
+    moved = next((position for position in flown if np.hypot(*(position - flown[0])) > 1.0), None)
     if moved is None:
         return []
     ahead = (moved - flown[0]) / np.hypot(*(moved - flown[0]))
-    # On the left, which of a lap is the inside: neither waypoints nor the frame are there.
+    # The left side is the inside of a lap, free of waypoints and of the frame.
     left = np.array([-ahead[1], ahead[0]])
     tail = flown[0] + 0.06 * scenario.area_m * left
     tip = tail + 0.15 * scenario.area_m * ahead
@@ -168,13 +169,13 @@ def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: l
     axes.scatter(
         sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=27 if few else 6, color=INK, edgecolors="white", zorder=5
     )
-    crowd = [*drawn, *sensor_xy]
+    occupied = [*drawn, *sensor_xy]
     reach = LABEL_OFFSET * scenario.area_m
-    turns = np.arange(8) * np.pi / 4 + np.pi / 4
+    angles = np.arange(8) * np.pi / 4 + np.pi / 4
     for j, at in enumerate(sensor_xy if few else ()):
-        spots = at + reach * np.column_stack([np.cos(turns), np.sin(turns)])
-        spot = max(spots, key=lambda s: min((float(np.hypot(*(s - other))) for other in crowd), default=0.0))
-        crowd.append(spot)
+        spots = at + reach * np.column_stack([np.cos(angles), np.sin(angles)])
+        spot = max(spots, key=lambda s: min((float(np.hypot(*(s - other))) for other in occupied), default=0.0))
+        occupied.append(spot)
         axes.text(
             spot[0], spot[1], str(j), fontsize=7, color=INK, ha="center", va="center", zorder=7, path_effects=_HALO
         )  # fmt: skip
@@ -182,8 +183,8 @@ def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: l
 
 def _map_waypoints(axes: Axes, mine: Sequence[Decision], scale: Normalize) -> None:
     for source, marker in MARKERS.items():
-        asked = [(*d.position, d.rtt_ms) for d in mine if d.source == source and d.rtt_ms is not None]
-        x, y, trips = np.array(asked, dtype=float).reshape(-1, 3).T
+        timed = [(*d.position, d.rtt_ms) for d in mine if d.source == source and d.rtt_ms is not None]
+        x, y, trips = np.array(timed, dtype=float).reshape(-1, 3).T
         axes.scatter(
             x, y, c=trips, cmap="viridis", norm=scale, marker=marker,
             s=30, edgecolors="white", linewidths=0.5, zorder=3,
@@ -195,13 +196,13 @@ def _map_waypoints(axes: Axes, mine: Sequence[Decision], scale: Normalize) -> No
     )  # fmt: skip
 
 
-def latency_per_step(decisions: Sequence[Decision]) -> Drawing:
-    """Round trip over the steps, apart for each source: the median of the fleet, the range from fastest to slowest."""
+def latency_per_step(decisions: Sequence[Decision]) -> PaperFigure:
+    """Round trip over the steps for each source: the median of the fleet, and the range from fastest to slowest."""
     trips: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for d in decisions:
         if d.rtt_ms is not None:
             trips[d.source][d.step].append(d.rtt_ms)
-    out: list[Drawing] = []
+    out: list[PaperFigure] = []
     with drawn("latency-steps", 2.2, (1, 1), out) as (axes,):
         for source in (name for name in SOURCES if name in trips):
             by_step, colour = trips[source], SOURCES[source]
@@ -222,13 +223,13 @@ def latency_per_step(decisions: Sequence[Decision]) -> Drawing:
     return out[0]
 
 
-def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Drawing:
-    """Lost packets and loss events of every policy, per step and cumulative; ``names`` labels the policies."""
+def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> PaperFigure:
+    """Lost packets and loss events of every policy, per step and cumulative; ``names`` are the policies' labels."""
     measures: tuple[tuple[str, Callable[[Tally], int]], ...] = (
         ("lost packets", lambda t: t.lost_packets),
         ("loss events", lambda t: t.failures + t.overflows),
     )
-    out: list[Drawing] = []
+    out: list[PaperFigure] = []
     with drawn("losses", 4.8, (2, 2), out) as panels:
         for row, (title, measure) in enumerate(measures):
             for name, tally in tallies.items():
@@ -253,14 +254,14 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Dra
     return out[0]
 
 
-def tokens_per_step(decisions: Sequence[Decision]) -> Drawing:
-    """Tokens a decision, averaged over the fleet at each step: the prompt and its state block, as sent and in full."""
+def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
+    """Mean tokens of a decision over the fleet at each step: the prompt and its state block, as sent and in full."""
     by_step = defaultdict(list)
     for d in decisions:
         if d.tokens is not None:
             by_step[d.step].append(d.tokens)
     steps = sorted(by_step)
-    out: list[Drawing] = []
+    out: list[PaperFigure] = []
     with drawn("tokens", 2.7, (1, 2), out) as panels:
         for axes, sent, full, title in (
             (panels[0], "prompt", "uncompressed", "whole prompt"),
@@ -283,11 +284,11 @@ def tokens_per_step(decisions: Sequence[Decision]) -> Drawing:
     return out[0]
 
 
-def visits(decisions: Sequence[Decision], sensors: int) -> Drawing:
-    """Visits of each sensor: served ones, and failed ones on top."""
+def visits(decisions: Sequence[Decision], sensors: int) -> PaperFigure:
+    """Visits of each sensor as stacked bars: successful and failed ones."""
     served = np.array(visits_per_sensor(decisions, sensors))
     tried = np.bincount([d.sensor_id for d in decisions], minlength=sensors)[:sensors]
-    out: list[Drawing] = []
+    out: list[PaperFigure] = []
     with drawn("visits", 2.2, (1, 1), out) as (axes,):
         at = np.arange(sensors)
         axes.bar(at, served, color=BLUE, label="served")
@@ -312,10 +313,10 @@ def visits(decisions: Sequence[Decision], sensors: int) -> Drawing:
     return out[0]
 
 
-def deciders(decisions: Sequence[Decision]) -> Drawing:
-    """Who took the decisions of each step, as stacked bars."""
+def deciders(decisions: Sequence[Decision]) -> PaperFigure:
+    """The sources of the decisions of each step, as stacked bars."""
     steps = sorted({d.step for d in decisions})
-    out: list[Drawing] = []
+    out: list[PaperFigure] = []
     with drawn("deciders", 2.0, (1, 1), out) as (axes,):
         below = np.zeros(len(steps))
         for source, colour in SOURCES.items():

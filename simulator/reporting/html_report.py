@@ -15,14 +15,14 @@ from simulator.records.decision import Decision
 from simulator.records.run_folder import FIGURES
 from simulator.records.summary import Summary, Tally
 from simulator.reporting import figures
-from simulator.reporting.figure_style import Drawing
+from simulator.reporting.figure_style import PaperFigure
 from simulator.reporting.wording import llm_notice, number, policy_labels, verdict
 
 COSTLIEST_DECISIONS = 15
 
 
 def costliest(decisions: Sequence[Decision]) -> list[Decision]:
-    """The decisions that cost most, the earlier first among equals."""
+    """The decisions with the highest cost; of equals the earlier one first."""
     return sorted(decisions, key=lambda d: (-d.cost, d.step, d.uav_id))[:COSTLIEST_DECISIONS]
 
 
@@ -32,14 +32,14 @@ def drawings(
     decisions: Sequence[Decision],
     tallies: Mapping[str, Sequence[Tally]],
     sensor_xy: np.ndarray,
-) -> dict[str, Drawing]:
-    """The figures that this mission has, by their place in the page.
+) -> dict[str, PaperFigure]:
+    """The figures of this mission by their name in the page.
 
     Args:
-        summary: what ``summary.json`` holds.
-        scenario: the world's numbers, for the trajectories.
-        decisions: in order of step and UAV; may be none.
-        tallies: per policy, one entry a step flown.
+        summary: the content of ``summary.json``.
+        scenario: of the mission, for the trajectories.
+        decisions: in order of step and UAV; may be empty.
+        tallies: by policy, one entry a step flown.
         sensor_xy: (J, 2), metres.
     """
     drawn = {
@@ -56,9 +56,9 @@ def drawings(
 
 
 def render_report(
-    summary: Summary, scenario: Scenario, decisions: Sequence[Decision], drawn: Mapping[str, Drawing]
+    summary: Summary, scenario: Scenario, decisions: Sequence[Decision], drawn: Mapping[str, PaperFigure]
 ) -> str:
-    """The page as HTML; arguments as for ``drawings``, and what it returned."""
+    """The page as HTML; arguments as for ``drawings``, and ``drawn`` is its result."""
     pages = Environment(loader=PackageLoader("simulator.reporting", "."), autoescape=True, undefined=StrictUndefined)
     pages.trim_blocks = pages.lstrip_blocks = True
     pages.filters["number"] = number
@@ -86,7 +86,7 @@ def write_report(
     tallies: Mapping[str, Sequence[Tally]],
     sensor_xy: np.ndarray,
 ) -> None:
-    """Write the page, and beside it its figures for print into ``figures/``; arguments as for ``drawings``.
+    """Write the page, and its figures for print into the folder ``figures/`` beside it; arguments as for ``drawings``.
 
     Raises:
         OSError: a file cannot be written.

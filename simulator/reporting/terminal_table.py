@@ -5,12 +5,12 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from simulator.records.summary import Summary, told_sources
+from simulator.records.summary import Summary, sources_text
 from simulator.reporting.wording import llm_notice, policy_labels
 
 
 def show(summary: Summary, console: Console) -> None:
-    """Print the outcome beside EOF and WQCS, and who decided."""
+    """Print the outcome beside those of EOF and WQCS, and the sources of the decisions."""
     steps = f"{summary.steps_flown} of {summary.steps} steps" if summary.interrupted else f"{summary.steps} steps"
     table = Table(title=f"Scenario {summary.scenario}, seed {summary.seed}, {steps}")
     table.add_column("policy")
@@ -23,7 +23,7 @@ def show(summary: Summary, console: Console) -> None:
     if (notice := llm_notice(summary)) is not None:
         console.print(notice, style="yellow", markup=False, highlight=False, soft_wrap=True)
     if summary.policy == "edge":
-        console.print(f"{summary.decisions} decisions: {told_sources(summary.by_source)}")
+        console.print(f"{summary.decisions} decisions: {sources_text(summary.by_source)}")
     tokens, trips = summary.tokens, summary.rtt_ms
     if trips.p50 is not None:
         console.print(f"Round trip: median {trips.p50:.0f} ms, 99th percentile {trips.p99:.0f} ms")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from simulator.records.summary import Summary, told_sources
+from simulator.records.summary import Summary, sources_text
 
-# Of the decisions, that the LLM must have taken for the mission to count as the LLM's.
+# The share of LLM decisions from which a mission counts as a result of the LLM.
 LLM_SHARE = 0.9
 NAMES = {
     "aic_vds": "AIC-VDS",
@@ -18,20 +18,20 @@ NAMES = {
 
 
 def policy_labels(summary: Summary) -> dict[str, str]:
-    """The policies' names as people write them; the edge's with who really decided."""
-    flown = {"aic_vds": f"AIC-VDS ({told_sources(summary.by_source)})"} if summary.decisions else {}
+    """The policies' display names; the edge's includes the sources of its decisions."""
+    flown = {"aic_vds": f"AIC-VDS ({sources_text(summary.by_source)})"} if summary.decisions else {}
     return {**dict(zip(summary.lost_packets, summary.lost_packets, strict=True)), **NAMES, **flown}
 
 
 def llm_notice(summary: Summary) -> str | None:
-    """A warning when the LLM was to decide and too often did not; ``None`` when there is nothing to warn of."""
+    """A warning if the mission's mode uses the LLM and too few decisions are the LLM's, else ``None``."""
     by = summary.by_source
-    asks = summary.mode in ("llm", "guided")
-    if not asks or summary.policy != "edge" or by.llm + by.guided >= LLM_SHARE * summary.decisions:
+    uses_llm = summary.mode in ("llm", "guided")
+    if not uses_llm or summary.policy != "edge" or by.llm + by.guided >= LLM_SHARE * summary.decisions:
         return None
     owners = [
-        f"{words} {count}"
-        for words, count in (
+        f"{owner} {count}"
+        for owner, count in (
             ("the edge's LLM-free policy's", by.policy),
             ("its learned values'", by.value),
             ("the UAVs' own", by.onboard),
@@ -52,9 +52,9 @@ def verdict(summary: Summary) -> str:
     name, *others = summary.lost_packets
     labels = policy_labels(summary)
     lost, rivals = summary.lost_packets[name], [summary.lost_packets[other] for other in others]
-    told = f"In this one example {labels[name]} lost {lost:,} packets"
+    outcome = f"In this one example {labels[name]} lost {lost:,} packets"
     if not rivals:
-        return f"{told}."
+        return f"{outcome}."
     against = " and ".join(f"{labels[other]}'s {summary.lost_packets[other]:,}" for other in others)
     if {lost} == set(rivals):
         rank = "the same"
@@ -64,9 +64,9 @@ def verdict(summary: Summary) -> str:
         rank = "the most"
     else:
         rank = "as many as the best of them" if lost == min(rivals) else "neither the fewest nor the most"
-    return f"{told} against {against}: {rank}."
+    return f"{outcome} against {against}: {rank}."
 
 
 def number(value: float | None, digits: int = 1) -> str:
-    """A figure for a table, thousands apart by a comma; a dash when there is none."""
+    """A number for a table with thousands separators; a dash for ``None``."""
     return "–" if value is None else f"{value:,.{digits}f}"

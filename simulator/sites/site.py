@@ -15,10 +15,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """A scenario and, of a site whose traffic was recorded, its trace.
+    """A scenario and, for recorded traffic, its trace.
 
     Attributes:
-        arrivals: shape ``(at least T, J)``, packets that arrive in each step at each sensor; ``None``: Poisson.
+        arrivals: shape ``(at least T, J)``, packets that arrive in each step at each sensor; ``None`` for Poisson
+            arrivals.
     """
 
     scenario: Scenario

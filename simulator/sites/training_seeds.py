@@ -2,5 +2,5 @@
 
 from __future__ import annotations
 
-# Training worlds start here, so that no evaluation seed (from 0) is ever among them.
+# Evaluation seeds count up from 0 and stay far below this.
 FIRST_TRAINING_SEED = 1_000_000

@@ -1,4 +1,4 @@
-"""Many worlds of one scenario side by side in numpy, for training: the numbers of :class:`PipelineWorld` to the bit."""
+"""A batch of worlds of one scenario in numpy, for training: the numbers of :class:`PipelineWorld` to the bit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from simulator.world.sensors import Sensors, Streams
 
 
 class BatchObservation(TypedDict):
-    """What every UAV of every world knows: the entries of ``Observation`` with ``(B, I)`` in front of their shapes."""
+    """The observations of all UAVs of all worlds: the entries of ``Observation`` with leading dimensions ``(B, I)``."""
 
     step: IntArray
     position: FloatArray
@@ -31,12 +31,12 @@ class BatchObservation(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class BatchStep:
-    """What came of one step of every world: the fields of ``Info`` per UAV, and those of ``StepTally`` per world.
+    """The outcome of one step of every world: the fields of ``Info`` per UAV, and those of ``StepTally`` per world.
 
     Attributes:
         failed: f, ``(B, I)``.
         moved: packets collected by each UAV, ``(B, I)``.
-        blamed: packets lost at the sensors whose link to the UAV holds, ``(B, I)``.
+        blamed: packets lost at the sensors with a usable link to the UAV, ``(B, I)``.
         reward: minus the cost, ``(B, I)``.
         overflows: sensors that overflowed, ``(B,)``.
         lost_packets: ``(B,)``.
@@ -89,19 +89,19 @@ class Draw:
 
 
 class VectorWorld:
-    """B worlds that step together; the rules are those of :class:`PipelineWorld`, and so is every number.
+    """B worlds that step together, with the rules and the numbers of :class:`PipelineWorld`.
 
-    The worlds of one scenario are equally long, so all of them end at step T together. Observations are the
-    world's own arrays, not copies: they hold until the next ``step``. Attributes, besides the constructor's
-    ``scenario`` and ``cost``: ``steps_flown``, ``queue`` ``(B, J)`` and ``battery`` ``(B, J)`` as they truly are.
+    All worlds have the scenario's T steps and end together. Observations are the world's own arrays, not copies, and
+    are valid until the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and the true
+    ``queue`` ``(B, J)`` and ``battery`` ``(B, J)``.
 
     Args:
         arrivals: a trace, shape ``(at least T, J)``, instead of Poisson arrivals.
-        cost: what the reward is minus of; see :class:`PipelineWorld`.
+        cost: the negative of the reward; see :class:`PipelineWorld`.
 
     Raises:
-        ValueError: ``step`` before ``reset`` or past step T, or actions of another shape or out of bounds; a cost
-            of another name.
+        ValueError: ``step`` before ``reset`` or past step T, actions of another shape or out of bounds, or an unknown
+            cost.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class VectorWorld:
         return self.start(Draw.of(self.scenario, seeds, self._trace))
 
     def start(self, draw: Draw) -> BatchObservation:
-        """Begin worlds drawn before, and return the first observations."""
+        """Begin worlds that are drawn already, and return the first observations."""
         self._draw = draw
         self.steps_flown = 0
         self.queue = draw.initial_queue.copy()
@@ -133,10 +133,10 @@ class VectorWorld:
         shape = (*draw.start_m.shape, self.scenario.sensors)
         self._heard_queue, self._heard_battery, self._heard_gain = np.zeros((3, *shape))
         self._last_heard: IntArray = np.full(shape, -1)
-        # Row b * J + j of the flattened true state, for entry (b, i, j) of what the UAVs hold.
+        # Row b * J + j of the flattened true state, for entry (b, i, j) of the UAVs' observations.
         columns = np.arange(draw.initial_queue.size).reshape(-1, 1, shape[-1])
         self._row_of: IntArray = np.broadcast_to(columns, shape).ravel()
-        self._look()
+        self._update_links()
         return self._observe()
 
     def step(self, sensors: ArrayLike, velocities: ArrayLike) -> tuple[BatchObservation, BatchStep]:
@@ -148,12 +148,12 @@ class VectorWorld:
         """
         draw, chosen, velocity = self._checked(np.asarray(sensors), np.asarray(velocities))
         self._progress = self._progress + velocity * self.scenario.step_s
-        self._look()
+        self._update_links()
         failed, moved, collected = self._collect(chosen)
         filled = self.queue + draw.arrivals[:, self.steps_flown]
         self.queue = np.minimum(filled, self.scenario.queue_capacity)
         lost: IntArray = filled - self.queue
-        blamed = np.matmul(self._holds, lost[:, :, None])[:, :, 0]
+        blamed = np.matmul(self._usable, lost[:, :, None])[:, :, 0]
         overflows, lost_packets = np.count_nonzero(lost, axis=1), lost.sum(axis=1)
         if self.cost == "paper":
             events = (failed.sum(axis=1) + overflows).astype(np.float64)
@@ -195,39 +195,39 @@ class VectorWorld:
                 raise ValueError(f"{name} are not all in 0..{last}")
         return self._draw, sensors.astype(np.int64, copy=False), velocities
 
-    def _look(self) -> None:
-        """Where the UAVs are now, how far from the sensors, whom they hear and whose link holds."""
+    def _update_links(self) -> None:
+        """Update the UAVs' positions, their distances to the sensors, the sensors heard and the usable links."""
         assert self._draw is not None
         self._position = self._fleet.at(self._progress)
-        places = self._draw.positions[:, None]
+        sensors = self._draw.positions[:, None]
         self._distance = np.hypot(
-            self._position[..., 0, None] - places[..., 0], self._position[..., 1, None] - places[..., 1]
+            self._position[..., 0, None] - sensors[..., 0], self._position[..., 1, None] - sensors[..., 1]
         )
-        # The path loss is the dearest number of a step, and no one asks for it beyond the radio radius.
+        # The path loss is the costliest number of a step, and is needed only within the radio radius.
         self._heard = np.flatnonzero(self._distance <= self.scenario.radio_radius_m)
         self._loss = path_loss_db(self._distance.ravel()[self._heard], self.scenario)
-        self._holds = np.zeros(self._distance.shape, dtype=np.bool_)
-        self._holds.ravel()[self._heard] = self._loss < self.scenario.path_loss_limit_db
+        self._usable = np.zeros(self._distance.shape, dtype=np.bool_)
+        self._usable.ravel()[self._heard] = self._loss < self.scenario.path_loss_limit_db
 
     def _collect(self, chosen: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Serve the UAVs in order; f and the packets moved, each ``(B, I)``, and the packets by sensor, ``(B, J)``."""
+        """Serve the UAVs in order; returns f and the packets moved, each ``(B, I)``, and by sensor, ``(B, J)``."""
         reach = np.take_along_axis(self._distance, chosen[..., None], axis=2)[..., 0]
-        holds = np.take_along_axis(self._holds, chosen[..., None], axis=2)[..., 0]
+        usable = np.take_along_axis(self._usable, chosen[..., None], axis=2)[..., 0]
         budget = np.zeros(chosen.shape, dtype=np.int64)
         energy = np.full(chosen.shape, np.inf)
-        budget[holds] = packets_per_step(reach[holds], self.scenario)
+        budget[usable] = packets_per_step(reach[usable], self.scenario)
         with np.errstate(divide="ignore"):
-            airtime_s = self.scenario.packet_bits / rate_bps(reach[holds], self.scenario)
-        energy[holds] = self.scenario.transmit_power_w * airtime_s
+            airtime_s = self.scenario.packet_bits / rate_bps(reach[usable], self.scenario)
+        energy[usable] = self.scenario.transmit_power_w * airtime_s
         served = np.zeros(self.queue.shape, dtype=np.bool_)
         collected = np.zeros(self.queue.shape, dtype=np.int64)
         failed, moved = np.ones((2, *chosen.shape), dtype=np.int64)
         for uav in range(self.scenario.uavs):
             at = (self._world, chosen[:, uav])
             battery, cost = self.battery[at], energy[:, uav]
-            # More than a queue holds makes no difference, but may be more than an integer holds.
+            # A queue's capacity limits it, so that the number fits an integer.
             affordable = np.minimum(np.floor(battery / cost + 1e-9), self.scenario.queue_capacity).astype(np.int64)
-            able = (affordable >= 1) & holds[:, uav] & ~served[at]
+            able = (affordable >= 1) & usable[:, uav] & ~served[at]
             packets = np.where(able, np.minimum(np.minimum(self.queue[at], budget[:, uav]), affordable), 0)
             self.queue[at] -= packets
             spent = packets * np.where(able, cost, 0.0)
@@ -238,7 +238,7 @@ class VectorWorld:
         return failed, moved, collected
 
     def _observe(self) -> BatchObservation:
-        """Hear the beacons in range."""
+        """Record the beacons in range."""
         heard, row = self._heard, self._row_of[self._heard]
         self._heard_queue.ravel()[heard] = self.queue.ravel()[row]
         self._heard_battery.ravel()[heard] = self.battery.ravel()[row]

@@ -14,6 +14,8 @@ from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 from shared.channel import FloatArray, IntArray, Links, path_loss_db
 from shared.scenario import SCENARIOS, Scenario
 from shared.trajectory import Trajectory, trajectories
+from simulator.world.actions import checked_actions
+from simulator.world.beacons import Beacons
 from simulator.world.fleet import Fleet
 from simulator.world.sensors import Sensors, Streams
 
@@ -21,7 +23,7 @@ Cost = Literal["default", "paper"]
 
 
 class Observation(TypedDict):
-    """What one UAV knows; the shapes and units are in :class:`PipelineWorld`."""
+    """The observation of one UAV; shapes and units are in :class:`PipelineWorld`."""
 
     step: IntArray
     position: FloatArray
@@ -34,7 +36,7 @@ class Observation(TypedDict):
 
 
 class Info(TypedDict):
-    """What came of one UAV's last action; see :class:`PipelineWorld`."""
+    """The outcome of one UAV's last action; see :class:`PipelineWorld`."""
 
     action_mask: NDArray[np.int8]
     failed: bool
@@ -65,16 +67,16 @@ class StepTally:
 class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]
     """UAVs fly over a field of ground sensors and collect their packets before the queues overflow.
 
-    J sensors, I UAVs and T steps are the scenario's, and so is every other number named here.
+    J sensors, I UAVs, T steps and every other number named here are fields of the scenario.
 
     ## Agents
-    ``uav_0`` .. ``uav_{I-1}``. All act at every step, and all are there until the mission ends.
+    ``uav_0`` .. ``uav_{I-1}``. All of them act at every step until the mission ends.
 
     ## Action space
     ``MultiDiscrete([J, max_velocity + 1])``: the sensor to collect from, and the velocity of this step in m/s.
 
     ## Observation space
-    A ``Dict`` of arrays, one entry a sensor where the shape says J:
+    A ``Dict`` of arrays; J in a shape means one entry a sensor:
 
     | key | shape, type | meaning |
     |---|---|---|
@@ -87,25 +89,25 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     | ``channel_gain`` | ``(J,)`` float64 | dB, minus the path loss to this UAV when last heard |
     | ``last_heard`` | ``(J,)`` int64 | the ``step`` of that beacon; -1 never heard, then the three above are 0 |
 
-    Partial: before each observation every sensor sends a beacon (free of energy, so that even a flat sensor
-    is heard), and a UAV hears those within ``radio_radius_m``, horizontally, of where it is. Of the others it
-    holds what it heard last. A sensor is in range now exactly where ``last_heard == step``.
-    UAVs do not share what they hear.
+    The observation is partial. Before each observation every sensor sends a beacon, which costs no energy, so that even
+    a sensor with a flat battery is heard. A UAV hears the sensors within ``radio_radius_m`` of its position,
+    horizontally. The entries of the other sensors are those of the last beacon heard. A sensor is in range now exactly
+    where ``last_heard == step``. UAVs do not share their observations.
 
     ## A step
     1. All UAVs fly ``velocity x step_s`` metres along their trajectories (circles counter-clockwise, or routes).
-    2. From the new positions, ``uav_0`` first, each collects from its sensor. The transmission fails (f = 1) if
-       the link does not hold (out of the radio radius, or path loss at the threshold or past it), if a UAV of a
-       lower index was served by that sensor in this step, or if the battery cannot pay for one packet. Else
-       ``min(queue, packets_per_step)`` packets move, fewer if the battery cannot pay for them; an empty queue
-       is no failure. A UAV that failed does not count as served.
+    2. From the new positions, ``uav_0`` first, each UAV collects from its sensor. The transmission fails (f = 1) if
+       the sensor is out of the radio radius, if the path loss is at or past the threshold, if the sensor already served
+       a UAV of a lower index in this step, or if the battery cannot pay for one packet. Otherwise
+       ``min(queue, packets_per_step)`` packets move, fewer if the battery cannot pay for them. An empty queue is no
+       failure. A failed transmission does not count as service.
     3. Packets arrive (Poisson, each sensor at its own rate).
-    4. What exceeds W at a sensor is lost (g = 1 for that sensor), and its queue is W.
+    4. Packets in excess of W at a sensor are lost (g = 1 for that sensor), and its queue is W.
 
     ## Rewards
     ``reward = -cost``. With ``cost="default"``, ``c_i = f_i + lost_i / W``, where ``lost_i`` are the packets lost in
-    this step at the sensors whose link to UAV i holds at its new position. With ``cost="paper"``, Eq. 5: all f
-    plus all g of this step, the same for every UAV.
+    this step at the sensors with a usable link to UAV i at its new position. With ``cost="paper"``, Eq. 5: the sum of
+    all f and all g of this step, the same for every UAV.
 
     ## Infos
     ``action_mask``: flat int8, J entries for the sensors (1 for those heard at least once; all 1 if none was)
@@ -113,21 +115,20 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     ``cost``: as above. After ``reset`` the last four are ``False``, 0, 0 and 0.0.
 
     ## Start
-    Places, arrival rates, initial queues, start angles and all T x J arrivals are drawn at ``reset`` from separate
-    children of ``SeedSequence(seed)``: with the same seed the world is the same to the bit, whatever the
-    actions. ``reset`` without a seed goes on to the next world of the last seed given (or of a fresh one).
+    Positions, arrival rates, initial queues, start angles and all T x J arrivals are drawn at ``reset`` from separate
+    children of ``SeedSequence(seed)``: the same seed gives the same world to the bit, whatever the actions. ``reset``
+    without a seed draws the next world of the last seed given, or of a fresh one.
 
     ## Episode end
     Every agent is truncated at step T; nothing terminates.
 
     ## For reports
-    ``scenario``; ``sensors`` (true queues and batteries); ``fleet`` (where the UAVs are);
-    ``tally``, one :class:`StepTally` a step flown.
+    ``scenario``; ``sensors`` (true queues and batteries); ``fleet`` (the UAVs' positions); ``tally``, one
+    :class:`StepTally` a step flown.
 
     Raises:
-        ValueError: ``step`` before ``reset`` or after the end, without an action of a live agent, or with an
-            action out of bounds (nothing is changed then); ``render`` without ``render_mode="rgb_array"``; a
-            cost of another name.
+        ValueError: ``step`` before ``reset`` or after the end, without an action of a live agent, or with an action out
+            of bounds (the world does not change then); ``render`` without ``render_mode="rgb_array"``; an unknown cost.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": ["rgb_array"], "render_fps": 4}
@@ -172,7 +173,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, Info]]:
-        """Draw a world, and return the first observations and infos. ``options`` are not used."""
+        """Draw a world, and return the first observations and infos; ``options`` is unused."""
         if seed is not None or self._entropy is None:
             self._entropy = np.random.SeedSequence(seed).entropy
             self._missions = 0
@@ -183,19 +184,19 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         self.fleet = Fleet.draw(self.scenario, streams.angles)
         self.tally = []
         self.agents = self.possible_agents[:]
-        shape = (self.scenario.uavs, self.scenario.sensors)
-        self._queue, self._battery, self._gain = np.zeros((3, *shape))
-        self._last_heard: IntArray = np.full(shape, -1)
+        self._beacons = Beacons(self.scenario.uavs, self.scenario.sensors)
         position = self.fleet.positions
         observations = self._observe(position, self._links(position))
-        nothing = np.zeros(self.scenario.uavs, dtype=np.int64)
-        return observations, self._infos(nothing, nothing, nothing, nothing.astype(np.float64))
+        zeros = np.zeros(self.scenario.uavs, dtype=np.int64)
+        return observations, self._infos(zeros, zeros, zeros, zeros.astype(np.float64))
 
     def step(
         self, actions: Mapping[str, ArrayLike]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Info]]:
         """Fly one step; see the class docstring."""
-        chosen = self._checked(actions)
+        if not self.agents:
+            raise ValueError("step after the mission's end: reset first" if self.tally else "step before reset")
+        chosen = checked_actions(actions, self.agents, self.scenario)
         step = len(self.tally)
         position = self.fleet.advance(chosen[:, 1] * self.scenario.step_s)
         links = self._links(position)
@@ -246,45 +247,24 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             raise ValueError(f"render_mode is {self.render_mode!r}: only 'rgb_array' can be rendered")
         if not hasattr(self, "sensors"):
             raise ValueError("render before reset")
-        from simulator.world.rendering import picture
+        from simulator.world.rendering import render_map
 
-        return picture(self)
-
-    def _checked(self, actions: Mapping[str, ArrayLike]) -> IntArray:
-        """The actions as ``(I, 2)`` integers: sensor, velocity."""
-        if not self.agents:
-            raise ValueError("step after the mission's end: reset first" if self.tally else "step before reset")
-        for agent in actions:
-            if agent not in self._action_spaces:
-                raise ValueError(f"{agent}: no such agent")
-        limits = (("sensor", self.scenario.sensors - 1), ("velocity", self.scenario.max_velocity))
-        chosen = np.empty((self.scenario.uavs, 2), dtype=np.int64)
-        for uav, agent in enumerate(self.agents):
-            if agent not in actions:
-                raise ValueError(f"{agent}: no action")
-            action = np.asarray(actions[agent])
-            if action.shape != (2,) or action.dtype.kind not in "iu":
-                raise ValueError(f"{agent}: action {actions[agent]!r} is not two integers (sensor, velocity)")
-            for value, (name, last) in zip(action.tolist(), limits, strict=True):
-                if not 0 <= value <= last:
-                    raise ValueError(f"{agent}: {name} {value} is not in 0..{last}")
-            chosen[uav] = action
-        return chosen
+        return render_map(self)
 
     def _links(self, position: FloatArray) -> Links:
-        """Of every UAV to every sensor, ``(I, J)``."""
+        """The links of every UAV to every sensor, ``(I, J)``."""
         offset = position[:, None, :] - self.sensors.positions
         return Links.at(np.hypot(offset[..., 0], offset[..., 1]), self.scenario)
 
     def _collect(self, chosen: IntArray, links: Links) -> tuple[IntArray, IntArray]:
-        """Serve the UAVs in order; f and the packets moved, each ``(I,)``."""
+        """Serve the UAVs in order; returns f and the packets moved, each ``(I,)``."""
         reach = links[np.arange(self.scenario.uavs), chosen]
-        holds, budget, rate = reach.hold.tolist(), reach.packets.tolist(), reach.rate_bps.tolist()
+        usable, budget, rate = reach.hold.tolist(), reach.packets.tolist(), reach.rate_bps.tolist()
         failed, moved = np.ones((2, self.scenario.uavs), dtype=np.int64)
         served: set[int] = set()
         for uav, sensor in enumerate(chosen.tolist()):
             packets = None
-            if holds[uav] and sensor not in served:
+            if usable[uav] and sensor not in served:
                 packets = self.sensors.transmit(sensor, budget[uav], rate[uav])
             if packets is not None:
                 served.add(sensor)
@@ -293,32 +273,28 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         return failed, moved
 
     def _observe(self, position: FloatArray, links: Links) -> dict[str, Observation]:
-        """Hear the beacons in range, and give every live UAV a copy of what it knows."""
+        """Record the beacons in range, and return a copy of every live UAV's observation."""
         step = len(self.tally)
-        heard = links.distance_m <= self.scenario.radio_radius_m
-        self._queue = np.where(heard, self.sensors.queue, self._queue)
-        self._battery = np.where(heard, self.sensors.battery, self._battery)
-        self._gain = np.where(heard, links.gain_db, self._gain)
-        self._last_heard = np.where(heard, step, self._last_heard)
+        self._beacons.hear(step, self.sensors, links, self.scenario.radio_radius_m)
         return {
             agent: Observation(
                 step=np.array([step]),
                 position=position[uav].copy(),
                 progress=self.fleet.progress_m[uav : uav + 1].copy(),
                 sensor_position=self.sensors.positions.copy(),
-                queue=self._queue[uav].copy(),
-                battery=self._battery[uav].copy(),
-                channel_gain=self._gain[uav].copy(),
-                last_heard=self._last_heard[uav].copy(),
+                queue=self._beacons.queue[uav].copy(),
+                battery=self._beacons.battery[uav].copy(),
+                channel_gain=self._beacons.gain_db[uav].copy(),
+                last_heard=self._beacons.step[uav].copy(),
             )
             for uav, agent in enumerate(self.agents)
         }
 
     def _infos(self, failed: IntArray, moved: IntArray, blamed: IntArray, cost: FloatArray) -> dict[str, Info]:
-        known = self._last_heard >= 0
-        known |= ~known.any(axis=1, keepdims=True)
+        selectable = self._beacons.step >= 0
+        selectable |= ~selectable.any(axis=1, keepdims=True)
         mask = np.ones((self.scenario.uavs, self.scenario.sensors + self.scenario.max_velocity + 1), dtype=np.int8)
-        mask[:, : self.scenario.sensors] = known
+        mask[:, : self.scenario.sensors] = selectable
         rows = zip(self.agents, mask, failed.tolist(), moved.tolist(), blamed.tolist(), cost.tolist(), strict=True)
         return {
             agent: Info(action_mask=m.copy(), failed=bool(f), collected=c, lost_packets=lost, cost=paid)
@@ -338,7 +314,7 @@ def _observation_space(scenario: Scenario, path: Trajectory) -> spaces.Dict:
     return spaces.Dict(
         {
             "step": spaces.Box(0, scenario.steps, (1,), np.int64),
-            # Rounding may put a circle's point past its bounds by a hair.
+            # Rounding may put a circle's point slightly past its bounds.
             "position": spaces.Box(lowest - 1e-6, highest + 1e-6, dtype=np.float64),
             "progress": spaces.Box(0.0, farthest, (1,), np.float64),
             "sensor_position": spaces.Box(0.0, scenario.area_m, (count, 2), np.float64),
@@ -351,9 +327,10 @@ def _observation_space(scenario: Scenario, path: Trajectory) -> spaces.Dict:
 
 
 def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
-    """Bounds of the gain within the radio radius, dB, which hold whichever excess loss is the larger.
+    """Bounds of the gain within the radio radius, dB, whichever of the two excess losses is larger.
 
-    The margin of 1e-6 dB covers the rounding of the sum; 0 is always inside, since it stands for never heard.
+    The margin of 1e-6 dB covers the rounding of the sum. 0 is always within the bounds, since it marks a sensor never
+    heard.
     """
     excess = (scenario.los_excess_db, scenario.nlos_excess_db)
     free_space = scenario.model_copy(update={"los_excess_db": 0.0, "nlos_excess_db": 0.0})

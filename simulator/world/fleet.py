@@ -1,4 +1,4 @@
-"""A fleet on its trajectories: where each UAV began, and how far it has flown."""
+"""A fleet on its trajectories: the start and the progress of each UAV."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from shared.trajectory import Trajectory, trajectories
 
 
 class Fleet:
-    """I UAVs, each on a trajectory of its own.
+    """I UAVs, each on its trajectory.
 
     Attributes:
         trajectories: one a UAV.
-        start_m: shape ``(I,)``, arc length from each trajectory's beginning to where the UAV began.
-        progress_m: shape ``(I,)``, that and what was flown since.
+        start_m: shape ``(I,)``, arc length from each trajectory's beginning to the UAV's start.
+        progress_m: shape ``(I,)``, ``start_m`` plus the distance flown.
 
     Raises:
         ValueError: the number of starts is not that of the trajectories.
@@ -40,16 +40,16 @@ class Fleet:
 
     @property
     def positions(self) -> FloatArray:
-        """Where the UAVs are now, shape ``(I, 2)``, metres."""
+        """The UAVs' current positions, shape ``(I, 2)``, metres."""
         return self.at(self.progress_m)
 
     def at(self, progress_m: ArrayLike) -> FloatArray:
-        """Where UAVs are at arc lengths ``(..., I)`` along their trajectories, ``(..., I, 2)``, metres."""
+        """The UAVs' positions at arc lengths ``(..., I)`` along their trajectories, ``(..., I, 2)``, metres."""
         progress = np.asarray(progress_m, dtype=np.float64)
         return np.stack([path.at(progress[..., uav]) for uav, path in enumerate(self.trajectories)], axis=-2)
 
     def advance(self, distance_m: ArrayLike) -> FloatArray:
-        """Fly on by a distance, and return the new positions.
+        """Advance each UAV by a distance, and return the new positions.
 
         Args:
             distance_m: arc lengths, shape ``(I,)`` or a scalar for all, metres, at least 0.

@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     from simulator.world import PipelineWorld
 
 
-def picture(world: PipelineWorld) -> NDArray[np.uint8]:
+def render_map(world: PipelineWorld) -> NDArray[np.uint8]:
     """The map as RGB, shape ``(600, 600, 3)``: trajectories, UAVs, and sensors filled by their queues."""
     scenario, sensors, fleet = world.scenario, world.sensors, world.fleet
-    # Not made by pyplot, hence nothing holds the figure once this function returns.
+    # Without pyplot, no reference to the figure outlives this function.
     figure = Figure(figsize=(6, 6), dpi=100)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot(xlabel="x, m", ylabel="y, m", title=f"{scenario.name}, step {len(world.tally)}")
     low, high = [np.zeros(2)], [np.full(2, scenario.area_m)]
-    for uav, (path, place) in enumerate(zip(fleet.trajectories, fleet.positions, strict=True)):
+    for uav, (path, position) in enumerate(zip(fleet.trajectories, fleet.positions, strict=True)):
         colour = f"C{uav % 10}"
         axes.plot(*path.at(np.linspace(0.0, path.length_m, 361)).T, ls="--", color=colour, alpha=0.6)
-        axes.plot(place[0], place[1], marker="^", ms=11, color=colour)
+        axes.plot(position[0], position[1], marker="^", ms=11, color=colour)
         low.append(path.bounds[0])
         high.append(path.bounds[1])
     x, y = sensors.positions.T

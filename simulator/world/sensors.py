@@ -12,7 +12,7 @@ from shared.scenario import Scenario
 
 
 class Streams(NamedTuple):
-    """A world's sources of randomness, one a purpose, so that drawing more of one never shifts another."""
+    """A world's random streams, one for each purpose, so that more draws of one never shift another."""
 
     layout: np.random.Generator
     rates: np.random.Generator
@@ -27,7 +27,7 @@ class Streams(NamedTuple):
 
 
 class Sensors:
-    """The J sensors of one world. Everything random about them is drawn when they are made.
+    """The J sensors of one world; the constructor makes all their random draws.
 
     Attributes:
         positions: shape ``(J, 2)``, metres.
@@ -44,7 +44,7 @@ class Sensors:
     def __init__(self, scenario: Scenario, streams: Streams, trace: IntArray | None = None) -> None:
         self._scenario = scenario
         count, capacity = scenario.sensors, scenario.queue_capacity
-        self.positions = place(scenario, streams.layout)
+        self.positions = draw_positions(scenario, streams.layout)
         self.rates: FloatArray = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)
         fewest = math.ceil(scenario.initial_queue_min * capacity - 1e-9)
         self.initial_queue: IntArray = streams.queues.integers(fewest, capacity, count, endpoint=True)
@@ -57,14 +57,14 @@ class Sensors:
         self.battery: FloatArray = np.full(count, scenario.battery_j)
 
     def transmit(self, sensor: int, packets: int, rate_bps: float) -> int | None:
-        """Move up to ``packets`` out of a sensor's queue, paid for from its battery.
+        """Move up to ``packets`` out of a sensor's queue, and take the energy from its battery.
 
-        The energy is transmit power x airtime, the airtime ``moved x packet_bits / rate``; what is left in
-        the battery limits the packets moved.
+        The energy is transmit power x airtime, with airtime ``moved x packet_bits / rate``. The remaining battery
+        limits the packets moved.
 
         Returns:
-            Packets moved (0 from an empty queue), or ``None`` when the battery is flat, that is, cannot pay
-            for one packet (at a rate of 0, no battery can).
+            The packets moved (0 from an empty queue), or ``None`` if the battery cannot pay for one packet, which at a
+            rate of 0 no battery can.
         """
         airtime_s = self._scenario.packet_bits / rate_bps if rate_bps > 0 else math.inf
         energy = self._scenario.transmit_power_w * airtime_s
@@ -83,7 +83,7 @@ class Sensors:
         return np.asarray(filled - self.queue)
 
 
-def place(scenario: Scenario, rng: np.random.Generator) -> FloatArray:
+def draw_positions(scenario: Scenario, rng: np.random.Generator) -> FloatArray:
     """Sensor positions of a scenario's layout, shape ``(J, 2)``, metres, inside the area.
 
     ``uniform``: independent over the area. ``pipeline``: at equal arc lengths along the polyline, from its

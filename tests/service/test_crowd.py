@@ -43,10 +43,10 @@ def test_more_than_may_wait_for_the_llm_are_the_policys_at_once(edge: Edge, repo
 
 
 def test_past_the_most_requests_the_next_is_refused_and_probes_are_not(edge: Edge, report: Report) -> None:
-    asked_llm = threading.Semaphore(0)
+    queried_llm = threading.Semaphore(0)
 
     async def waiting(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        asked_llm.release()
+        queried_llm.release()
         await reader.read()
 
     with listening(misbehaving(waiting)) as llm:
@@ -59,7 +59,7 @@ def test_past_the_most_requests_the_next_is_refused_and_probes_are_not(edge: Edg
         with ThreadPoolExecutor(2) as pool:
             inside = [pool.submit(ask, number) for number in range(2)]
             for _ in inside:
-                assert asked_llm.acquire(timeout=10)
+                assert queried_llm.acquire(timeout=10)
             refused = client.post("/feedback", json={"decision_id": "0" * 32, "cost": 0.0})
             assert refused.status_code == 503
             assert refused.headers["retry-after"] == "1"

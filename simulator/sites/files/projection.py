@@ -12,17 +12,17 @@ from shared.channel import FloatArray
 def to_metres(degrees: ArrayLike) -> FloatArray:
     """Project WGS 84 to a plane: azimuthal equidistant, centred on the points.
 
-    Distances from the centre are true; across them the scale is ``(r / R) / sin(r / R)`` at ``r`` from the centre,
-    with R the Earth's radius of 6371 km: 0.4 millionths too long at 10 km, 0.004 % at 100 km, 0.2 % at 700 km, the
-    corner of the largest area. y is north at the centre. The centre is the mean of the points as directions from the
-    Earth's centre, so that neither a pole nor the antimeridian is special.
+    Distances from the centre are true. Distances across that direction are scaled by ``(r / R) / sin(r / R)`` at ``r``
+    from the centre, with R the Earth's radius of 6371 km: too long by 0.4 millionths at 10 km, 0.004 % at 100 km, and
+    0.2 % at 700 km, the corner of the largest area. y is north at the centre. The centre is the mean of the points as
+    directions from the Earth's centre, so that poles and the antimeridian need no special case.
 
     Args:
         degrees: longitudes and latitudes, ``(N, 2)``.
 
     Returns:
-        x east and y north of the centre, ``(N, 2)`` metres, to the millimetre, so that another version of the
-        projection's library still makes the same world to the bit.
+        x east and y north of the centre, ``(N, 2)`` metres. Rounding to the millimetre makes the same world to the bit
+        with another version of the projection's library.
     """
     longitude, latitude = np.asarray(degrees, dtype=np.float64).T
     east, north = np.radians(longitude), np.radians(latitude)

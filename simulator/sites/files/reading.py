@@ -9,10 +9,10 @@ from simulator.errors import UsageError
 
 
 def text_of(path: Path, max_bytes: int) -> str:
-    """A file's text, UTF-8, with or without a byte order mark.
+    """The text of a UTF-8 file, with or without a byte order mark.
 
     Raises:
-        UsageError: it cannot be read, is larger than ``max_bytes``, or is not UTF-8 (then the line is named).
+        UsageError: the file cannot be read, is larger than ``max_bytes``, or is not UTF-8 (the text names the line).
     """
     try:
         if path.exists() and not path.is_file():
@@ -32,6 +32,6 @@ def text_of(path: Path, max_bytes: int) -> str:
 
 
 def quoted(value: object) -> str:
-    """A value out of a file, as messages show it: quoted, on one line, and not longer than a name."""
+    """A value of a file for a message: quoted, on one line, cut to the length of a name."""
     text = repr(value)
     return text if len(text) <= 48 else f"{text[:45]}..."

@@ -17,7 +17,7 @@ from simulator.sites.files.reading import quoted, text_of
 MAX_BYTES = 20_000_000
 MAX_SENSORS, MAX_TRAJECTORIES, MAX_WAYPOINTS = 10_000, 100, 1000
 ROLES = '"sensor", "trajectory" or "pipeline"'
-# RFC 7946 has no `crs` member any more; what older programs write there is right if it says WGS 84.
+# RFC 7946 has no `crs` member; older programs still write one, which is valid if it names WGS 84.
 _WGS84 = {"urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "urn:ogc:def:crs:EPSG::4326", "EPSG:4326"}
 
 
@@ -98,12 +98,12 @@ class _Feature(_Member):
 
 @dataclass
 class Survey:
-    """What a ``world.geojson`` says. Points are longitude and latitude, degrees.
+    """The content of a ``world.geojson``. Points are longitude and latitude, degrees.
 
     Attributes:
         sensors: site by ID, in the file's order.
-        trajectories: waypoints by the feature's place in the file, such as ``features[3] ('north')``; of a ring, the
-            last is the first.
+        trajectories: waypoints by the feature's label, such as ``features[3] ('north')``; the last waypoint of a ring
+            equals the first.
         pipeline: a polyline, or empty.
     """
 
@@ -116,15 +116,15 @@ def read_survey(path: Path) -> Survey:
     """The features of a GeoJSON file (RFC 7946), by their property ``role``.
 
     Raises:
-        UsageError: the file cannot be read, is no such GeoJSON, or lacks sensors or trajectories; the text names the
+        UsageError: the file cannot be read, is no valid GeoJSON, or lacks sensors or trajectories; the text names the
             line, or the feature by its index from 0 and its ID.
     """
     survey = Survey()
-    for place, feature in _features(path):
+    for label, feature in _features(path):
         try:
-            _add(survey, place, feature)
+            _add(survey, label, feature)
         except ValueError as error:
-            raise UsageError(f"{path}, {place}: {error}") from None
+            raise UsageError(f"{path}, {label}: {error}") from None
     for found, role, geometry in (
         (survey.sensors, "sensor", "Point"),
         (survey.trajectories, "trajectory", "LineString or Polygon"),
@@ -135,18 +135,18 @@ def read_survey(path: Path) -> Survey:
 
 
 def _features(path: Path) -> Iterator[tuple[str, _Feature]]:
-    """Each feature and where it is in the file, with its ID if it has one."""
+    """The label of each feature, its index and ID if it has one, and the feature."""
     for index, raw in enumerate(_collection(path)):
-        place = f"features[{index}]{_id_of(raw)}"
+        label = f"features[{index}]{_id_of(raw)}"
         try:
-            yield place, _Feature.model_validate(raw)
+            yield label, _Feature.model_validate(raw)
         except ValidationError as error:
-            raise UsageError(f"{path}, {place}: {_told(error.errors(include_url=False)[0])}") from None
+            raise UsageError(f"{path}, {label}: {_complaint(error.errors(include_url=False)[0])}") from None
 
 
 def _collection(path: Path) -> list[Any]:
     try:
-        # NaN and infinities pass here, so that the feature which has one can be named.
+        # NaN and infinities pass here; the validation of their feature rejects them with its label.
         document = from_json(text_of(path, MAX_BYTES))
     except ValueError as error:
         raise UsageError(f"{path} is no JSON: {error}") from None
@@ -175,8 +175,8 @@ def _id_of(raw: object) -> str:
     return "" if name is None else f" ({quoted(name)})"
 
 
-def _told(error: ErrorDetails) -> str:
-    """What is wrong with a feature, in the words of its format."""
+def _complaint(error: ErrorDetails) -> str:
+    """A validation error as a message in the terms of GeoJSON."""
     where = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in error["loc"]).lstrip(".")
     for geometry in ("Point", "LineString", "Polygon"):
         where = where.replace(f"geometry.{geometry}", "geometry")
@@ -198,8 +198,8 @@ def _told(error: ErrorDetails) -> str:
     return f"{where or 'the feature'}: {message[0].lower()}{message[1:]}, not {quoted(error['input'])}"
 
 
-def _add(survey: Survey, place: str, feature: _Feature) -> None:
-    """Put a feature where its role says; raises ``ValueError`` where it cannot have that role."""
+def _add(survey: Survey, label: str, feature: _Feature) -> None:
+    """Add a feature to the survey by its role; raises ``ValueError`` for a geometry that does not fit the role."""
     role, geometry = feature.properties.role, feature.geometry.type
     if role == "sensor":
         if geometry != "Point":
@@ -216,7 +216,7 @@ def _add(survey: Survey, place: str, feature: _Feature) -> None:
             raise ValueError("a trajectory is a LineString (there and back) or a Polygon (laps), not a Point")
         if len(survey.trajectories) == MAX_TRAJECTORIES:
             raise ValueError(f"a world has at most {MAX_TRAJECTORIES} trajectories")
-        survey.trajectories[place] = feature.line
+        survey.trajectories[label] = feature.line
     else:
         if geometry != "LineString":
             raise ValueError(f"the pipeline is a LineString, not a {geometry}")

@@ -29,7 +29,7 @@ def read_trace(path: Path, sensors: Sequence[str]) -> IntArray:
         Packets, shape ``(steps of the file, J)``, columns in the order of ``sensors``.
 
     Raises:
-        UsageError: the file cannot be read, or is broken; the text names the line.
+        UsageError: the file cannot be read or is invalid; the text names the line.
     """
     rows = csv.reader(io.StringIO(text_of(path, MAX_BYTES), newline=""), strict=True)
     steps: list[list[int]] = []
@@ -54,23 +54,23 @@ def read_trace(path: Path, sensors: Sequence[str]) -> IntArray:
 
 
 def _columns(path: Path, header: list[str], sensors: Sequence[str]) -> list[int]:
-    """Where each sensor's column is."""
+    """The index of each sensor's column."""
     at = f"{path}, line 1"
     if not header or header[0] != "step":
         found = quoted(header[0]) if header else "nothing"
         raise UsageError(f"{at}: the first column is {found}; the header is step and the sensors' IDs, split by commas")
-    places = {name: column for column, name in enumerate(header[1:], start=1)}
-    known = frozenset(sensors)
+    column_of = {name: column for column, name in enumerate(header[1:], start=1)}
+    expected = frozenset(sensors)
     for name in header[1:]:
-        if name not in known:
+        if name not in expected:
             raise UsageError(f"{at}: column {quoted(name)} is no sensor of world.geojson; take it out")
-    if len(places) < len(header) - 1:
-        twice = next(name for name in places if header.count(name) > 1)
+    if len(column_of) < len(header) - 1:
+        twice = next(name for name in column_of if header.count(name) > 1)
         raise UsageError(f"{at}: column {quoted(twice)} comes twice; keep one of the two")
     for name in sensors:
-        if name not in places:
+        if name not in column_of:
             raise UsageError(f"{at}: sensor {quoted(name)} of world.geojson has no column; add it")
-    return [places[name] for name in sensors]
+    return [column_of[name] for name in sensors]
 
 
 def _packets(at: str, cell: str, sensor: str) -> int:

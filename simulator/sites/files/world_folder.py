@@ -1,6 +1,6 @@
-"""A world of one's own: a folder of files that say where sensors are, where UAVs fly, and what arrives.
+"""The folder of a user's own world: sensors, trajectories, scenario fields and recorded arrivals in files.
 
-``world.geojson`` (RFC 7946, WGS 84), a FeatureCollection. The property ``role`` says what a feature is:
+``world.geojson`` (RFC 7946, WGS 84) is a FeatureCollection. The property ``role`` is the meaning of a feature:
 
 | role | geometry | becomes |
 |---|---|---|
@@ -9,13 +9,12 @@
 | ``pipeline`` (at most one) | LineString | the line in pictures |
 
 ``scenario.toml`` (optional): any field of :class:`shared.scenario.Scenario` that does not follow from the features,
-such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. The rest are those of scenario ``paper``.
+such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are those of scenario ``paper``.
 
 ``arrivals.csv`` (optional): a trace, ``step,<sensor ID>,<sensor ID>,...``, whole packets, one line a step from step 0,
-for at least the mission's steps. Without it arrivals are Poisson, as the scenario says.
+for at least the mission's steps. Without it arrivals are Poisson with the scenario's rates.
 
-A seed draws where along its trajectory each UAV starts and what waits in the queues; and the arrivals, if there is
-no trace.
+A seed draws each UAV's start along its trajectory, the initial queues and, without a trace, the arrivals.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ __all__ = ["ARRIVALS", "FEATURES", "OVERRIDES", "site_from_folder"]
 
 FEATURES, OVERRIDES, ARRIVALS = "world.geojson", "scenario.toml", "arrivals.csv"
 MAX_AREA_M = 1_000_000.0
-# Of the sensors out of reach, that a warning names.
+# The most sensors out of reach that a warning names.
 FAR_NAMED = 5
 
 
@@ -51,15 +50,15 @@ def site_from_folder(
     """The site that a world's folder describes.
 
     Args:
-        folder: as in this module's docstring; the scenario is called like it, unless ``scenario.toml`` says ``name``.
-        steps: of a mission, instead of the scenario's; from 1 to 10,000.
-        on_warning: called with what is odd but no error: sensors that no UAV can reach.
+        folder: as in this module's docstring; its name is the scenario's, unless ``scenario.toml`` sets ``name``.
+        steps: of a mission, from 1 to 10,000; overrides the scenario's.
+        on_warning: called with a warning about sensors that no UAV can reach.
 
     Raises:
-        UsageError: a file is missing or broken; the text names the file, and the line or the feature.
+        UsageError: a file is missing or invalid; the text names the file, and the line or the feature.
     """
     if not folder.is_dir():
-        raise UsageError(f"--world {folder} is no folder; name one that holds {FEATURES}")
+        raise UsageError(f"--world {folder} is no folder; name one that contains {FEATURES}")
     survey = read_survey(folder / FEATURES)
     overrides = read_overrides(folder / OVERRIDES)
     derived = _placed(survey, folder / FEATURES) | ({} if steps is None else {"steps": steps})
@@ -91,9 +90,9 @@ def _placed(survey: Survey, path: Path) -> dict[str, object]:
     metres, side = in_square(metres)
     ends = np.cumsum([len(line) for line in lines])[:-1]
     sites, *routes, pipeline = (_points(part) for part in np.split(metres, ends))
-    for place, route in zip(survey.trajectories, routes, strict=True):
+    for label, route in zip(survey.trajectories, routes, strict=True):
         if len(set(route)) < 2:
-            raise UsageError(f"{path}, {place}: all waypoints are the same; a trajectory needs two that differ")
+            raise UsageError(f"{path}, {label}: all waypoints are the same; a trajectory needs two that differ")
     return {
         "layout": "surveyed",
         "sensors": len(sites),
@@ -106,13 +105,13 @@ def _placed(survey: Survey, path: Path) -> dict[str, object]:
 
 
 def _in_reach(scenario: Scenario) -> Iterator[bool]:
-    """For each sensor, whether some trajectory comes close enough for its radio."""
+    """For each sensor, whether some trajectory comes into its radio range."""
     paths = [(path, *path.bounds) for path in trajectories(scenario)]
-    for place in scenario.sites:
+    for sensor in scenario.sites:
         yield any(
-            # Most trajectories of a large world are so far off that their legs need no look.
-            np.all((low - scenario.radio_radius_m <= place) & (place <= high + scenario.radio_radius_m))
-            and link_holds(path.locate(place)[1], scenario)
+            # The bounding boxes exclude most trajectories of a large world without a look at their legs.
+            np.all((low - scenario.radio_radius_m <= sensor) & (sensor <= high + scenario.radio_radius_m))
+            and link_holds(path.locate(sensor)[1], scenario)
             for path, low, high in paths
         )
 
@@ -122,7 +121,7 @@ def _points(metres: FloatArray) -> tuple[Point, ...]:
 
 
 def _fit_name(folder: str) -> str:
-    """A folder's name as a scenario's: small letters, digits and underscores, a letter first, at most 32."""
+    """A folder's name as a scenario's name: at most 32 lower-case letters, digits and underscores, a letter first."""
     name = re.sub(r"[^a-z0-9]+", "_", folder.lower()).strip("_")
     return (name if re.match("[a-z]", name) else f"world_{name}".rstrip("_"))[:32]
 

@@ -11,7 +11,7 @@ from simulator.errors import UsageError
 
 
 @pytest.mark.parametrize(
-    ("check", "told"),
+    ("check", "message"),
     [
         (lambda: check_seed(2**32), "--seed 4294967296 is not between 0 and 4294967295"),
         (lambda: check_seed(-1), "--seed -1 is not between 0 and 4294967295"),
@@ -23,10 +23,10 @@ from simulator.errors import UsageError
         (lambda: checked_edge("ftp://edge"), "--edge: "),
     ],
 )
-def test_a_value_out_of_bounds_is_told_with_its_bounds(check: Callable[[], object], told: str) -> None:
+def test_the_error_for_a_value_out_of_bounds_has_the_bounds(check: Callable[[], object], message: str) -> None:
     with pytest.raises(UsageError) as error:
         check()
-    assert str(error.value).startswith(told)
+    assert str(error.value).startswith(message)
 
 
 def test_values_on_their_bounds_are_taken() -> None:

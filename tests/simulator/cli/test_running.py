@@ -66,7 +66,7 @@ def test_an_error_is_one_line_on_stderr_and_an_exit_code(
     assert capsys.readouterr().err == f"aicvds fly: {line}\n"
 
 
-def test_sigterm_ends_a_command_as_ctrl_c_does_and_means_what_it_did_before_afterwards() -> None:
+def test_sigterm_ends_a_command_like_ctrl_c_and_its_handler_is_restored() -> None:
     def run(options: Fly) -> int:
         os.kill(os.getpid(), signal.SIGTERM)
         signal.pause()

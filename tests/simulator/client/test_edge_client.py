@@ -32,7 +32,7 @@ def request_() -> DecideRequest:
 
 
 class Awaited:
-    """An ``AsyncEdgeClient`` that is waited for at every call: what is true of the one client is true of the other."""
+    """An ``AsyncEdgeClient`` with blocking calls, so that the same tests cover both clients."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._runner = asyncio.Runner()
@@ -81,7 +81,7 @@ def test_a_sensor_never_heard_is_sent_as_null(request_: DecideRequest) -> None:
         assert [value is not None for value in column] == heard
 
 
-def test_a_busy_edge_is_asked_again(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
+def test_requests_to_a_busy_edge_are_retried(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
     stub.script = ["busy", "busy"]
     with client(stub.url) as edge:
         assert edge.decide(request_).attempts == 3
@@ -93,13 +93,13 @@ def test_retry_after_is_honoured(stub: EdgeStub, request_: DecideRequest, client
         assert edge.decide(request_).rtt_ms >= 200
 
 
-def test_retries_are_bounded_and_the_error_says_what_happened(
+def test_retries_are_bounded_and_the_error_names_the_cause(
     stub: EdgeStub, request_: DecideRequest, client: Opened
 ) -> None:
     stub.otherwise = "busy"
     with client(stub.url, attempts=2) as edge, pytest.raises(EdgeUnreachable) as failed:
         edge.decide(request_)
-    assert stub.asked == 2
+    assert stub.request_count == 2
     assert stub.url in str(failed.value) and "503 overloaded" in str(failed.value)
 
 
@@ -112,14 +112,14 @@ def test_a_refusal_carries_the_fields_and_is_not_repeated(
     assert refused.value.status == 422
     assert refused.value.errors[0]["field"] == "sensors.queue[0]"
     assert refused.value.blames("queue") and not refused.value.blames("outcome")
-    assert stub.asked == 1
+    assert stub.request_count == 1
 
 
 def test_a_server_error_is_a_refusal(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
     stub.script = ["crash"]
     with client(stub.url) as edge, pytest.raises(EdgeRefused, match="500"):
         edge.decide(request_)
-    assert stub.asked == 1
+    assert stub.request_count == 1
 
 
 def test_an_error_page_that_is_no_problem_document(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
@@ -171,7 +171,7 @@ def test_a_silent_edge_is_unreachable(request_: DecideRequest, client: Opened) -
         edge.decide(request_)
 
 
-def test_what_is_no_edge_is_said_to_be_none(request_: DecideRequest, client: Opened) -> None:
+def test_a_server_that_is_no_edge_is_a_protocol_error(request_: DecideRequest, client: Opened) -> None:
     with listening(_redirect) as url, client(url) as edge, pytest.raises(EdgeProtocolError, match="302"):
         edge.decide(request_)
     with listening(_broken_gzip) as url, client(url) as edge, pytest.raises(EdgeProtocolError, match="broken body"):
@@ -201,19 +201,19 @@ def test_an_edge_that_never_comes(client: Opened) -> None:
 
 def test_a_fleet_at_once(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
     state = UavState.model_validate(request_.model_dump(include=set(UavState.model_fields)))
-    asked = BatchRequest(step=0, uavs=[state, state.model_copy(update={"uav_id": 2})])
+    before = BatchRequest(step=0, uavs=[state, state.model_copy(update={"uav_id": 2})])
     with client(stub.url) as edge:
-        assert [decision.uav_id for decision in edge.decide_batch(asked).decisions] == [1, 2]
+        assert [decision.uav_id for decision in edge.decide_batch(before).decisions] == [1, 2]
         stub.script = ["wrong"]
         with pytest.raises(EdgeProtocolError, match="/decide/batch chose sensor 9999"):
-            edge.decide_batch(asked)
+            edge.decide_batch(before)
 
 
 async def test_decisions_are_awaited_beside_each_other(stub: EdgeStub, request_: DecideRequest) -> None:
     stub.otherwise = "slow"
     async with AsyncEdgeClient(stub.url) as edge:
-        asked = [edge.decide(request_.model_copy(update={"uav_id": uav})) for uav in range(4)]
-        exchanges = await asyncio.gather(*asked)
+        before = [edge.decide(request_.model_copy(update={"uav_id": uav})) for uav in range(4)]
+        exchanges = await asyncio.gather(*before)
     assert [exchange.response.uav_id for exchange in exchanges] == [0, 1, 2, 3]
     assert stub.most_at_once == 4
 
@@ -224,9 +224,9 @@ async def test_a_cancelled_call_is_not_sent_again(stub: EdgeStub, request_: Deci
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.5):
                 await edge.decide(request_)
-        asked = stub.asked
+        before = stub.request_count
         await asyncio.sleep(0.5)
-    assert 0 < stub.asked == asked
+    assert 0 < stub.request_count == before
 
 
 def test_a_mission_and_feedback(stub: EdgeStub, client: Opened) -> None:
@@ -242,7 +242,7 @@ def test_a_mission_and_feedback(stub: EdgeStub, client: Opened) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "edge:8000", "ftp://edge", "http://", "http://me:pw@edge", "http://edge?key=1"])
-def test_what_is_no_edges_url(text: str) -> None:
+def test_invalid_edge_urls(text: str) -> None:
     with pytest.raises(ValueError):
         edge_url(text)
 
@@ -268,7 +268,7 @@ def test_a_lossy_uplink_is_retried(stub: EdgeStub, request_: DecideRequest) -> N
     with EdgeClient(stub.url, timeout_s=5, attempts=12, transport=transport) as edge:
         attempts = [edge.decide(request_).attempts for _ in range(6)]
     assert max(attempts) > 1
-    assert stub.asked == 6
+    assert stub.request_count == 6
 
 
 def test_a_lossy_uplink_has_bounds() -> None:

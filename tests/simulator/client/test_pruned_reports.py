@@ -1,4 +1,4 @@
-"""Pruning on board agrees with the edge's attention, on what the UAV knows itself, and needs numpy alone."""
+"""Pruning on board agrees with the edge's attention on the UAV's own knowledge, and needs only numpy."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def test_the_same_features_have_the_same_scores(features: Features, n: int) -> N
 
 @pytest.mark.parametrize("belief", get_args(Belief))
 @pytest.mark.parametrize("features", get_args(Features))
-def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Features, belief: Belief) -> None:
-    """Nobody else knows more: from full reports the edge ranks the sensors alike."""
+def test_a_lone_uav_selects_the_edges_sensors(edge: Edge, features: Features, belief: Belief) -> None:
+    """A single UAV knows all that the edge knows: from full reports, the edge ranks the sensors alike."""
     alone = PAPER.model_copy(update={"uavs": 1, "steps": 10})
     world, reports = PipelineWorld(alone), PrunedReports()
     observations, _ = world.reset(seed=3)
@@ -55,7 +55,7 @@ def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Feature
         reports.take(0, 0, client.mission("m"), None)
         for step in range(alone.steps):
             if outcome is not None:
-                # Learned from before the weights are fetched, so that these are what decides.
+                # The learning ends before the weights are fetched, so the fetched ones are those that decide.
                 client.feedback(FeedbackRequest(mission_id="m", **outcome.model_dump()))
                 taught(client)
             fetched = httpx.get(f"{client.base_url}/missions/m/attention").content
@@ -67,7 +67,7 @@ def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Feature
             reports.answered(request, answer)
             scores = {candidate.sensor_id: candidate.score for candidate in answer.top_k}
             if step:
-                # Alike sensors have one score, and no order.
+                # Equal sensors have equal scores, and so no order.
                 ranked = [scores[sensor] for sensor in kept.id[: len(scores)]]
                 assert np.all(np.diff(ranked) < 1e-5) and len(kept.id) == 10 and not kept.x
                 compared += len(set(ranked))
@@ -77,7 +77,7 @@ def test_a_lone_uav_keeps_what_the_edge_would_keep(edge: Edge, features: Feature
 
 
 def taught(client: EdgeClient) -> None:
-    """Wait for the lessons; a decision that the modules had no part in teaches none."""
+    """Wait for the training samples; a decision without the modules gives none."""
     before, ends = -1, time.monotonic() + 1
     while (told := client.mission("m")).learner_updates < told.feedback and time.monotonic() < ends:
         if told.learner_updates != before:
@@ -85,7 +85,7 @@ def taught(client: EdgeClient) -> None:
         time.sleep(0.005)
 
 
-def test_weights_are_asked_for_now_and_then() -> None:
+def test_weights_are_refreshed_after_some_steps() -> None:
     reports = PrunedReports()
     mission = Mission("m", MissionSpec(), Settings(mode="value"))
     wanted = reports.missing("m", 4, 0)
@@ -97,10 +97,10 @@ def test_weights_are_asked_for_now_and_then() -> None:
     assert all(reports.missing("m", step, 0) is None for step in range(4, 4 + REFRESH_STEPS))
     wanted = reports.missing("m", 4 + REFRESH_STEPS, 0)
     assert wanted is not None and wanted.etag == '"v1"'
-    # 304: they are the mission's still.
+    # 304: the weights are still current.
     reports.take(0, 4 + REFRESH_STEPS, None, '"v1"')
     assert reports.missing("m", 5 + REFRESH_STEPS, 0) is None
-    # Every UAV for itself, and of each mission.
+    # Each UAV fetches them separately, for each mission.
     assert reports.missing("m", 4, 1) is not None and reports.missing("other", 4, 0) is not None
 
 

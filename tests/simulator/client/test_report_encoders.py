@@ -1,4 +1,4 @@
-"""The clients' uplinks against a real edge: what is sent, and that all is where the edge does not hold the rest."""
+"""The uplinks' encoders with a real edge: the parts sent, and full reports where the edge lacks the rest."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PAPER = SCENARIOS["paper"]
 
 @pytest.fixture(scope="module")
 def steps() -> list[list[DecideRequest]]:
-    """What three UAVs see at four steps."""
+    """The observations of three UAVs at four steps."""
     world = PipelineWorld(PAPER)
     observations, _ = world.reset(seed=0)
     seen = []
@@ -44,7 +44,7 @@ def batch(requests: list[DecideRequest]) -> BatchRequest:
     return BatchRequest(mission_id="m", step=requests[0].step, uavs=uavs)
 
 
-def test_a_report_is_told_in_full_once(
+def test_a_first_report_is_full(
     edge: Edge, client: Callable[..., EdgeClient], steps: list[list[DecideRequest]]
 ) -> None:
     with client(str(edge().base_url), uplink="delta") as uavs:
@@ -52,7 +52,7 @@ def test_a_report_is_told_in_full_once(
     assert min(sizes[0]) > 600 > max(size for later in sizes[1:] for size in later)
 
 
-def test_an_edge_that_forgot_is_told_all_at_once(
+def test_an_edge_that_forgot_gets_full_reports(
     edge: Edge, client: Callable[..., EdgeClient], steps: list[list[DecideRequest]]
 ) -> None:
     http = edge()
@@ -69,17 +69,17 @@ def test_a_fleet_at_once(edge: Edge, client: Callable[..., EdgeClient], steps: l
     with client(str(http.base_url), uplink="delta") as uavs, client(str(other.base_url)) as full:
         for requests in steps:
             if requests[0].step == 2:
-                # One of them asks in between: the batch's base is no longer its last, for this edge.
+                # A single request in between: for this edge, the batch's reference report is no longer the last.
                 body = requests[1].model_dump()
                 http.post("/decide", json=body).raise_for_status()
                 other.post("/decide", json=body).raise_for_status()
-            told, whole = uavs.decide_batch(batch(requests)), full.decide_batch(batch(requests))
-            assert [(d.sensor_id, d.velocity, d.top_k) for d in told.decisions] == [
+            reduced, whole = uavs.decide_batch(batch(requests)), full.decide_batch(batch(requests))
+            assert [(d.sensor_id, d.velocity, d.top_k) for d in reduced.decisions] == [
                 (d.sensor_id, d.velocity, d.top_k) for d in whole.decisions
             ]
 
 
-def test_another_refusal_is_not_asked_again(edge: Edge, steps: list[list[DecideRequest]]) -> None:
+def test_another_refusal_is_not_retried(edge: Edge, steps: list[list[DecideRequest]]) -> None:
     with EdgeClient(str(edge().base_url), uplink="delta") as uavs:
         uavs.decide(steps[0][0])
         with pytest.raises(EdgeRefused, match="unknown") as refused:
@@ -92,7 +92,9 @@ def test_another_refusal_is_not_asked_again(edge: Edge, steps: list[list[DecideR
     [{"mission_id": "other"}, {"uav_id": 2}, {"step": 0}, {"x": 1.0}, {"id": 9}],
     ids=["mission", "uav", "earlier", "place", "sensors"],
 )
-def test_a_delta_builds_on_nothing_else(change: dict[str, Any], edge: Edge, steps: list[list[DecideRequest]]) -> None:
+def test_a_delta_refers_only_to_the_last_answered_report(
+    change: dict[str, Any], edge: Edge, steps: list[list[DecideRequest]]
+) -> None:
     reports = DeltaReports()
     with EdgeClient(str(edge().base_url)) as uavs:
         uavs.put_mission("m", MissionSpec())
@@ -106,5 +108,5 @@ def test_a_delta_builds_on_nothing_else(change: dict[str, Any], edge: Edge, step
         rows = now.sensors.model_dump()
         rows = {name: values[:9] for name, values in rows.items()} if column == "id" else {**rows, "x": [1.0] * 10}
         now = now.model_copy(update={"sensors": type(now.sensors).model_validate(rows)})
-    told = reports.reduced(mission_id, step, now)
-    assert told.base is None and told.uplink == "delta" and told.sensors == now.sensors
+    reduced = reports.reduced(mission_id, step, now)
+    assert reduced.base is None and reduced.uplink == "delta" and reduced.sensors == now.sensors

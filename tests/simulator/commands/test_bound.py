@@ -1,4 +1,4 @@
-"""`aicvds bound`: what it prints and writes, Ctrl-C, and its errors."""
+"""`aicvds bound`: its output, Ctrl-C, and errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from simulator.commands.bound import main
 from simulator.flying.clairvoyant_bound import replay
 from simulator.sites.site import Site
 
-# The command in a process of its own, which sends itself Ctrl-C while the solver searches.
+# The command in a separate process, which sends itself Ctrl-C while the solver searches.
 INTERRUPTED_BOUND = """
 import os, signal, sys, threading
 from ortools.sat.python import cp_model
@@ -25,9 +25,9 @@ from simulator.commands.bound import main
 
 solve = cp_model.CpSolver.solve
 
-def solve_and_interrupt(solver, *told):
+def solve_and_interrupt(solver, *arguments):
     threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
-    return solve(solver, *told)
+    return solve(solver, *arguments)
 
 cp_model.CpSolver.solve = solve_and_interrupt
 sys.exit(main(["--seed", "0", "--scenario", "stress", "--time-limit-s", "600"]))

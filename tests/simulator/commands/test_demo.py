@@ -1,4 +1,4 @@
-"""`aicvds demo`: an edge of its own, started, flown against and stopped."""
+"""`aicvds demo`: its edge is started, used for a flight, and stopped."""
 
 from __future__ import annotations
 

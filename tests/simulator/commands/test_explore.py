@@ -1,4 +1,4 @@
-"""`aicvds explore`: the teachers' turns, its workers and its errors."""
+"""`aicvds explore`: the alternation of teachers, the workers, and errors."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
 NAMES: list[TeacherName] = ["planner", "clairvoyant"]
 
 
-def test_both_take_turns() -> None:
+def test_both_teachers_alternate() -> None:
     assert [teacher_of("both", mission) for mission in range(4)] == ["planner", "clairvoyant"] * 2
     assert teacher_of("clairvoyant", 0) == "clairvoyant"
     assert set(NAMES) == set(TEACHERS)
 
 
-def test_workers_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCENARIOS, "paper", SHORT)
     written = []
     for workers in ("1", "2"):
@@ -37,7 +37,7 @@ def test_workers_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--missions", "-1"], "--missions -1 is less than 0"),
         (["--missions", "0", "--untaught", "0"], "there is nothing to fly"),
@@ -46,9 +46,9 @@ def test_workers_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     ],
 )
 def test_bad_use_is_one_clear_line(
-    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--out", str(tmp_path / "r.gz"), *options]) == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

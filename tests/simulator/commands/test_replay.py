@@ -1,4 +1,4 @@
-"""A logged mission asked again: of a real edge without an LLM, and of one that misbehaves as told."""
+"""`aicvds replay` with a real edge without an LLM, and with a stub that misbehaves by a script."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def fly(url: str, out: Path, steps: int = 4, **changes: str) -> Path:
 
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A mission of 3 steps, flown once; tests that change it copy it."""
+    """A mission of 3 steps, flown once; tests change only copies of it."""
     with stub_edge() as edge:
         return fly(edge.url, tmp_path_factory.mktemp("logged"), 3)
 
@@ -47,7 +47,7 @@ def run(logged: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(logged, tmp_path / "run"))
 
 
-def ask_again(run: Path, url: str, out: Path, *arguments: str) -> ReplaySummary:
+def replay_again(run: Path, url: str, out: Path, *arguments: str) -> ReplaySummary:
     assert replay.main([str(run), "--edge", url, "--out", str(out), *arguments]) == 0
     return ReplaySummary.model_validate_json((out / "replay.json").read_bytes())
 
@@ -56,12 +56,12 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_a_mission_logs_what_it_asked_and_that_can_be_read_again(stub: EdgeStub, tmp_path: Path) -> None:
+def test_a_mission_logs_its_requests_and_they_can_be_read(stub: EdgeStub, tmp_path: Path) -> None:
     run = fly(stub.url, tmp_path / "run", 3)
     spec, requests = read_requests(run / "requests.jsonl")
     assert requests == stub.decides
     assert [r.outcome is None for r in requests] == [True] * 3 + [False] * 6
-    # What the edge's defaults were is in the log, so that another edge's change nothing.
+    # The log has the edge's defaults, so that another edge's defaults change nothing.
     assert (spec.mode, spec.top_k, spec.scenario) == ("llm", 5, stub.missions[requests[0].mission_id].scenario)
     per_decision = (run / "requests.jsonl").stat().st_size / 9
     assert 700 < per_decision < 1500, "--help says about 1 kB a decision"
@@ -72,32 +72,32 @@ def test_a_local_policys_mission_leaves_no_requests_of_another(run: Path) -> Non
     assert not (run / "requests.jsonl").exists()
 
 
-def test_the_same_edge_decides_the_same_and_is_told_every_outcome(
+def test_the_same_edge_decides_the_same_and_gets_every_outcome(
     edge: Edge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # The modules learn beside the decisions, so only the policy's are the same each time.
+    # The modules learn beside the decisions, so only the policy's decisions are reproducible.
     url = str(edge(mode="llm", llm_gguf="none").base_url)
     run = fly(url, tmp_path / "run", 5, seed="3")
-    again = ask_again(run, url, tmp_path / "again")
+    again = replay_again(run, url, tmp_path / "again")
     assert (again.decisions, again.unasked, again.outcomes_fed_back, again.changed) == (15, 0, 15, {})
     assert again.agreement.both_pct == 100
     assert (again.logged.by_source.policy, again.replayed.by_source.policy) == (15, 15)
     assert again.replayed.prompt_tokens == pytest.approx(again.logged.prompt_tokens)
     printed = capsys.readouterr().out
-    assert "15 decisions asked again" in printed and "fed back" not in printed
+    assert "15 decisions replayed" in printed and "fed back" not in printed
     replayed = lines(tmp_path / "again" / "replayed.jsonl")
     assert len(replayed) == 15
     assert "cost" in replayed[0]["logged"] and "cost" not in replayed[0]["replayed"]
 
 
-def test_another_mode_prompt_and_k_are_compared_and_what_differs_is_not_fed_back(
+def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_fed_back(
     edge: Edge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     client = edge(mode="llm", llm_gguf="none")
     url = str(client.base_url)
     run = fly(url, tmp_path / "run", 8)
-    asked = "--mode value --format json --top-k 2 --features reach --init random --experiences 4 --selection best"
-    again = ask_again(run, url, tmp_path / "again", *asked.split())
+    changes = "--mode value --format json --top-k 2 --features reach --init random --experiences 4 --selection best"
+    again = replay_again(run, url, tmp_path / "again", *changes.split())
     assert again.changed == {
         "mode": ("llm", "value"),
         "top_k": (5, 2),
@@ -121,15 +121,15 @@ def test_another_mode_prompt_and_k_are_compared_and_what_differs_is_not_fed_back
 
 def test_outcomes_go_with_the_uavs_next_request_or_at_the_end(stub: EdgeStub, run: Path, tmp_path: Path) -> None:
     flown = read_decisions(run / "decisions.jsonl")
-    summary = ask_again(run, stub.url, tmp_path / "again", "--deadline-ms", "700")
+    summary = replay_again(run, stub.url, tmp_path / "again", "--deadline-ms", "700")
     assert {r.mission_id for r in stub.decides} == {summary.mission_id}
     assert {r.deadline_ms for r in stub.decides} == {700}
-    told = [r.outcome for r in stub.decides[3:]] + stub.feedbacks
-    assert [o.cost for o in told if o is not None] == [d.cost for d in flown]
-    assert not {o.decision_id for o in told if o is not None} & {d.decision_id for d in flown}
+    prices = [r.outcome for r in stub.decides[3:]] + stub.feedbacks
+    assert [o.cost for o in prices if o is not None] == [d.cost for d in flown]
+    assert not {o.decision_id for o in prices if o is not None} & {d.decision_id for d in flown}
 
 
-def test_an_edge_lost_on_the_way_leaves_what_was_asked(
+def test_a_replay_that_loses_its_edge_is_written_so_far(
     stub: EdgeStub, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stub.script, stub.otherwise = ["ok"] * 4, "crash"
@@ -140,7 +140,7 @@ def test_an_edge_lost_on_the_way_leaves_what_was_asked(
     assert len(lines(tmp_path / "again" / "replayed.jsonl")) == 4
 
 
-def test_a_request_that_was_never_flown_is_not_asked_again(run: Path) -> None:
+def test_a_request_without_a_flown_decision_is_not_replayed(run: Path) -> None:
     text = (run / "decisions.jsonl").read_text().splitlines(keepends=True)
     (run / "decisions.jsonl").write_text("".join(text[:6]) + text[6][:40])
     requests = (run / "requests.jsonl").read_text()
@@ -149,7 +149,7 @@ def test_a_request_that_was_never_flown_is_not_asked_again(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ([], "--edge is missing"),
         (["--edge", "nowhere"], "'nowhere' is not an edge's URL"),
@@ -162,14 +162,14 @@ def test_a_request_that_was_never_flown_is_not_asked_again(run: Path) -> None:
     ],
 )
 def test_bad_use_is_one_line_and_code_2(
-    arguments: list[str], said: str, logged: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], message: str, logged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert replay.main([str(logged), *arguments]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("aicvds replay: ") and error.count("\n") == 1 and said in error
+    assert error.startswith("aicvds replay: ") and error.count("\n") == 1 and message in error
 
 
-def test_a_folder_that_cannot_be_asked_again_says_why(
+def test_the_error_for_an_unusable_folder_has_the_reason(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refused(run: Path) -> str:
@@ -180,22 +180,22 @@ def test_a_folder_that_cannot_be_asked_again_says_why(
 
     assert "is no folder" in refused(tmp_path / "none")
     (run / "decisions.jsonl").write_text("")
-    assert "no decision to ask again" in refused(run)
+    assert "no decision to replay" in refused(run)
     (run / "decisions.jsonl").unlink()
     assert "decisions.jsonl: No such file" in refused(run)
     (run / "requests.jsonl").write_text('{"spec": 1}\n\n')
     assert "requests.jsonl, line 1: " in refused(run)
     (run / "requests.jsonl").unlink()
-    assert "holds no requests.jsonl" in refused(run)
+    assert "has no requests.jsonl" in refused(run)
 
 
-def test_an_earlier_replay_is_kept_unless_told(
+def test_an_earlier_replay_is_overwritten_only_with_the_option(
     stub: EdgeStub, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ask_again(run, stub.url, tmp_path / "again")
+    replay_again(run, stub.url, tmp_path / "again")
     assert replay.main([str(run), "--edge", stub.url, "--out", str(tmp_path / "again")]) == 2
-    assert "holds a replay.json already" in capsys.readouterr().err
-    ask_again(run, stub.url, tmp_path / "again", "--overwrite")
+    assert "already has a replay.json" in capsys.readouterr().err
+    replay_again(run, stub.url, tmp_path / "again", "--overwrite")
 
 
 def test_no_edge_is_code_1(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -206,13 +206,13 @@ def test_no_edge_is_code_1(run: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_prices_are_per_million_tokens_by_the_servers_counts(stub: EdgeStub, run: Path, tmp_path: Path) -> None:
-    told = ("--price-input", "10", "--price-cached", "1", "--price-output", "100")
-    summary = ask_again(run, stub.url, tmp_path / "again", *told)
-    # Each of 9 calls: 250 tokens of which 200 were cached, and 5 for an answer whose length nobody told.
+    prices = ("--price-input", "10", "--price-cached", "1", "--price-output", "100")
+    summary = replay_again(run, stub.url, tmp_path / "again", *prices)
+    # Each of 9 calls: 250 tokens, 200 of them cached, and 5 for an answer without a count.
     assert (
         summary.replayed.cost_usd == summary.logged.cost_usd == pytest.approx(9 * (50 * 10 + 200 * 1 + 5 * 100) / 1e6)
     )
-    unpriced = ask_again(run, stub.url, tmp_path / "unpriced")
+    unpriced = replay_again(run, stub.url, tmp_path / "unpriced")
     assert unpriced.replayed.cost_usd is None
 
 

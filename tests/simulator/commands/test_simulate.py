@@ -48,18 +48,18 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
         assert words in printed
 
 
-@pytest.mark.parametrize(("awaited", "polled", "told"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
+@pytest.mark.parametrize(("awaited", "polled", "message"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
 def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
-    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, told: str
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, message: str
 ) -> None:
     stub.readiness = [(True, "unavailable"), (True, "unavailable"), (True, "ready")]
     arguments = ["--edge", stub.url, "--steps", "1", "--await-llm", awaited, "--out", str(tmp_path)]
     assert simulate.main(arguments) == 0
     assert stub.polled == polled
-    assert told in capsys.readouterr().out
+    assert message in capsys.readouterr().out
 
 
-def test_an_old_result_is_kept_unless_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_old_result_is_overwritten_only_with_the_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
     assert simulate.main(arguments) == 0
     assert simulate.main(arguments) == 2
@@ -77,7 +77,7 @@ def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ([], "--edge is missing"),
         (["--edge", "nowhere"], "'nowhere' is not an edge's URL"),
@@ -94,13 +94,13 @@ def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
         (["--policy", "eof", "--out", f"{__file__}/below"], f"--out {__file__}/below: Not a directory"),
     ],
 )
-def test_bad_use_is_one_line_and_code_2(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_use_is_one_line_and_code_2(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert simulate.main(arguments) == 2
     error = capsys.readouterr().err
-    assert error.startswith("aicvds simulate: ") and error.count("\n") == 1 and said in error
+    assert error.startswith("aicvds simulate: ") and error.count("\n") == 1 and message in error
 
 
-def test_what_tyro_refuses_is_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_of_tyro_is_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert simulate.main(["--seed", "x"]) == 2
     assert simulate.main(["--help"]) == 0
     assert "AICVDS_API_KEY" in capsys.readouterr().out
@@ -129,7 +129,7 @@ def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None
     process = subprocess.Popen([sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.PIPE, text=True)
     try:
         give_up = time.monotonic() + 60
-        while stub.asked < 8 and time.monotonic() < give_up:
+        while stub.request_count < 8 and time.monotonic() < give_up:
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)
         printed, _ = process.communicate(timeout=60)
@@ -138,7 +138,7 @@ def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None
         process.kill()
         process.wait()
     summary = summary_in(tmp_path)
-    assert f"interrupted after {summary.steps_flown} steps; writing what was flown" in printed
+    assert f"interrupted after {summary.steps_flown} steps; writing their results" in printed
     assert summary.interrupted and 2 <= summary.steps_flown < 30
     assert summary.decisions == 3 * summary.steps_flown == len(read_decisions(tmp_path / "decisions.jsonl"))
     assert f"interrupted after step {summary.steps_flown} of 30" in (tmp_path / "report.html").read_text("utf-8")

@@ -1,4 +1,4 @@
-"""The clairvoyant bound: against every flight there is, against every policy, and as a command."""
+"""The clairvoyant bound, compared with an exhaustive search and with every policy."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ BUSY: dict[str, Any] = {"initial_queue_min": 0.8, "arrival_rate_min": 15.0, "arr
 
 
 def small(**changes: Any) -> Site:
-    """Links from 3 to 60 packets a step, so that from where a sensor is served matters."""
+    """A small world with links of 3 to 60 packets a step, so that the position of a transfer matters."""
     defaults: dict[str, Any] = {"name": "small", "sensors": 3, "uavs": 2, "steps": 3, "max_velocity": 2}
     return Site(Scenario(**{**defaults, "step_s": 100.0, "packet_bits": 1.1e7, **BUSY, **changes}))
 
 
 def least_by_trying(site: Site, seed: int) -> int:
-    """The fewest packets lost over all flights, by trying every joint action in every state that can be reached."""
+    """The fewest packets lost over all flights, by a search of every joint action in every reachable state."""
     problem, world = problem_of(site, seed), site.scenario
     farthest = np.arange(world.steps * world.max_velocity + 1)
     distance = [problem.distance(uav, farthest) for uav in range(world.uavs)]
@@ -60,7 +60,7 @@ def collected(queue: tuple[int, ...], transfers: list[tuple[int, int]]) -> list[
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_the_bound_is_what_trying_every_flight_finds(seed: int) -> None:
+def test_the_bound_equals_an_exhaustive_search(seed: int) -> None:
     site = small(sensors=2) if seed % 2 else small(steps=2)
     bound = clairvoyant(site, seed, workers=1)
     assert bound.lower_bound == bound.lost_packets == least_by_trying(site, seed)
@@ -68,7 +68,7 @@ def test_the_bound_is_what_trying_every_flight_finds(seed: int) -> None:
     assert bound.gap == 0
 
 
-def test_trying_every_flight_of_three_sensors_two_uavs_and_three_steps() -> None:
+def test_an_exhaustive_search_of_three_sensors_two_uavs_and_three_steps() -> None:
     bound = clairvoyant(small(), 1, workers=1)
     assert bound.lower_bound == bound.lost_packets == least_by_trying(small(), 1)
 
@@ -86,7 +86,7 @@ def test_with_fewer_sensors_than_uavs_the_bound_is_below_every_flight(site: Site
         assert bound.lower_bound <= lost, name
 
 
-# The proofs of others take half a minute.
+# The proofs of the other scenarios take half a minute.
 @pytest.mark.parametrize("seed", [0, 2])
 @pytest.mark.parametrize("site", [small(steps=6), small(steps=6, routes=ROUTES), small(steps=6, battery_j=20.0)])
 def test_no_policy_loses_less_than_the_bound(site: Site, seed: int) -> None:
@@ -105,7 +105,7 @@ def test_no_policy_learned_or_not_loses_less_than_the_bound_on_worlds_like_the_p
 
 
 @pytest.mark.parametrize("name", ["paper", "pipeline"])
-def test_the_plan_loses_in_the_world_just_what_it_says(name: str) -> None:
+def test_the_plan_loses_in_the_world_as_many_packets_as_predicted(name: str) -> None:
     site = Site(SCENARIOS[name])
     bound = clairvoyant(site, 0, time_limit_s=30, workers=1)
     assert bound.optimal
@@ -120,7 +120,7 @@ def test_flat_batteries_leave_a_bound_below_and_a_flight_that_is_true() -> None:
     assert replay(site, 2, bound.actions) == bound.lost_packets
 
 
-def test_recorded_arrivals_are_what_is_known() -> None:
+def test_the_bound_knows_recorded_arrivals() -> None:
     scenario = small().scenario
     quiet = Site(scenario, arrivals=np.zeros((3, 3), dtype=np.int64))
     assert clairvoyant(quiet, 0, workers=1).lost_packets == 0

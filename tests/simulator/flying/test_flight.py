@@ -12,7 +12,7 @@ from simulator.flying.pilots import Choice, EdgePilot, LocalPilot
 from simulator.flying.rollout import BASELINES, baselines, rollout
 from simulator.policies.registry import policy_named
 from simulator.records.decision_log import DecisionLog, read_decisions
-from simulator.records.summary import Flown, Summary, summarise
+from simulator.records.summary import FlightFacts, Summary, summarise
 from simulator.sites.site import Site
 from simulator.world import PipelineWorld
 from tests.simulator.edge_stub import EdgeStub, stub_edge
@@ -32,18 +32,18 @@ def client(stub: EdgeStub) -> Iterator[EdgeClient]:
         yield edge
 
 
-def facts(flight: Flight, deadline_ms: int | None = None) -> Flown:
+def facts(flight: Flight, deadline_ms: int | None = None) -> FlightFacts:
     return flight.facts(
         policy="edge", edge="http://e", mission_id="m", mode="llm", model=None, deadline_ms=deadline_ms, command="c"
     )
 
 
-def test_the_position_recorded_is_where_the_uav_asked(stub: EdgeStub, client: EdgeClient) -> None:
+def test_the_position_recorded_is_that_of_the_request(stub: EdgeStub, client: EdgeClient) -> None:
     flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
     assert [list(d.position) for d in flight.decisions] == [d.position for d in stub.decides]
 
 
-def test_a_local_policy_flies_what_rollout_flies() -> None:
+def test_a_local_policy_flies_as_in_rollout() -> None:
     paper = SCENARIOS["paper"]
     flight = fly(Site(paper), LocalPilot("wqcs", paper, 5), seed=5)
     expected = rollout(PipelineWorld(paper), policy_named("wqcs"), 5)
@@ -54,7 +54,7 @@ def test_a_local_policy_flies_what_rollout_flies() -> None:
 
 def test_an_interrupt_keeps_the_whole_steps(stub: EdgeStub, client: EdgeClient, tmp_path: Path) -> None:
     def interrupt(choice: Choice) -> None:
-        if stub.asked == 8:
+        if stub.request_count == 8:
             raise KeyboardInterrupt
 
     with DecisionLog(tmp_path / "d.jsonl") as log:
@@ -71,20 +71,20 @@ def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient) -> None:
     summary = summarise(
         facts(flight, deadline_ms=200), flight.decisions, {"aic_vds": flight.tally, **baselines(Site(SHORT), 0, 4)}
     )
-    told = summary.model_dump()
-    assert set(told) == {
+    fields = summary.model_dump()
+    assert set(fields) == {
         *("scenario", "seed", "steps", "uavs", "sensors", "decisions", "by_source", "lost_packets", "loss_events"),
         *("tokens", "rtt_ms", "uplink_bytes_mean", "uplink", "attention_bytes_mean", "jain"),
         *("by_reason", "late", "failures", "model", "edge", "mission_id", "mode", "interrupted", "steps_flown"),
         *("started_at", "duration_s", "version", "policy", "deadline_ms", "command", "llm_asked"),
     }
-    assert set(told["by_source"]) == {"llm", "guided", "value", "policy", "onboard"}
-    assert set(told["lost_packets"]) == set(told["loss_events"]) == {"aic_vds", *BASELINES}
-    assert set(told["rtt_ms"]) == {"p50", "p99"}
-    assert told["by_source"] == {"llm": 9, "guided": 0, "value": 0, "policy": 3, "onboard": 0}
-    assert told["by_reason"] == {"llm_timeout": 3}
-    assert told["late"] >= 1 and told["llm_asked"] == 12 and told["model"] == "stub-1"
-    assert told["tokens"] == {
+    assert set(fields["by_source"]) == {"llm", "guided", "value", "policy", "onboard"}
+    assert set(fields["lost_packets"]) == set(fields["loss_events"]) == {"aic_vds", *BASELINES}
+    assert set(fields["rtt_ms"]) == {"p50", "p99"}
+    assert fields["by_source"] == {"llm": 9, "guided": 0, "value": 0, "policy": 3, "onboard": 0}
+    assert fields["by_reason"] == {"llm_timeout": 3}
+    assert fields["late"] >= 1 and fields["llm_asked"] == 12 and fields["model"] == "stub-1"
+    assert fields["tokens"] == {
         "prompt_mean": 255.0,
         "uncompressed_mean": 305.0,
         "saved_pct": pytest.approx(100 * 50 / 305),

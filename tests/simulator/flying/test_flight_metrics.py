@@ -1,4 +1,4 @@
-"""What `aicvds simulate --metrics-port` tells Prometheus, and how long."""
+"""The metrics of `aicvds simulate --metrics-port`, and how long they are served."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def stub() -> Iterator[EdgeStub]:
 
 
 def numbers(port: int) -> dict[str, float]:
-    """The numbers at the port by series; none where nobody listens."""
+    """The numbers at the port by series; empty if no server listens."""
     try:
         text = httpx.get(f"http://127.0.0.1:{port}/metrics", timeout=10).text
     except httpx.TransportError:
@@ -57,7 +57,7 @@ def test_the_last_scrape_has_the_whole_flight(stub: EdgeStub, tmp_path: Path) ->
     port, last = free_port(), dict[str, float]()
     with flying(stub, tmp_path, port, steps=4) as process:
         while process.poll() is None:
-            # Far apart, as Prometheus's are: without waiting for one, the flight would be over between two.
+            # As far apart as Prometheus's: without a wait, the flight would end between two scrapes.
             last = numbers(port) or last
             time.sleep(0.5)
         assert process.returncode == 0
@@ -83,7 +83,7 @@ def for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("for_ever")
-def test_who_is_never_scraped_does_not_wait(stub: EdgeStub, tmp_path: Path) -> None:
+def test_a_flight_that_is_never_scraped_does_not_wait(stub: EdgeStub, tmp_path: Path) -> None:
     arguments = ["--edge", stub.url, "--steps", "1", "--out", str(tmp_path), "--metrics-port", str(free_port())]
     assert simulate.main(arguments) == 0
 
@@ -106,8 +106,8 @@ def test_an_interrupted_flight_waits_for_no_scrape(stub: EdgeStub, tmp_path: Pat
 
 def test_a_port_that_is_taken_is_one_line(stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port = stub.url.rsplit(":", 1)[1]
-    for wanted, said in ((port, "Address already in use"), ("70000", "not between 0 and 65535")):
+    for wanted, message in ((port, "Address already in use"), ("70000", "not between 0 and 65535")):
         arguments = ["--edge", stub.url, "--out", str(tmp_path), "--metrics-port", wanted]
         assert simulate.main(arguments) == 2
         error = capsys.readouterr().err
-        assert error.count("\n") == 1 and f"--metrics-port {wanted}" in error and said in error
+        assert error.count("\n") == 1 and f"--metrics-port {wanted}" in error and message in error

@@ -45,8 +45,8 @@ def test_every_uav_asks_at_every_step_and_every_outcome_arrives(stub: EdgeStub, 
 
 
 def test_without_an_edge_the_uavs_fly_eof() -> None:
-    with EdgeClient("http://127.0.0.1:1", timeout_s=1, attempts=2) as nobody:
-        pilot = EdgePilot(nobody, "m", SHORT, seed=2)
+    with EdgeClient("http://127.0.0.1:1", timeout_s=1, attempts=2) as unreachable:
+        pilot = EdgePilot(unreachable, "m", SHORT, seed=2)
         flight = fly(Site(SHORT), pilot, seed=2)
     eof = fly(Site(SHORT), LocalPilot("eof", SHORT, 2), seed=2)
     assert [(d.sensor_id, d.velocity) for d in flight.decisions] == [(d.sensor_id, d.velocity) for d in eof.decisions]
@@ -59,7 +59,7 @@ def test_an_edge_that_fails_for_a_while(stub: EdgeStub, client: EdgeClient) -> N
     flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), seed=0)
     assert [d.reason for d in flight.decisions[3:6]] == ["edge_unreachable", "edge_protocol", "edge_refused"]
     assert all(d.source != "onboard" for d in flight.decisions[6:])
-    # Nothing that the edge decided is left without its outcome, later though it comes.
+    # Every decision of the edge gets its outcome, if late.
     sent = {d.outcome.decision_id for d in stub.decides if d.outcome} | {f.decision_id for f in stub.feedbacks}
     assert sent >= {d.decision_id for d in flight.decisions if d.decision_id is not None}
 
@@ -93,9 +93,9 @@ def test_an_edge_that_comes_back_in_time_rejoins() -> None:
 
 def test_an_edge_that_stays_away_costs_one_pause() -> None:
     with (
-        EdgeClient(f"http://127.0.0.1:{free_port()}", timeout_s=1, attempts=1) as nobody,
-        patch.object(nobody, "wait_ready", wraps=nobody.wait_ready) as pauses,
+        EdgeClient(f"http://127.0.0.1:{free_port()}", timeout_s=1, attempts=1) as unreachable,
+        patch.object(unreachable, "wait_ready", wraps=unreachable.wait_ready) as pauses,
     ):
-        flight = fly(Site(SHORT), EdgePilot(nobody, "m", SHORT, seed=0, reconnect_s=3), seed=0)
+        flight = fly(Site(SHORT), EdgePilot(unreachable, "m", SHORT, seed=0, reconnect_s=3), seed=0)
     assert [pause.args for pause in pauses.call_args_list] == [(3,)]
     assert {d.source for d in flight.decisions} == {"onboard"} and flight.steps_flown == 4

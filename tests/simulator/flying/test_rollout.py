@@ -1,4 +1,4 @@
-"""Whole missions: what a rollout hands to whom, what a seed fixes, and what holds whatever the UAVs do."""
+"""Whole missions: the arguments of policies, the draws of a seed, and invariants under any actions."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from tests.simulator.edge_stub import stub_edge
 
 
 class Recorder:
-    """Takes sensor ``uav`` every time, and keeps what it was asked."""
+    """Takes sensor ``uav`` every time, and records its calls."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[int, int, frozenset[int], tuple[float, float]]] = []
+        self.calls: list[tuple[int, int, frozenset[int], tuple[float, float]]] = []
         self.resets: list[tuple[Scenario, int]] = []
 
     def reset(self, scenario: Scenario, seed: int) -> None:
@@ -37,32 +37,32 @@ class Recorder:
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         x, y = observation["position"].tolist()
-        self.asked.append((int(observation["step"][0]), uav, taken, (x, y)))
+        self.calls.append((int(observation["step"][0]), uav, taken, (x, y)))
         return uav, 4
 
 
-def test_uavs_decide_in_order_and_later_ones_see_what_is_taken() -> None:
+def test_uavs_decide_in_order_and_later_ones_get_the_taken_sensors() -> None:
     recorder, world = Recorder(), PipelineWorld()
     rollout(world, recorder, seed=9)
     assert recorder.resets == [(SCENARIOS["paper"], 9)]
-    order = [(step, uav) for step, uav, _, _ in recorder.asked]
+    order = [(step, uav) for step, uav, _, _ in recorder.calls]
     assert order == [(step, uav) for step in range(30) for uav in range(3)]
-    assert [taken for _, _, taken, _ in recorder.asked[:3]] == [frozenset(), frozenset({0}), frozenset({0, 1})]
-    assert recorder.asked[3][2] == frozenset(), "reservations last one step"
+    assert [taken for _, _, taken, _ in recorder.calls[:3]] == [frozenset(), frozenset({0}), frozenset({0, 1})]
+    assert recorder.calls[3][2] == frozenset(), "reservations last one step"
 
 
 def test_each_uav_sees_its_own_position() -> None:
     recorder, world = Recorder(), PipelineWorld()
     observations, _ = world.reset(seed=9)
     rollout(world, recorder, seed=9)
-    assert [p for *_, p in recorder.asked[:3]] == [tuple(o["position"].tolist()) for o in observations.values()]
+    assert [p for *_, p in recorder.calls[:3]] == [tuple(o["position"].tolist()) for o in observations.values()]
 
 
-def test_every_step_is_told_and_returned() -> None:
-    told: list[StepTally] = []
+def test_every_step_is_passed_to_the_callback_and_returned() -> None:
+    passed: list[StepTally] = []
     world = PipelineWorld()
-    tally = rollout(world, policy_named("eof"), seed=1, on_step=told.append)
-    assert tally == told == world.tally
+    tally = rollout(world, policy_named("eof"), seed=1, on_step=passed.append)
+    assert tally == passed == world.tally
     assert len(tally) == 30
 
 
@@ -93,7 +93,7 @@ def test_no_policy_changes_the_world() -> None:
 
 
 class Reckless:
-    """Draws from, and reseeds, every generator that a program shares."""
+    """Draws from every global generator, and seeds it again."""
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         self._count = scenario.sensors
@@ -107,7 +107,7 @@ class Reckless:
 
 @dataclass(frozen=True, eq=False)
 class Watched(Site):
-    """A site that keeps the worlds made on it."""
+    """A site that stores the worlds made on it."""
 
     made: list[PipelineWorld] = field(default_factory=list)
 
@@ -137,8 +137,8 @@ SITES = {
 
 
 @pytest.mark.parametrize("site", SITES)
-def test_whoever_flies_and_however_the_world_is_the_same(site: str) -> None:
-    """Every policy, the edge over a sound or a lossy uplink, no edge at all, and a policy that shares its dice."""
+def test_the_world_is_the_same_for_every_pilot(site: str) -> None:
+    """Every policy, the edge over a reliable or a lossy uplink, no edge, and a policy with global generators."""
     watched = Watched(SITES[site].scenario, SITES[site].arrivals)
     scenario = watched.scenario
     for name in POLICY_NAMES:
@@ -158,7 +158,7 @@ def test_whoever_flies_and_however_the_world_is_the_same(site: str) -> None:
     assert all(len(world.tally) == scenario.steps for world in watched.made)
 
 
-def test_a_trace_replaces_the_arrivals_and_nothing_else() -> None:
+def test_a_trace_replaces_only_the_arrivals() -> None:
     drawn_world, traced = SITES["routes"].world(), SITES["traced"].world()
     drawn_world.reset(seed=5)
     traced.reset(seed=5)
@@ -207,7 +207,7 @@ def test_a_longer_mission_begins_like_the_shorter_one() -> None:
     np.testing.assert_array_equal(long.sensors.positions, short.sensors.positions)
 
 
-# ---- whatever the UAVs do
+# ---- invariants under any actions
 
 
 @settings(max_examples=25, deadline=None)
@@ -238,7 +238,7 @@ def test_no_packet_appears_or_vanishes(name: str, seed: int, battery: float, flo
     assert np.all((world.sensors.battery >= 0) & (world.sensors.battery <= battery))
 
 
-def test_blame_falls_on_links_that_hold() -> None:
+def test_losses_are_blamed_on_uavs_with_a_usable_link() -> None:
     world = PipelineWorld(SCENARIOS["stress"])
     world.reset(seed=4)
     while world.agents:

@@ -1,4 +1,4 @@
-"""Checkpoints of trained networks: those that ship, and files that hold none."""
+"""Checkpoints of trained networks: those that ship, and invalid files."""
 
 from __future__ import annotations
 
@@ -54,5 +54,5 @@ def test_a_file_that_holds_no_weights_is_one_clear_error(content: bytes, tmp_pat
 
 def test_a_state_to_resume_from_is_no_policy(tmp_path: Path) -> None:
     torch.save({"episodes": 3}, tmp_path / "state.pt")
-    with pytest.raises(ValueError, match="state.pt holds no trained policy: train one with `aicvds train`"):
+    with pytest.raises(ValueError, match="state.pt has no trained policy: train one with `aicvds train`"):
         Learned("madqn", tmp_path / "state.pt")

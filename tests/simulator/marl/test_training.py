@@ -1,4 +1,4 @@
-"""A training: repeatable, resumable, and what it leaves."""
+"""A training: reproducible, resumable, and its files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WORLDS = {"madqn": madqn.WORLDS, "mappo": mappo.WORLDS}
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Missions few enough to learn from at once."""
+    """A plan with few missions, and learning from the start."""
     monkeypatch.setattr(madqn, "WARM_UP", 150)
 
 

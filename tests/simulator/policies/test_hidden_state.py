@@ -1,4 +1,4 @@
-"""No policy reads the hidden state: it decides from what its UAVs saw, and nothing else is within its reach."""
+"""No policy reads the hidden state: it decides from its UAVs' observations, and cannot reach anything else."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from simulator.world import Observation, PipelineWorld
 from simulator.world.fleet import Fleet
 from simulator.world.sensors import Sensors, Streams
 
-# The paper's world, with radios so weak that some sensors are not heard for a while.
+# The paper's world with radios so weak that some sensors stay unheard for a while.
 SCENARIO = SCENARIOS["paper"].model_copy(update={"radio_radius_m": 200.0})
 DECISIONS, SEED = 4, 0
 HIDDEN = (PipelineWorld, Sensors, Streams, Fleet)
@@ -27,13 +27,13 @@ Actions = list[tuple[int, int]]
 
 
 def copied(observation: Observation) -> Observation:
-    """The same values, in arrays that are nobody else's."""
+    """The same values in new arrays."""
     copy: Any = {key: np.array(value) for key, value in observation.items()}
     return copy  # type: ignore[no-any-return]
 
 
 def decide(policy: Policy, seen: list[Observation]) -> Actions:
-    """One step's actions, each from a copy of what that UAV saw."""
+    """One step's actions, each from a copy of the UAV's observation."""
     actions: Actions = []
     for uav, observation in enumerate(seen):
         taken = frozenset(sensor for sensor, _ in actions)
@@ -43,7 +43,7 @@ def decide(policy: Policy, seen: list[Observation]) -> Actions:
 
 
 class Flight:
-    """The first steps of a mission: what was seen at each decision and what was done; and the world as it is then.
+    """The first steps of a mission: the observation and the action of each decision, and the world after them.
 
     ``unheard`` is, for every sensor, the step from which on nobody has heard it (0: never heard), shape ``(J,)``. If
     given, everything that nobody hears from those steps on is another: queues, batteries, arrivals and rates.
@@ -70,13 +70,13 @@ def _change_what_is_hidden(sensors: Sensors, unheard: Any) -> None:
     sensors.queue = np.where(never, 60 - sensors.queue // 2, sensors.queue)
     sensors.battery = np.where(never, 1.0, sensors.battery)
     sensors.rates = sensors.rates[::-1].copy()
-    # What arrives in a step is in the queue that is heard after it.
+    # The arrivals of a step are in the queue heard after it.
     later = np.arange(SCENARIO.steps)[:, None] >= np.maximum(unheard, 0)
     sensors.arrivals = np.where(later, sensors.arrivals + 7, sensors.arrivals)
 
 
 @pytest.mark.parametrize("name", POLICY_NAMES)
-def test_worlds_that_differ_in_what_is_hidden_are_flown_alike(name: str) -> None:
+def test_hidden_differences_of_worlds_do_not_change_decisions(name: str) -> None:
     one = Flight(policy_named(name))
     two = Flight(policy_named(name), one.unheard)
     assert np.any(one.unheard < 0) and np.any((one.unheard >= 0) & (one.unheard < DECISIONS - 1))
@@ -88,7 +88,7 @@ def test_worlds_that_differ_in_what_is_hidden_are_flown_alike(name: str) -> None
 
 @pytest.mark.parametrize("name", POLICY_NAMES)
 def test_observations_alone_lead_to_the_same_decisions(name: str) -> None:
-    """Asked again when there is no world any more, nor a way to draw one."""
+    """The decisions repeated without a world, and without a way to draw one."""
     flight = Flight(policy_named(name))
     seen, actions = flight.seen, flight.actions
     del flight
@@ -114,8 +114,8 @@ def test_nothing_hidden_is_within_a_policys_reach(name: str) -> None:
 
 
 def reachable(root: object) -> Iterator[object]:
-    """Every object that one refers to, directly or not; of functions, what they close over and their defaults."""
-    # Whatever these refer to belongs to the program, not to the policy.
+    """Every object reachable from one, with the closures and defaults of functions."""
+    # References from these belong to the program, not to the policy.
     program = (type, ModuleType, CodeType, FrameType, BuiltinFunctionType)
     found, left = {id(root)}, [root]
     while left:
@@ -147,7 +147,7 @@ def test_an_observation_is_a_copy_that_leads_nowhere() -> None:
 
 
 class Vandal:
-    """Flies EOF, and overwrites what it is shown."""
+    """Flies EOF, and overwrites its observation."""
 
     def __init__(self) -> None:
         self._eof = policy_named("eof")
@@ -163,16 +163,16 @@ class Vandal:
         return action
 
 
-def test_what_a_policy_does_to_its_observation_changes_nothing() -> None:
+def test_changes_of_an_observation_do_not_change_the_world() -> None:
     vandalised, left_alone = (rollout(PipelineWorld(), policy, SEED) for policy in (Vandal(), policy_named("eof")))
     assert [(t.events, t.lost_packets) for t in vandalised] == [(t.events, t.lost_packets) for t in left_alone]
 
 
-# ---- cheats, to show that the tests above would notice
+# ---- cheating policies, to show that the tests above detect them
 
 
 class Cheat:
-    """Takes the sensor that is truly fullest, in the world that it gets hold of."""
+    """Takes the truly fullest sensor of a world to which it has a reference."""
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         self.world = self.hold_of(scenario, seed)
@@ -185,7 +185,7 @@ class Cheat:
 
 
 class Prying(Cheat):
-    """Looks into the variables of its caller's caller, which flies the world."""
+    """Reads the variables of its caller's caller, which flies the world."""
 
     def hold_of(self, scenario: Scenario, seed: int) -> PipelineWorld:
         world: PipelineWorld = sys._getframe(2).f_locals["self"].world
@@ -193,7 +193,7 @@ class Prying(Cheat):
 
 
 class Drawing(Cheat):
-    """Draws the world again, since it is told the seed."""
+    """Draws the world again from the seed."""
 
     def hold_of(self, scenario: Scenario, seed: int) -> PipelineWorld:
         world = PipelineWorld(scenario)

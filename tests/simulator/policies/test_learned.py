@@ -1,8 +1,7 @@
-"""The learned schemes as policies: greedy, repeatable, and only where they fit."""
+"""The learned schemes as policies: greedy, reproducible, and for matching scenarios only."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +61,7 @@ def test_it_is_greedy_so_the_policys_seed_does_not_matter(scheme: str) -> None:
     assert len(chosen) == 1
 
 
-def test_it_takes_what_no_other_took_and_was_heard(tmp_path: Path) -> None:
+def test_it_takes_free_sensors_that_were_heard(tmp_path: Path) -> None:
     policy = Learned("madqn", saved(tmp_path / "own.pt"))
     policy.reset(SMALL, 0)
     drawn = (PipelineWorld(SMALL).reset(seed=seed)[0] for seed in range(50))
@@ -77,7 +76,7 @@ def test_it_takes_what_no_other_took_and_was_heard(tmp_path: Path) -> None:
     assert policy.decide(0, observations["uav_0"], frozenset(range(4)))[0] in range(4)
 
 
-def test_a_scenario_of_another_size_says_what_to_train() -> None:
+def test_the_error_for_another_size_names_the_training_command() -> None:
     policy = policy_named("madqn")
     message = "madqn was trained for sensors 10, scenario dense has 100: train one with `aicvds train madqn --scenario"
     with pytest.raises(ValueError, match=message) as refused:
@@ -88,17 +87,6 @@ def test_a_scenario_of_another_size_says_what_to_train() -> None:
 def test_weights_of_ones_own_fly_the_scenario_they_were_trained_in(tmp_path: Path) -> None:
     policy = Learned("madqn", saved(tmp_path / "own.pt"))
     assert len(rollout(PipelineWorld(SMALL), policy, seed=0)) == 6
-
-
-@pytest.fixture
-def without_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if neither torch nor TorchRL were installed."""
-    for module in [name for name in sys.modules if name.startswith("simulator.marl")]:
-        monkeypatch.delitem(sys.modules, module)
-    for module in [name for name in sys.modules if name.startswith("torchrl.")]:
-        monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "torch", None)
-    monkeypatch.setitem(sys.modules, "torchrl", None)
 
 
 @pytest.mark.usefixtures("without_extra")

@@ -1,4 +1,4 @@
-"""Receding-horizon planning: that it repeats, is told nothing hidden, and beats what is simpler."""
+"""Receding-horizon planning is reproducible, uses no hidden state, and beats simpler policies."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_it_loses_far_less_than_eof() -> None:
     assert lost["mpc"] < 0.5 * lost["eof"]
 
 
-def test_what_it_is_not_told_does_not_move_it() -> None:
-    """Two worlds that differ only in what nobody has observed yet: the decisions are the same until somebody has."""
+def test_unobserved_differences_do_not_change_its_decisions() -> None:
+    """In two worlds with unobserved differences, the decisions are the same until a UAV observes one."""
     decisions = []
     for hidden in (0, 20):
         world, policy = PipelineWorld(SHORT), RecedingHorizon()

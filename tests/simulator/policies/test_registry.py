@@ -1,4 +1,4 @@
-"""The hand-written policies, on observations made by hand."""
+"""The hand-written policies, on observations written by hand."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from simulator.world import Observation, PipelineWorld
 
 FOUR = Scenario(name="four", sensors=4, uavs=2)
 NONE: frozenset[int] = frozenset()
-# A trained policy flies only scenarios of its size; its own tests are in marl/.
+# A trained policy flies only scenarios of its size; its tests are in test_learned.py.
 UNTRAINED = [name for name in POLICY_NAMES if name not in LEARNED_NAMES]
 
 
@@ -55,7 +55,7 @@ def test_eof_takes_the_sensor_in_range_that_overflows_first() -> None:
     assert ready("eof").decide(0, seen([30, 60, 50, 40], [5, 4, 5, 5]), NONE) == (2, 7)
 
 
-def test_eof_leaves_what_is_taken() -> None:
+def test_eof_leaves_taken_sensors() -> None:
     assert ready("eof").decide(1, seen([30, 60, 50, 40], [5, 4, 5, 5]), frozenset({2})) == (3, 7)
 
 
@@ -89,13 +89,13 @@ def test_max_gain_takes_the_best_channel_in_range_however_empty_its_queue() -> N
     assert policy.decide(0, observation, frozenset({2})) == (3, 7)
 
 
-def test_nearest_neighbour_goes_through_what_is_in_range_and_starts_again() -> None:
+def test_nearest_neighbour_cycles_through_the_sensors_in_range() -> None:
     policy = ready("nearest")
     in_range = seen([60, 0, 60, 60], [5, 5, 5, 4], [300, 100, 200, 50])
     assert [policy.decide(0, in_range, NONE) for _ in range(7)] == [(s, 7) for s in (1, 2, 0, 1, 2, 0, 1)]
 
 
-def test_each_uav_goes_by_its_own_rounds() -> None:
+def test_each_uav_has_its_own_rounds() -> None:
     policy = ready("nearest")
     in_range = seen([60] * 4, [5] * 4, [300, 100, 200, 350])
     assert policy.decide(0, in_range, NONE)[0] == policy.decide(1, in_range, NONE)[0] == 1
@@ -123,7 +123,7 @@ def test_a_reset_begins_a_new_round() -> None:
     assert policy.decide(0, in_range, NONE)[0] == 1
 
 
-def test_round_robin_visits_every_sensor_in_turn() -> None:
+def test_round_robin_cycles_through_the_sensors() -> None:
     policy = ready("round_robin")
     order = [[policy.decide(uav, seen([0] * 4, [-1] * 4, now=t), NONE) for t in range(5)] for uav in (0, 1)]
     assert order[0] == [(0, 7), (1, 7), (2, 7), (3, 7), (0, 7)]

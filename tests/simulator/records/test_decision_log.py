@@ -1,4 +1,4 @@
-"""`decisions.jsonl`: whole lines, whatever interrupts the mission."""
+"""`decisions.jsonl`: whole lines after any interruption."""
 
 from __future__ import annotations
 
@@ -44,6 +44,6 @@ def test_an_interrupt_in_the_middle_of_a_step_leaves_whole_steps(tmp_path: Path)
     with DecisionLog(tmp_path / "d.jsonl") as log:
         for step in range(3):
             log.append(decision(step=step))
-        log.keep([decision(step=0)])
+        log.rewrite([decision(step=0)])
         log.append(decision(step=1))
     assert [d.step for d in read_decisions(tmp_path / "d.jsonl")] == [0, 1]

@@ -51,7 +51,7 @@ def summary_of(flight: Flight, model: str | None) -> Summary:
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """A flight of which every second decision pretends to have come from an edge."""
+    """A flight in which every second decision has the fields of an edge's decision."""
     flown = fly(Site(SHORT), LocalPilot("eof", SHORT, 0), seed=0)
     flown.decisions = [
         d.model_copy(update={"rtt_ms": 10.0 + n, "source": "llm", "attempts": 1, "request_bytes": 900}) if n % 2 else d
@@ -61,7 +61,7 @@ def flight() -> Flight:
 
 
 class Page(HTMLParser):
-    """Collects ids and the addresses that a browser would follow or load."""
+    """Collects IDs, and the addresses that a browser would follow or load."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ def test_every_section_is_there(flight: Flight) -> None:
         assert words in html
 
 
-def test_the_row_says_who_decided(flight: Flight) -> None:
+def test_the_page_has_the_sources_of_the_decisions(flight: Flight) -> None:
     summary = summary_of(flight, None)
     assert policy_labels(summary)["aic_vds"] == "AIC-VDS (8 onboard, 7 llm)"
     notice = llm_notice(summary)
@@ -101,7 +101,7 @@ def test_the_row_says_who_decided(flight: Flight) -> None:
     assert llm_notice(summary.model_copy(update={"mode": "value"})) is None
 
 
-def test_learned_values_are_told_and_cost_no_tokens(flight: Flight) -> None:
+def test_decisions_of_learned_values_are_named_and_have_no_tokens(flight: Flight) -> None:
     learned = Flight(flight.scenario, 0, tally=flight.tally, sensor_xy=flight.sensor_xy)
     learned.decisions = [
         d.model_copy(update={"source": "value", "reason": "mode_value", "rtt_ms": 3.0}) for d in flight.decisions
@@ -161,7 +161,7 @@ def test_the_page_is_the_same_each_time(flight: Flight) -> None:
     assert page(flight) == page(flight)
 
 
-def test_what_came_from_the_edge_is_escaped(flight: Flight) -> None:
+def test_text_of_the_edge_is_escaped(flight: Flight) -> None:
     evil = [d.model_copy(update={"reason": EVIL}) for d in flight.decisions]
     html = page(flight, model=EVIL, decisions=evil)
     assert "<script" not in html

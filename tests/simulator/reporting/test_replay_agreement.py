@@ -23,5 +23,5 @@ def test_velocities_a_metre_a_second_apart_agree() -> None:
     assert agreement([]).both_pct is None
 
 
-def test_nobody_pays_for_an_llm_that_was_not_asked() -> None:
+def test_a_decision_without_an_llm_query_has_no_cost() -> None:
     assert side([decision(1, 7, source="value", reason="mode_value")], Prices(1, 1, 1)).cost_usd == 0

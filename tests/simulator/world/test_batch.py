@@ -1,4 +1,4 @@
-"""The batch of worlds against the single one: every number, to the bit."""
+"""The batch of worlds equals single worlds in every number, to the bit."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ def same(batched: dict[str, Any], world: int, single: dict[str, Any]) -> None:
 def test_every_number_is_that_of_the_single_world(scenario: Scenario, cost: Cost) -> None:
     seeds = range(5) if scenario.sensors < 50 else range(2)
     batch = VectorWorld(scenario, cost=cost)
-    seen: Any = batch.reset(seeds)
+    observation: Any = batch.reset(seeds)
     singles = [PipelineWorld(scenario, cost=cost) for _ in seeds]
     for index, (seed, world) in enumerate(zip(seeds, singles, strict=True)):
-        same(seen, index, world.reset(seed=seed)[0])
+        same(observation, index, world.reset(seed=seed)[0])
     sensors, velocities = actions_of(scenario, seeds)
     for step in range(scenario.steps):
-        seen, came = batch.step(sensors[step], velocities[step])
+        observation, outcome = batch.step(sensors[step], velocities[step])
         for index, world in enumerate(singles):
             pairs = np.stack((sensors[step, index], velocities[step, index]), axis=-1)
             alone, rewards, _, over, infos = world.step(dict(zip(world.agents, pairs, strict=True)))
-            same(seen, index, alone)
+            same(observation, index, alone)
             tally = world.tally[-1]
-            assert came.reward[index].tolist() == list(rewards.values())
-            assert came.failed[index].tolist() == [info["failed"] for info in infos.values()]
-            assert came.moved[index].tolist() == [info["collected"] for info in infos.values()]
-            assert came.blamed[index].tolist() == [info["lost_packets"] for info in infos.values()]
-            assert (came.failures[index], came.overflows[index]) == (tally.failures, tally.overflows)
-            assert (came.lost_packets[index], came.events[index]) == (tally.lost_packets, tally.events)
-            assert came.collected[index].tolist() == tally.collected.tolist()
+            assert outcome.reward[index].tolist() == list(rewards.values())
+            assert outcome.failed[index].tolist() == [info["failed"] for info in infos.values()]
+            assert outcome.moved[index].tolist() == [info["collected"] for info in infos.values()]
+            assert outcome.blamed[index].tolist() == [info["lost_packets"] for info in infos.values()]
+            assert (outcome.failures[index], outcome.overflows[index]) == (tally.failures, tally.overflows)
+            assert (outcome.lost_packets[index], outcome.events[index]) == (tally.lost_packets, tally.events)
+            assert outcome.collected[index].tolist() == tally.collected.tolist()
             np.testing.assert_array_equal(batch.state()[index], world.state(), strict=True)
             assert set(over.values()) == {batch.steps_flown == scenario.steps}
 
@@ -83,9 +83,9 @@ def test_a_trace_replaces_the_arrivals() -> None:
     batch.reset([4])
     world.reset(seed=4)
     idle = np.zeros((1, 3), dtype=np.int64)
-    _, came = batch.step(idle, idle)
+    _, outcome = batch.step(idle, idle)
     world.step({agent: np.zeros(2, dtype=np.int64) for agent in world.agents})
-    assert came.lost_packets.tolist() == [world.tally[0].lost_packets]
+    assert outcome.lost_packets.tolist() == [world.tally[0].lost_packets]
     assert batch.queue[0].tolist() == world.sensors.queue.tolist()
 
 

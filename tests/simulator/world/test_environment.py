@@ -152,7 +152,7 @@ def test_an_empty_queue_is_no_failure() -> None:
     assert [(infos[a]["failed"], infos[a]["collected"]) for a in world.agents] == [(False, 0), (False, 0)]
 
 
-def test_what_is_left_in_the_battery_limits_a_transfer_and_a_flat_one_sends_nothing() -> None:
+def test_the_remaining_battery_limits_a_transfer_and_a_flat_one_sends_nothing() -> None:
     # A packet overhead costs 1/60 J, so 0.5 J pay for 30 of the 60.
     world = small_world(battery_j=0.5)
     _, _, _, _, infos = step(world, (0, 0), (1, 0))
@@ -179,7 +179,7 @@ def test_a_queue_that_is_exactly_full_does_not_overflow() -> None:
     assert world.tally[0].overflows == 0
 
 
-def test_default_cost_charges_what_was_lost_within_reach() -> None:
+def test_default_cost_charges_losses_within_reach() -> None:
     world = small_world(arrivals=(5, 7, 9))
     _, rewards, _, _, infos = step(world, (0, 0), (2, 0))
     # Sensor 2 overflows too, but at 400 m neither UAV could have served it.
@@ -202,7 +202,7 @@ def test_the_transfer_happens_at_the_new_position() -> None:
     start = world.fleet.positions[0]
     world.sensors.positions[0] = start
     _, _, _, _, infos = step(world, (0, 14))
-    # 140 m are half a lap: the UAV is now a diameter, 89 m, from where the sensor is.
+    # 140 m are half a lap: the UAV is now a diameter, 89 m, from the sensor.
     np.testing.assert_allclose(world.fleet.positions[0], 2 * np.array(world.scenario.lap_centres[0]) - start)
     assert infos["uav_0"]["failed"] is True
     _, _, _, _, infos = step(world, (0, 14))
@@ -222,7 +222,7 @@ def test_the_mission_is_truncated_at_the_last_step_and_not_before() -> None:
     assert world.agents == []
 
 
-def test_a_uav_holds_the_last_beacon_that_it_heard() -> None:
+def test_an_observation_has_the_last_beacon_heard() -> None:
     world = PipelineWorld()
     observations, _ = world.reset(seed=3)
     held = 0
@@ -258,7 +258,7 @@ def test_with_no_sensor_ever_heard_the_mask_allows_all() -> None:
     assert infos["uav_1"]["action_mask"].tolist() == [1] * 18
 
 
-def test_a_caller_cannot_change_the_world_through_what_it_was_given() -> None:
+def test_a_caller_cannot_change_the_world_through_an_observation() -> None:
     touched, left = PipelineWorld(), PipelineWorld()
     observations, infos = touched.reset(seed=0)
     left.reset(seed=0)
@@ -283,10 +283,10 @@ def test_state_is_laid_out_as_documented() -> None:
     np.testing.assert_allclose(state[14:], [0.98, 1.0, 1.0], rtol=1e-6)
 
 
-# ---- what is drawn
+# ---- random draws
 
 
-def test_what_is_drawn_keeps_to_the_scenario() -> None:
+def test_draws_are_within_the_scenarios_bounds() -> None:
     world = PipelineWorld(SCENARIOS["dense"])
     world.reset(seed=0)
     sensors = world.sensors
@@ -344,7 +344,7 @@ def test_stepping_a_world_that_does_not_run() -> None:
         step(world, (0, 0), (1, 0))
 
 
-def test_other_faults_are_said_clearly() -> None:
+def test_other_faults_have_clear_errors() -> None:
     with pytest.raises(ValueError, match="unknown cost 'eq5': choose one of default, paper"):
         PipelineWorld(cost="eq5")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="state before reset"):

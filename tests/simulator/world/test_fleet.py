@@ -27,7 +27,7 @@ def test_uavs_advance_each_by_its_own_distance() -> None:
     np.testing.assert_array_equal(got, fleet.positions)
 
 
-def test_looking_ahead_is_vectorised_and_moves_nobody() -> None:
+def test_looking_ahead_is_vectorised_and_moves_no_uav() -> None:
     fleet = two()
     ahead = fleet.at(np.array([[0.0, 0.0], [10.0 * np.pi, 50.0]]))
     assert ahead.shape == (2, 2, 2)

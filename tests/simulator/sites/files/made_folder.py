@@ -1,4 +1,4 @@
-"""World folders for tests: features, and writing them."""
+"""World folders for tests."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GOOD = (sensor("a"), sensor("b", 41.505), there_and_back())
 
 
 def write(folder: Path, *features: Json, toml: str | None = None, trace: str | None = None, **members: Any) -> Path:
-    """Write a world's files into a folder; ``members`` go beside the features."""
+    """Write a world's files into a folder; ``members`` are further members of the feature collection."""
     collection = {"type": "FeatureCollection", "features": list(features), **members}
     (folder / "world.geojson").write_text(json.dumps(collection), encoding="utf-8")
     if toml is not None:

@@ -1,4 +1,4 @@
-"""Worlds from files: what is said of broken ones, and that nothing else can come of them."""
+"""Errors of broken world folders; any content gives a site or such an error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from simulator.sites.files.world_folder import site_from_folder
 from tests.simulator.sites.files.made_folder import GOOD, RING, Json, feature, sensor, there_and_back, traced, write
 
 
-def said(folder: Path, steps: int | None = None) -> str:
+def error_of(folder: Path, steps: int | None = None) -> str:
     with pytest.raises(UsageError) as refused:
         site_from_folder(folder, steps)
     assert "\n" not in str(refused.value)
@@ -78,27 +78,27 @@ EXTRA: list[tuple[Any, str]] = [
 
 @pytest.mark.parametrize(("extra", "complaint"), EXTRA)
 def test_a_broken_feature_is_named(tmp_path: Path, extra: Any, complaint: str) -> None:
-    told = said(write(tmp_path, *GOOD, extra))
-    assert told.startswith(str(tmp_path / "world.geojson"))
-    assert complaint in told
+    error = error_of(write(tmp_path, *GOOD, extra))
+    assert error.startswith(str(tmp_path / "world.geojson"))
+    assert complaint in error
 
 
 def test_a_second_pipeline_and_too_many_trajectories(tmp_path: Path) -> None:
     pipe = feature("pipeline", "LineString", [[41.5, 39.95], [41.51, 39.955]])
-    assert "features[4]: the pipeline comes twice" in said(write(tmp_path, *GOOD, pipe, pipe))
-    assert "at most 100 trajectories" in said(write(tmp_path, sensor("a"), *CROWD))
+    assert "features[4]: the pipeline comes twice" in error_of(write(tmp_path, *GOOD, pipe, pipe))
+    assert "at most 100 trajectories" in error_of(write(tmp_path, sensor("a"), *CROWD))
 
 
 @pytest.mark.parametrize(("features", "role"), [(GOOD[2:], "sensor"), (GOOD[:2], "trajectory"), ((), "sensor")])
-def test_a_role_that_nothing_has(tmp_path: Path, features: tuple[Json, ...], role: str) -> None:
-    assert f"world.geojson has no {role}: give a" in said(write(tmp_path, *features))
+def test_a_missing_role_is_named(tmp_path: Path, features: tuple[Json, ...], role: str) -> None:
+    assert f"world.geojson has no {role}: give a" in error_of(write(tmp_path, *features))
 
 
 @pytest.mark.parametrize(
     "crs", [{"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}, "EPSG:32637", {}]
 )
 def test_another_crs_is_refused(tmp_path: Path, crs: Any) -> None:
-    assert "export the file as WGS 84 (EPSG:4326)" in said(write(tmp_path, *GOOD, crs=crs))
+    assert "export the file as WGS 84 (EPSG:4326)" in error_of(write(tmp_path, *GOOD, crs=crs))
 
 
 @pytest.mark.parametrize(
@@ -116,14 +116,14 @@ def test_another_crs_is_refused(tmp_path: Path, crs: Any) -> None:
 )
 def test_a_file_that_is_no_geojson(tmp_path: Path, content: bytes, complaint: str) -> None:
     (tmp_path / "world.geojson").write_bytes(content)
-    assert complaint in said(tmp_path)
+    assert complaint in error_of(tmp_path)
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    assert "--world" in said(tmp_path / "none") and "is no folder" in said(tmp_path / "none")
-    assert said(tmp_path) == f"{tmp_path / 'world.geojson'}: No such file or directory"
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    assert "--world" in error_of(tmp_path / "none") and "is no folder" in error_of(tmp_path / "none")
+    assert error_of(tmp_path) == f"{tmp_path / 'world.geojson'}: No such file or directory"
     (tmp_path / "world.geojson").mkdir()
-    assert said(tmp_path).endswith("world.geojson is no file")
+    assert error_of(tmp_path).endswith("world.geojson is no file")
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         ("radio_radius = 300", "scenario.toml, line 1: a scenario has no field 'radio_radius'; did you mean radio_r"),
         ("gravity = 9.81", "a scenario has no field 'gravity'; its fields are those of shared/scenario.py"),
         ("steps = 30\nsensors = 4", "scenario.toml, line 2: sensors follows from world.geojson"),
-        ("lap_radius_m = 4", "lap_radius_m means nothing"),
+        ("lap_radius_m = 4", "does not use lap_radius_m"),
         ("# x\nqueue_capacity = 2.5", "scenario.toml, line 2: queue_capacity: input should be a valid integer"),
         ("altitude_m = nan", "scenario.toml, line 1: altitude_m: input should be a finite number"),
         ("altitude_m = true", "scenario.toml, line 1: altitude_m: input should be a valid number"),
@@ -144,7 +144,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_broken_toml_names_the_line(tmp_path: Path, toml: str, complaint: str) -> None:
-    assert complaint in said(write(tmp_path, *GOOD, toml=toml))
+    assert complaint in error_of(write(tmp_path, *GOOD, toml=toml))
 
 
 @pytest.mark.parametrize(
@@ -171,9 +171,9 @@ def test_a_broken_toml_names_the_line(tmp_path: Path, toml: str, complaint: str)
     ],
 )  # fmt: skip
 def test_a_broken_trace_names_the_line(tmp_path: Path, trace: str, complaint: str) -> None:
-    told = said(write(tmp_path, *GOOD, trace=trace))
-    assert told.startswith(str(tmp_path / "arrivals.csv"))
-    assert complaint in told
+    error = error_of(write(tmp_path, *GOOD, trace=trace))
+    assert error.startswith(str(tmp_path / "arrivals.csv"))
+    assert complaint in error
 
 
 def test_a_short_trace_will_do_for_a_short_mission(tmp_path: Path) -> None:
@@ -183,14 +183,14 @@ def test_a_short_trace_will_do_for_a_short_mission(tmp_path: Path) -> None:
 
 def test_more_arrivals_than_a_world_may_draw(tmp_path: Path) -> None:
     crowd = [sensor(f"s{j}") for j in range(1100)]
-    assert "exceeds 10,000,000" in said(write(tmp_path, *crowd, there_and_back()), steps=10_000)
+    assert "exceeds 10,000,000" in error_of(write(tmp_path, *crowd, there_and_back()), steps=10_000)
 
 
-# ---- whatever is in the files
+# ---- any content
 
 
 def fuzzed(folder: Path, change: Callable[[Path], object]) -> None:
-    """Read a world after a change: it is a site that can be flown, or the house's error."""
+    """Read a world after a change: it gives a site that can be flown, or a ``UsageError``."""
     for name in ("scenario.toml", "arrivals.csv"):
         (folder / name).unlink(missing_ok=True)
     write(folder, *GOOD)
@@ -232,13 +232,13 @@ quick = settings(max_examples=150, deadline=None, suppress_health_check=[HealthC
 
 @quick
 @given(extra=st.lists(features | anything, max_size=4), members=st.dictionaries(st.just("crs"), anything))
-def test_any_features_make_a_site_or_the_houses_error(tmp_path: Path, extra: list[Any], members: Json) -> None:
+def test_any_features_make_a_site_or_a_usage_error(tmp_path: Path, extra: list[Any], members: Json) -> None:
     fuzzed(tmp_path, lambda folder: write(folder, *GOOD[:2], *extra, *GOOD[2:], **members))
 
 
 @quick
 @given(content=st.binary(max_size=60) | anything.map(lambda value: json.dumps(value).encode()))
-def test_any_bytes_make_a_site_or_the_houses_error(tmp_path: Path, content: bytes) -> None:
+def test_any_bytes_make_a_site_or_a_usage_error(tmp_path: Path, content: bytes) -> None:
     for name in ("world.geojson", "scenario.toml", "arrivals.csv"):
         fuzzed(tmp_path, lambda folder, name=name: (folder / name).write_bytes(content))  # type: ignore[misc]
 
@@ -251,13 +251,13 @@ def test_any_bytes_make_a_site_or_the_houses_error(tmp_path: Path, content: byte
     | st.integers().map(str)
     | st.just(hex(10**5000)),
 )
-def test_any_override_makes_a_site_or_the_houses_error(tmp_path: Path, key: str, value: str) -> None:
+def test_any_override_makes_a_site_or_a_usage_error(tmp_path: Path, key: str, value: str) -> None:
     fuzzed(tmp_path, lambda folder: (folder / "scenario.toml").write_text(f"{key} = {value}\n"))
 
 
 @quick
 @given(cells=st.lists(st.lists(st.text(max_size=4) | st.integers().map(str), min_size=2, max_size=3), max_size=4))
-def test_any_cells_make_a_site_or_the_houses_error(tmp_path: Path, cells: list[list[str]]) -> None:
+def test_any_cells_make_a_site_or_a_usage_error(tmp_path: Path, cells: list[list[str]]) -> None:
     out = io.StringIO()
     csv.writer(out, escapechar="\\").writerows([["step", "a", "b"], *([t, *row] for t, row in enumerate(cells))])
     text = out.getvalue().encode("utf-8", errors="surrogatepass")

@@ -1,4 +1,4 @@
-"""Worlds from files: what they become, and what is said of broken ones."""
+"""Sites from valid world folders."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.simulator.sites.files.made_folder import EXAMPLE, GOOD, RING, feature
 EARTH = Geod(ellps="WGS84")
 
 
-# ---- what files become
+# ---- sites from files
 
 
 def test_sensors_and_trajectories_become_a_scenario(tmp_path: Path) -> None:
@@ -60,7 +60,7 @@ def test_east_is_x_and_north_is_y(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("apart", "worst"), [(0.1, 1e-6), (1.0, 5e-5), (4.0, 1e-3)])
 @pytest.mark.parametrize("centre", [(41.5, 39.95), (180.0, -17.0), (0.0, 0.0), (10.0, 88.0)])
 def test_lengths_are_those_on_the_ellipsoid(centre: tuple[float, float], apart: float, worst: float) -> None:
-    """Also across the antimeridian, and near a pole: what the projection's docstring promises."""
+    """The accuracy in the projection's docstring, also across the antimeridian and near a pole."""
     east, north, _ = EARTH.fwd([centre[0]] * 8, [centre[1]] * 8, np.arange(8) * 45.0, [apart * 1e5] * 8)
     points = np.stack((east, north), axis=-1)
     plane = to_metres(points)
@@ -83,7 +83,7 @@ def test_altitudes_are_left_out_and_foreign_members_ignored(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326"])
-def test_a_crs_member_may_say_what_is_the_rule(tmp_path: Path, name: str) -> None:
+def test_a_crs_member_may_name_the_default(tmp_path: Path, name: str) -> None:
     site_from_folder(write(tmp_path, *GOOD, crs={"type": "name", "properties": {"name": name}}))
 
 
@@ -112,7 +112,7 @@ def test_other_numbers_come_from_the_toml(tmp_path: Path) -> None:
     assert site_from_folder(tmp_path, steps=7).scenario.steps == 7, "the command line is asked first"
 
 
-def test_a_trace_is_what_arrives_and_the_seed_draws_the_rest(tmp_path: Path) -> None:
+def test_a_trace_gives_the_arrivals_and_the_seed_draws_the_rest(tmp_path: Path) -> None:
     trace = "\ufeffstep, b ,a\r\n" + "".join(f"{t},{t},{10 * t}\r\n" for t in range(40)) + "\r\n"
     site = site_from_folder(write(tmp_path, *GOOD, trace=trace))
     one, two = site.world(), site.world()
@@ -146,7 +146,7 @@ def test_a_warning_names_a_few_of_many(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("metres", "reached"), [(355, True), (365, False)])
-def test_in_reach_is_what_the_radio_reaches(tmp_path: Path, metres: float, reached: bool) -> None:
+def test_sensors_in_reach_are_within_the_radio_radius(tmp_path: Path, metres: float, reached: bool) -> None:
     east, north, _ = EARTH.fwd(41.5, 39.95, 180.0, metres)
     warnings: list[str] = []
     line = there_and_back([41.49, 39.95], [41.51, 39.95])
@@ -176,7 +176,7 @@ def test_steps_out_of_bounds(tmp_path: Path, steps: int) -> None:
 # ---- the worked example
 
 
-def test_the_example_is_what_its_readme_says() -> None:
+def test_the_example_matches_its_readme() -> None:
     warnings: list[str] = []
     site = site_from_folder(EXAMPLE, on_warning=warnings.append)
     scenario = site.scenario
@@ -189,7 +189,7 @@ def test_the_example_is_what_its_readme_says() -> None:
     assert set(tomllib.loads((EXAMPLE / "scenario.toml").read_text(encoding="utf-8"))) <= set(Scenario.model_fields)
 
 
-def test_on_the_example_it_matters_how_one_flies() -> None:
+def test_on_the_example_policies_differ() -> None:
     site = site_from_folder(EXAMPLE)
 
     def lost(name: str) -> int:

@@ -11,8 +11,8 @@ from rich.console import Console
 
 from shared.scenario import Scenario
 from simulator.experiments.edges import Llm
-from simulator.experiments.flight import Decided, Flown
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.flight import DecisionRecord, FlightRecord
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.runner import Run
 from simulator.experiments.schemes import Scheme, local
 from simulator.sites.site import Site
@@ -20,8 +20,8 @@ from simulator.sites.site import Site
 TINY = Scenario(steps=3)
 
 
-def flown(decisions: Sequence[Decided] = (), **changes: Any) -> Flown:
-    """A flight of three steps, two UAVs and three sensors, unless told otherwise."""
+def flown(decisions: Sequence[DecisionRecord] = (), **changes: Any) -> FlightRecord:
+    """A flight, by default of three steps, two UAVs and three sensors."""
     facts: dict[str, Any] = {
         "seed": 0,
         "scenario": "paper",
@@ -34,13 +34,13 @@ def flown(decisions: Sequence[Decided] = (), **changes: Any) -> Flown:
         "duration_s": 1.0,
         "decisions": list(decisions),
     }
-    return Flown(**{**facts, **changes})
+    return FlightRecord(**{**facts, **changes})
 
 
-def decided(step: int, sensor: int, *, failed: bool = False, uav: int = 0, **changes: Any) -> Decided:
-    """One decision, of an edge's policy unless told otherwise."""
+def decided(step: int, sensor: int, *, failed: bool = False, uav: int = 0, **changes: Any) -> DecisionRecord:
+    """One decision, by default of an edge's policy."""
     facts: dict[str, Any] = {"velocity": 7, "collected": 5, "source": "policy"}
-    return Decided(step=step, uav=uav, sensor=sensor, failed=failed, **{**facts, **changes})
+    return DecisionRecord(step=step, uav=uav, sensor=sensor, failed=failed, **{**facts, **changes})
 
 
 def setup(**changes: Any) -> Setup:
@@ -50,13 +50,13 @@ def setup(**changes: Any) -> Setup:
 
 
 def declared(*schemes: Scheme, name: str = "tiny", **changes: Any) -> Experiment:
-    """An experiment that measures losses of the schemes given; of none, EOF and random."""
+    """An experiment that measures the losses of the given schemes, by default EOF and random."""
     facts: dict[str, Any] = {
         "title": "Tiny",
         "summary": "for tests",
         "schemes": lambda setup: list(schemes) or [local("eof"), local("random")],
         "measures": ("lost_packets", "events", "jain"),
-        "drawings": (Drawing("tiny", "bars", ("lost_packets", "events"), "Losses."),),
+        "figures": (FigureSpec("tiny", "bars", ("lost_packets", "events"), "Losses."),),
         "reference": "eof",
     }
     return Experiment(name=name, **{**facts, **changes})

@@ -1,4 +1,4 @@
-"""Fly one planned flight: by a policy here, over HTTP by an edge, or the bound of its world."""
+"""Executing one planned flight: a local policy, an edge over HTTP, or the bound of its world."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from simulator.errors import EdgeError, UsageError
 from simulator.experiments.edges import EdgeAt, radio
-from simulator.experiments.flight import BoundFound, Counted, Decided, Flown
+from simulator.experiments.flight import BoundFound, DecisionRecord, FlightRecord, TokenCounts
 from simulator.experiments.plan import Planned
 from simulator.experiments.schemes import Clairvoyant, Local, OverEdge
 from simulator.flying.flight import Flight, fly
@@ -21,7 +21,7 @@ from simulator.world import Observation
 
 
 class CannotFly(Exception):
-    """This scheme has no way to decide in this world; the text says why."""
+    """The scheme cannot decide in this world; the text says why."""
 
 
 class FullSpeed(LocalPilot):
@@ -32,16 +32,16 @@ class FullSpeed(LocalPilot):
         self._velocity = site_max_velocity
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
-        """The policy's sensor, full speed."""
+        """The policy's sensor at full speed."""
         return replace(super().decide(uav, observation, taken), velocity=self._velocity)
 
 
-def fly_here(planned: Planned) -> Flown:
-    """A flight that needs no edge.
+def fly_here(planned: Planned) -> FlightRecord:
+    """Fly without an edge.
 
     Raises:
         CannotFly: the policy cannot decide in this world, such as a network trained for another number of sensors.
-        KeyboardInterrupt: interrupted on the way.
+        KeyboardInterrupt: the flight was interrupted.
     """
     if isinstance(planned.scheme.decides, Clairvoyant):
         return _bound(planned, planned.scheme.decides.seconds)
@@ -53,15 +53,15 @@ def fly_here(planned: Planned) -> Flown:
             pilot = FullSpeed(planned.scheme.decides.policy, scenario.max_velocity, planned)
     except (UsageError, ValueError, ImportError, OSError) as error:
         raise CannotFly(str(error)) from error
-    return _kept(planned, fly(planned.site, pilot, planned.seed), model=None)
+    return _record(planned, fly(planned.site, pilot, planned.seed), model=None)
 
 
-def fly_over(edge: EdgeAt, planned: Planned) -> Flown:
-    """A flight that asks the edge.
+def fly_over(edge: EdgeAt, planned: Planned) -> FlightRecord:
+    """Fly with decisions of the edge.
 
     Raises:
-        EdgeError: the edge died or did not answer; what was decided without it is not this scheme's.
-        KeyboardInterrupt: interrupted on the way.
+        EdgeError: the edge died or did not answer; decisions on board are not this scheme's.
+        KeyboardInterrupt: the flight was interrupted.
     """
     assert isinstance(planned.scheme.decides, OverEdge)
     decides, scenario = planned.scheme.decides, planned.site.scenario
@@ -80,40 +80,40 @@ def fly_over(edge: EdgeAt, planned: Planned) -> Flown:
         radio(edge.url, decides.deadline_ms, scenario, planned.seed) as air,
     ):
         pilot = EdgePilot(air, mission_id, scenario, planned.seed, deadline_ms=decides.deadline_ms)
-        operator, asked = decides.operator, dict[str, Any]()
+        operator, guided = decides.operator, dict[str, Any]()
         spec = {**pilot.spec.model_dump(), **decides.spec}
         if operator is not None:
             spec["note"] = operator.note(planned.seed)
-            asked["meant"] = operator.told(planned.seed).meant
+            guided["meant"] = operator.intent(planned.seed).meant
         pilot.spec = pilot.spec.model_validate(spec)
         try:
             ground.put_mission(mission_id, pilot.spec)
             if operator is not None:
-                asked["guidance"] = operator.answer(ground, mission_id, planned.seed)
+                guided["guidance"] = operator.answer(ground, mission_id, planned.seed)
         except EdgeError:
             edge.alive()
             raise
         flight = fly(planned.site, pilot, planned.seed, on_decision=check)
     edge.alive()
-    return _kept(planned, flight, edge.model).model_copy(update=asked)
+    return _record(planned, flight, edge.model).model_copy(update=guided)
 
 
-def _bound(planned: Planned, seconds: float) -> Flown:
+def _bound(planned: Planned, seconds: float) -> FlightRecord:
     try:
         from simulator.flying.clairvoyant_bound import clairvoyant
 
         found = clairvoyant(planned.site, planned.seed, seconds)
     except ImportError as error:
         raise CannotFly(f"{error}; install the extra: pip install 'aic-vds[planner]'") from error
-    kept = BoundFound.model_validate(found, from_attributes=True)
+    bound = BoundFound.model_validate(found, from_attributes=True)
     flight = Flight(planned.site.scenario, planned.seed, duration_s=found.seconds)
-    return _kept(planned, flight, model=None).model_copy(update={"bound": kept})
+    return _record(planned, flight, model=None).model_copy(update={"bound": bound})
 
 
-def _kept(planned: Planned, flight: Flight, model: str | None) -> Flown:
+def _record(planned: Planned, flight: Flight, model: str | None) -> FlightRecord:
     if flight.interrupted:
         raise KeyboardInterrupt
-    return Flown(
+    return FlightRecord(
         seed=planned.seed,
         scenario=planned.site.scenario.name,
         steps=planned.site.scenario.steps,
@@ -130,8 +130,8 @@ def _kept(planned: Planned, flight: Flight, model: str | None) -> Flown:
     )
 
 
-def _decided(decision: Decision) -> Decided:
-    return Decided(
+def _decided(decision: Decision) -> DecisionRecord:
+    return DecisionRecord(
         step=decision.step,
         uav=decision.uav_id,
         sensor=decision.sensor_id,
@@ -140,7 +140,7 @@ def _decided(decision: Decision) -> Decided:
         collected=decision.collected,
         source=decision.source,
         reason=decision.reason,
-        tokens=None if decision.tokens is None else Counted.model_validate(decision.tokens.model_dump()),
+        tokens=None if decision.tokens is None else TokenCounts.model_validate(decision.tokens.model_dump()),
         rtt_ms=None if decision.rtt_ms is None else round(decision.rtt_ms, 2),
         latency_ms={stage: round(took, 2) for stage, took in decision.latency_ms.items()},
     )
@@ -148,7 +148,7 @@ def _decided(decision: Decision) -> Decided:
 
 @cache
 def commit() -> str | None:
-    """The commit of the code that runs, ``-dirty`` where files differ from it; ``None`` outside a repository."""
+    """The commit of this code, with ``-dirty`` if files differ from it; ``None`` outside a repository."""
     command = [
         "git",
         "--no-optional-locks",
