@@ -36,7 +36,7 @@ class FullSpeed(LocalPilot):
         return replace(super().decide(uav, observation, taken), velocity=self._velocity)
 
 
-def fly_here(planned: Planned) -> FlightRecord:
+def fly_locally(planned: Planned) -> FlightRecord:
     """Fly without an edge.
 
     Raises:
@@ -56,7 +56,7 @@ def fly_here(planned: Planned) -> FlightRecord:
     return _record(planned, fly(planned.site, pilot, planned.seed), model=None)
 
 
-def fly_over(edge: EdgeAt, planned: Planned) -> FlightRecord:
+def fly_with_edge(edge: EdgeAt, planned: Planned) -> FlightRecord:
     """Fly with decisions of the edge.
 
     Raises:

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from simulator.errors import UsageError
 from simulator.experiments.edges import edge_for
-from simulator.experiments.execution import CannotFly, commit, fly_here, fly_over
+from simulator.experiments.execution import CannotFly, commit, fly_locally, fly_with_edge
 from simulator.experiments.flight import FlightRecord, FlightStore
 from simulator.experiments.measures import substituted_decisions
 from simulator.experiments.pace import Pace, duration_text
@@ -107,36 +107,36 @@ class Run:
                 if flight is not None:
                     self.store.save(planned.key, flight)
                     self.pace.took(planned, flight.duration_s)
-                    self._doubt(planned, flight)
+                    self._warn_of_substitutes(planned, flight)
                 advance(planned, self.pace.left_s(left.values()))
                 yield planned.key
 
     def _flights(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
-        yield from self._here([planned for planned in flights if planned.backing is None])
+        yield from self._fly_locally([planned for planned in flights if planned.backing is None])
         for backing in dict.fromkeys(planned.backing for planned in flights if planned.backing is not None):
             name = "".join(c if c.isalnum() else "-" for c in Path(backing).stem)
             with edge_for(backing, self.setup.llm, self.out / f"edge-{name}.log", self.console) as edge:
                 for planned in (p for p in flights if p.backing == backing):
-                    yield planned, fly_over(edge, planned)
+                    yield planned, fly_with_edge(edge, planned)
 
-    def _here(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
-        apart = [planned for planned in flights if self.workers > 1 or planned.plans]
-        for planned in (planned for planned in flights if planned not in apart):
-            yield planned, self._landed(planned, lambda planned=planned: fly_here(planned))  # type: ignore[misc]
-        if apart:
+    def _fly_locally(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
+        pooled = [planned for planned in flights if self.workers > 1 or planned.plans]
+        for planned in (planned for planned in flights if planned not in pooled):
+            yield planned, self._record_of(planned, lambda planned=planned: fly_locally(planned))  # type: ignore[misc]
+        if pooled:
             with _workers(self.workers) as pool:
-                futures = {pool.submit(fly_here, planned): planned for planned in apart}
+                futures = {pool.submit(fly_locally, planned): planned for planned in pooled}
                 for future in as_completed(futures):
-                    yield futures[future], self._landed(futures[future], future.result)
+                    yield futures[future], self._record_of(futures[future], future.result)
 
-    def _landed(self, planned: Planned, fly: Callable[[], FlightRecord]) -> FlightRecord | None:
+    def _record_of(self, planned: Planned, fly: Callable[[], FlightRecord]) -> FlightRecord | None:
         try:
             return fly()
         except CannotFly as error:
             self.grounded.setdefault(f"{planned.scheme.label} on {planned.site_name}", str(error))
             return None
 
-    def _doubt(self, planned: Planned, flight: FlightRecord) -> None:
+    def _warn_of_substitutes(self, planned: Planned, flight: FlightRecord) -> None:
         substituted = substituted_decisions(flight)
         if planned.scheme.is_answered and substituted > 3:
             self.console.print(

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from simulator.flying.flight_metrics import FlightMetrics
     from simulator.flying.pilots import Choice, Pilot
 
-
 API_KEY = "AICVDS_API_KEY"
 # Without a requested deadline the edge's default applies, which may be as long as the paper's step.
 DEFAULT_TIMEOUT_S = 10.0
@@ -80,7 +79,7 @@ def conduct(
 
     Raises:
         UsageError: the folder cannot be written.
-        EdgeError: no edge answers as one, before take-off.
+        EdgeError: no edge is ready before take-off.
     """
     from simulator.flying.pilots import EdgePilot, LocalPilot
 
@@ -88,7 +87,8 @@ def conduct(
         fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
         return _conclude(job, flight, None, None, console)
-    with _client(job, job.edge) as ground, _client(job, job.edge, airborne=True) as radio, _probe(job.edge) as probe:
+    lossy = _radio_link(job.site.scenario, job.seed)
+    with _client(job, job.edge) as ground, _client(job, job.edge, lossy) as radio, _probe(job.edge) as probe:
         model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
         progress = _ProgressText(metrics)
         pilot = EdgePilot(
@@ -111,17 +111,17 @@ def conduct(
     return code or (1 if flight.decisions and not pilot.answered else 0)
 
 
-def _client(job: Job, edge: str, airborne: bool = False) -> EdgeClient:
-    """The client of the fleet's radio link, or with ``airborne`` false that of a lossless link on the ground."""
+def _radio_link(scenario: Scenario, seed: int) -> LossyTransport | None:
+    """The transport of the scenario's radio link; ``None`` for a lossless one."""
+    if not scenario.uplink_drop and not scenario.uplink_jitter_ms:
+        return None
+    inner = httpx.HTTPTransport()
+    return LossyTransport(inner, drop=scenario.uplink_drop, jitter_ms=scenario.uplink_jitter_ms, seed=seed)
+
+
+def _client(job: Job, edge: str, transport: httpx.BaseTransport | None = None) -> EdgeClient:
+    """A client of the edge with the job's deadline and uplink; without ``transport`` its link is lossless."""
     timeout_s = DEFAULT_TIMEOUT_S if job.deadline_ms is None else job.deadline_ms / 1000 + NETWORK_SLACK_S
-    transport = None
-    if airborne and (job.site.scenario.uplink_drop or job.site.scenario.uplink_jitter_ms):
-        transport = LossyTransport(
-            httpx.HTTPTransport(),
-            drop=job.site.scenario.uplink_drop,
-            jitter_ms=job.site.scenario.uplink_jitter_ms,
-            seed=job.seed,
-        )
     key = os.environ.get(API_KEY) or None
     return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport, uplink=job.uplink)
 

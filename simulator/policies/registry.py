@@ -24,8 +24,6 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "nearest": NearestNeighbour,
     "mpc": RecedingHorizon,
 }
-
-
 # They need the extra `marl`, and fly only scenarios of the size of their training.
 LEARNED_NAMES = ("madqn", "mappo")
 _POLICIES |= {name: partial(Learned, name) for name in LEARNED_NAMES}

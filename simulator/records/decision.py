@@ -11,8 +11,6 @@ from simulator.records.record import Record
 _LLM_QUERIED_IN_VAIN = frozenset(
     {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
 )
-
-
 DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
 
 

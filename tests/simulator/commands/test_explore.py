@@ -12,8 +12,6 @@ from simulator.commands.explore import main, teacher_of
 from simulator.flying.teachers import TEACHERS, TeacherName
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
-
-
 NAMES: list[TeacherName] = ["planner", "clairvoyant"]
 
 

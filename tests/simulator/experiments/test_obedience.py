@@ -13,7 +13,7 @@ from shared.guidance import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire import MissionSpec
 from simulator.client import EdgeClient
 from simulator.experiments.edges import EdgeAt
-from simulator.experiments.execution import fly_over
+from simulator.experiments.execution import fly_with_edge
 from simulator.experiments.flight import flight_key
 from simulator.experiments.measures import MEASURES
 from simulator.experiments.obedience import EXPERIMENT
@@ -77,7 +77,7 @@ def test_a_flight_records_its_guidance_and_obeys(edge: Edge) -> None:
     scheme = over_edge("intent", "intent", mode="value", backing=OFF, operator=operator)
     [planned] = [p for p in plan(declared(scheme), setup(seeds=1)).flights]
     at = EdgeAt(str(edge().base_url), None, lambda: None)
-    flight = fly_over(at, planned)
+    flight = fly_with_edge(at, planned)
     assert (flight.meant, flight.guidance) == (MEANT, "confirmed")
     assert max(d.velocity for d in flight.decisions) <= 6
 

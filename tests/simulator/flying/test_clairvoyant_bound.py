@@ -16,8 +16,6 @@ from simulator.policies.registry import LEARNED_NAMES, POLICY_NAMES, policy_name
 from simulator.sites.site import Site
 
 ROUTES = (((100.0, 100.0), (900.0, 100.0)), ((100.0, 900.0), (900.0, 900.0), (500.0, 400.0)))
-
-
 BUSY: dict[str, Any] = {"initial_queue_min": 0.8, "arrival_rate_min": 15.0, "arrival_rate_max": 25.0}
 
 

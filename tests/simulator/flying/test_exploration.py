@@ -19,8 +19,6 @@ from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 from simulator.world import PipelineWorld
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
-
-
 NAMES: list[TeacherName] = ["planner", "clairvoyant"]
 
 

@@ -14,11 +14,7 @@ from simulator.marl.curve import read_csv
 from simulator.policies.learned import Learned
 
 PAPER = SCENARIOS["paper"]
-
-
 SCHEMES = ["madqn", "mappo"]
-
-
 CHECKPOINTS = Path(__file__).parents[3] / "simulator" / "checkpoints"
 
 

@@ -19,11 +19,7 @@ from simulator.policies.registry import policy_named
 from simulator.world import PipelineWorld
 
 PAPER = SCENARIOS["paper"]
-
-
 SMALL = Scenario(name="small", sensors=4, uavs=2, steps=6)
-
-
 SCHEMES = ["madqn", "mappo"]
 
 

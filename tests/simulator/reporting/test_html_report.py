@@ -19,11 +19,7 @@ from simulator.reporting.wording import llm_notice, policy_labels
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
-
-
 EVIL = '<script>alert("$x$")</script>&amp;'
-
-
 SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "glossary", "provenance")
 
 
