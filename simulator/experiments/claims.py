@@ -125,7 +125,7 @@ _RANKING_ALONE = f"{_NO_BETTER}: this measures attention's ranking, not what an 
 
 
 def _zero_by(name: str, step: int, near: int | None) -> Callable[[Result, Runs], Judged]:
-    """The rule of a claim of zero by ``step``; ``near`` is its tolerance on either side, ``None`` allows earlier."""
+    """The rule of a claim of zero by ``step``; with a tolerance ``near`` on either side, or before it if ``None``."""
 
     def rule(result: Result, runs: Runs) -> Judged:
         means = {label: _curve(result, name, measure) for measure, label in LOSSES.items()}

@@ -1,4 +1,4 @@
-"""The ground sensors of one world: where they are, and the packets that wait, arrive and leave."""
+"""The ground sensors of one world: their positions, queues, arrivals and batteries."""
 
 from __future__ import annotations
 
