@@ -25,8 +25,10 @@ from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
-from simulator.mission import Choice, LocalPilot, decide_request, fly
-from simulator.site import Site
+from simulator.client.observation_report import decide_request
+from simulator.flying.flight import fly
+from simulator.flying.pilots import Choice, LocalPilot
+from simulator.sites.site import Site
 from simulator.world import Observation
 
 GUIDED, LLM, LLM_ALL, LLM_30, PAPER = "guided", "llm", "llm_no_attention", "llm_30", "paper"

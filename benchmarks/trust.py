@@ -35,9 +35,10 @@ from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient
 from simulator.experiments.intervals import interval, paired
-from simulator.mission import Choice, EdgePilot, fly
+from simulator.flying.flight import fly
+from simulator.flying.pilots import Choice, EdgePilot
 from simulator.policies.mpc import RecedingHorizon
-from simulator.site import Site
+from simulator.sites.site import Site
 from simulator.world import Observation
 
 GOAL = 1.10

@@ -15,7 +15,7 @@ from service.training.training_loop import losses
 from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from shared.wire import Features
-from simulator.explore import explore
+from simulator.flying.exploration import explore
 from tests.e2e.processes import run
 
 PAPER = SCENARIOS["paper"]

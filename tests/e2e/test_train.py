@@ -56,7 +56,7 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
         assert list((folder / "tensorboard").glob("events.*"))
     again = run("train", "mappo", *EPISODES, "--out", str(whole))
     assert again.returncode == 2
-    assert "holds a training: give --resume" in again.stderr
+    assert "has a training: give --resume" in again.stderr
 
 
 def test_help_teaches() -> None:

@@ -14,9 +14,10 @@ import httpx
 from shared.scenario import SCENARIOS
 from shared.wire import FeedbackRequest, Uplink
 from simulator.client import EdgeClient
-from simulator.mission import Choice, EdgePilot, Flight, fly
-from simulator.site import Site
-from simulator.uplink import LossyTransport
+from simulator.client.lossy_transport import LossyTransport
+from simulator.flying.flight import Flight, fly
+from simulator.flying.pilots import Choice, EdgePilot
+from simulator.sites.site import Site
 from simulator.world import Observation
 from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.simulator.edge_stub import free_port

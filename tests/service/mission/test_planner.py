@@ -12,7 +12,7 @@ import pytest
 
 from service.mission import planner
 from shared.scenario import SCENARIOS, Scenario
-from simulator.mission import decide_request
+from simulator.client.observation_report import decide_request
 from simulator.policies.mpc import RecedingHorizon
 from simulator.world import PipelineWorld
 

@@ -15,7 +15,7 @@ from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS, Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
-from simulator.explore import explore
+from simulator.flying.exploration import explore
 from tests.service.making import PAPER, attended, mission, uav
 
 SHORT = PAPER.model_copy(update={"steps": 8})

@@ -15,7 +15,7 @@ from service.training.rollout_examples import Batch, Example, Taught, replay
 from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from service.training.training_loop import losses
 from shared.rollouts import Header, Reference, RolloutStep
-from simulator.explore import explore
+from simulator.flying.exploration import explore
 from tests.service.making import PAPER
 
 SHORT = PAPER.model_copy(update={"steps": 12})
