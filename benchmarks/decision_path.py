@@ -3,8 +3,8 @@
     python benchmarks/decision_path.py
     python benchmarks/decision_path.py --modes guided --list
 
-Runs `aicvds serve` in a process of its own for each mode and round, in its main thread, with a SQLite store, the planner
-on, and an LLM that answers at once from a thread of the same process. After four decisions two requests of UAV 0 are
+Runs `aicvds serve` in a process of its own for each mode and round, in its main thread, with a SQLite store, a planner,
+and an LLM that answers at once from a thread of the same process. After four decisions two requests of UAV 0 are
 counted: the README's four sensors, first without an outcome, then with that of an earlier decision.
 
 How it is counted, by `sys.setprofile`, from sending the request to having the answer: every `call` event of a Python
@@ -50,7 +50,7 @@ from rich.table import Table
 PACKAGES = ("service", "shared")
 # The first word of a process that counts; its mode follows.
 COUNTED = "counted"
-SENSORS = {
+SENSORS: dict[str, list[Any]] = {
     "id": [0, 1, 2, 3],
     "x": [420, 650, 300, 900],
     "y": [380, 520, 700, 100],
