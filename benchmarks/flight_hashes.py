@@ -3,7 +3,7 @@
     python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/before.json
     python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/after.json --against runs/before.json
 
-Starts `aicvds serve` with no LLM and no store and flies every scenario in modes `value`, `policy` and `guided`, `paper`
+Starts `aicvds serve` with no LLM and a store of its own and flies every scenario in modes `value`, `policy` and `guided`, `paper`
 with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order flown, each decision's step, UAV, sensor,
 velocity, source, reason and failure, its cost and the packets that its UAV lost, as `decisions.jsonl` has them.
 
@@ -20,8 +20,10 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -154,7 +156,10 @@ def _over(url: str, course: Course, site: Site, seed: int) -> Flight:
 @contextmanager
 def serving() -> Iterator[str]:
     """An edge as a process of its own, with nothing inherited that changes a decision; yields its URL."""
-    settings = {"MODE": "value", "STORE": "none", "PLANNER_MS": "60000", "LOG_LEVEL": "warning"}
+    # An answer waits for the store, and so for what is learned from the outcome that came with its request: with no
+    # store the next request may overtake that on a busy machine.
+    folder = tempfile.mkdtemp()
+    settings = {"MODE": "value", "STORE": f"{folder}/m.db", "PLANNER_MS": "60000", "LOG_LEVEL": "warning"}
     process = subprocess.Popen(
         [sys.executable, "-m", "shared.cli", "serve", "--port", "0"],
         stderr=subprocess.PIPE,
@@ -173,6 +178,7 @@ def serving() -> Iterator[str]:
     finally:
         process.terminate()
         process.communicate(timeout=30)
+        shutil.rmtree(folder)
 
 
 def _environment(settings: Mapping[str, str]) -> dict[str, str]:
