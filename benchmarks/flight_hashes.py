@@ -4,8 +4,9 @@
     python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/after.json --against runs/before.json
 
 Starts `aicvds serve` with no LLM and a store of its own, and flies every scenario in modes `value`, `policy` and
-`guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order flown, each decision's step, UAV, sensor,
-velocity, source, reason and failure, its cost and the packets that its UAV lost, as `decisions.jsonl` has them.
+`guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order flown, each decision's
+step, UAV, sensor, velocity, source, reason and failure, its cost and the packets that its UAV lost, as
+`decisions.jsonl` has them.
 
 A flight repeats to the bit where no wall clock decides. The planner's search has two limits: the solver's deterministic
 time, and AICVDS_PLANNER_MS of wall clock, which is set to its highest here; the deadline is a minute. Requests come one
