@@ -35,12 +35,14 @@ from typing import Any, NamedTuple
 import httpx
 import tyro
 
+from simulator.cli.options import chosen_site
 from simulator.client import EdgeClient
+from simulator.client.lossy_transport import LossyTransport
 
 # The only names from inside: who flies a world, and the radio that loses requests.
-from simulator.mission import EdgePilot, Flight, LocalPilot, fly
-from simulator.site import Site, chosen_site
-from simulator.uplink import LossyTransport
+from simulator.flying.flight import Flight, fly
+from simulator.flying.pilots import EdgePilot, LocalPilot
+from simulator.sites.site import Site
 
 SCENARIOS = ("paper", "pipeline", "stress", "dense", "lossy_uplink")
 MODES = ("value", "policy", "guided")
