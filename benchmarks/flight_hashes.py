@@ -147,7 +147,7 @@ def _over(url: str, course: Course, site: Site, seed: int) -> Flight:
         EdgeClient(url, timeout_s=timeout_s) as ground,
         EdgeClient(url, timeout_s=timeout_s, seed=seed, transport=radio, uplink=uplink) as air,
     ):
-        pilot = EdgePilot(air, mission_id, scenario, seed, mode=mode, deadline_ms=DEADLINE_MS, scout=ground)
+        pilot = EdgePilot(air, mission_id, scenario, seed, mode=mode, deadline_ms=DEADLINE_MS, probe=ground)
         ground.put_mission(mission_id, pilot.spec)
         flight = fly(site, pilot, seed)
         ground.delete_mission(mission_id)
