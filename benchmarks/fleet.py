@@ -33,7 +33,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from simulator.client import EdgeClient
-from simulator.demo import HOST, edge_process, usable_port
+from simulator.flying.local_edge import HOST, edge_process, usable_port
 
 UAVS, SENSORS = 3, 10
 GOAL_KB = 200.0

@@ -13,18 +13,22 @@ from typing import Any
 
 from paper_template import EXPERIENCES, Newest, PaperTemplate
 
-from service.candidates import GuidedTemplate, Offer
-from service.critic import Situation
-from service.guided import offered
-from service.llm.bodies import chat_body, label_body
-from service.mission import Mission
-from service.prompt import Prompt
-from service.settings import Settings
-from service.view import View
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.deliberation import candidates_of
+from service.deciding.rollout_evaluator import RolloutState
+from service.llm.request_bodies import chat_body, label_body
+from service.mission.mission import Mission
+from service.prompting.candidates import CandidateSet
+from service.prompting.guided_prompt import GuidedTemplate
+from service.prompting.prompt import Prompt
+from shared.actions import Action
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, PromptStyle
-from simulator.mission import Choice, LocalPilot, decide_request, fly
-from simulator.site import Site
+from simulator.client.observation_report import decide_request
+from simulator.flying.flight import fly
+from simulator.flying.pilots import Choice, LocalPilot
+from simulator.sites.site import Site
 from simulator.world import Observation
 
 GUIDED, LLM, LLM_ALL, LLM_30, PAPER = "guided", "llm", "llm_no_attention", "llm_30", "paper"
@@ -46,7 +50,7 @@ class Put:
 
     prompt: Prompt
     sensors: list[int]
-    offer: Offer | None = None
+    offer: CandidateSet | None = None
 
     def body(self, velocities: int) -> dict[str, Any]:
         """The request to the embedded LLM, as the edge would send it."""
@@ -64,7 +68,7 @@ class Asked:
     step: int
     uav: int
     ways: dict[str, Put]
-    situation: Situation
+    situation: RolloutState
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ class Scribe(LocalPilot):
         self._missions = missions(scenario, seed)
         self._owed: dict[int, Outcome] = {}
         self._decided: dict[int, str] = {}
-        self._step: dict[int, tuple[Offer, View]] = {}
+        self._step: dict[int, tuple[CandidateSet, AttendedState]] = {}
         self.asked: list[Asked] = []
         self.together: list[Together] = []
 
@@ -103,32 +107,31 @@ class Scribe(LocalPilot):
         self._decided[uav] = name = uuid.uuid4().hex
         request = decide_request(uav, observation, "flown", outcome=self._owed.pop(uav, None))
         ways: dict[str, Put] = {}
-        situation: Situation | None = None
+        situation: RolloutState | None = None
         for way, mission in self._missions.items():
             if request.outcome is not None:
                 mission.apply(request.outcome)
             attempt = mission.observe(request, step)
-            view = View.of(mission, request, step)
-            view.attend(mission)
+            view = AttendedState.of(mission, request, step)
             if view.rows:
                 ways[way] = self._put(mission, view)
             if way == GUIDED:
                 reserved = mission.reserved(step, uav)
-                situation = Situation.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
-            mission.commit(view.pending(mission, name, choice.sensor, choice.velocity), attempt)
+                situation = RolloutState.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
+            mission.commit(view.pending(name, Action(choice.sensor, choice.velocity)), attempt)
         if situation is not None and len(ways) == len(self._missions):
             self.asked.append(Asked(self._seed, step, uav, ways, situation))
         return choice
 
-    def _put(self, mission: Mission, view: View) -> Put:
-        shown, nearest = view.shown(mission), view.nearest(mission)
+    def _put(self, mission: Mission, view: AttendedState) -> Put:
+        shown, nearest = view.shown(), view.similar_experiences()
         if not isinstance(mission.template, GuidedTemplate):
-            return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.offered)
-        offer = offered(mission, view)
+            return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.kept_ids)
+        offer = candidates_of(view)
         self._note(mission, mission.template, view, offer)
-        return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.offered, offer)
+        return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.kept_ids, offer)
 
-    def _note(self, mission: Mission, template: GuidedTemplate, view: View, offer: Offer) -> None:
+    def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
         self._step[view.uav_id] = offer, view
         if len(self._step) == mission.scenario.uavs:

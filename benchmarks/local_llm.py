@@ -10,10 +10,10 @@ from typing import Any, Self
 
 import httpx
 
+from service.config.settings import Settings
 from service.llm.embedded import EmbeddedServer
-from service.model import embedded_model
-from service.prompt import Prompt
-from service.settings import Settings
+from service.llm.model_file import embedded_model
+from service.prompting.prompt import Prompt
 
 # Of a call that may take longer, only that it took so long is known.
 LIMIT_S = 120.0

@@ -21,11 +21,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from service.compiler import understood
-from service.llm.answer import NoDecision
-from service.llm.servers import Servers
-from service.orders import BadOrders, number_of, read, shown
-from service.settings import Settings
+from service.config.settings import Settings
+from service.guidance.note_compiler import understood
+from service.guidance.note_orders import BadOrders, number_of, read, shown
+from service.llm.answer_format import NoDecision
+from service.llm.server_pool import ServerPool
+from service.prompting.warm_up import warm_up
 from shared.guidance import Guidance, Impossible
 from shared.scenario import SCENARIOS
 
@@ -57,7 +58,7 @@ class Understood:
 
 async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
     """The LLM's name and what was made of each note."""
-    upstream = Servers(Settings(mode="llm"))
+    upstream = ServerPool(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
     while upstream.status == "loading":
         await asyncio.sleep(0.2)

@@ -38,8 +38,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from simulator.demo import HOST, usable_port
 from simulator.experiments.intervals import paired
+from simulator.flying.local_edge import HOST, usable_port
 
 LITELLM = "litellm[proxy]==1.106.2"
 FLEET, SENSORS = 3, 10

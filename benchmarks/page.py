@@ -23,7 +23,7 @@ import tyro
 from playwright.sync_api import CDPSession, Page, sync_playwright
 from rich.console import Console
 
-from simulator.demo import HOST, usable_port
+from simulator.flying.local_edge import HOST, usable_port
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 UPDATES_A_SECOND = 10

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.experiences import Experiences
-from service.prompt import Prompt, Template
-from service.rows import UNKNOWN, Cells
-from service.uncompressed import Uncompressed
+from service.prompting.experiences import Experiences
+from service.prompting.prompt import Prompt, Template
+from service.prompting.row_formats import UNKNOWN, Cells
+from service.prompting.unpruned_baseline import Uncompressed
 from shared.features import State
 from shared.scenario import Scenario
 

@@ -41,11 +41,12 @@ from shared.missions import MissionAttention
 from shared.scenario import Scenario
 from shared.wire import DecideRequest, MissionSpec, Mode, Outcome, Uplink
 from simulator.client import EdgeClient
-from simulator.demo import HOST, edge_process, usable_port
-from simulator.mission import Choice, EdgePilot, fly
-from simulator.pruning import PrunedReports
-from simulator.reports import DeltaReports
-from simulator.site import Site
+from simulator.client.pruned_reports import PrunedReports
+from simulator.client.report_encoders import DeltaReports
+from simulator.flying.flight import fly
+from simulator.flying.local_edge import HOST, edge_process, usable_port
+from simulator.flying.pilots import Choice, EdgePilot
+from simulator.sites.site import Site
 from simulator.world import Observation
 
 GOALS = {"share_1000_to_10": 3.0, "share_10000_to_10": 40.0, "memory_mb": 200.0}

@@ -38,7 +38,7 @@ from rich.progress import Progress
 from scipy import stats
 
 from simulator.client import EdgeClient
-from simulator.demo import HOST, usable_port
+from simulator.flying.local_edge import HOST, usable_port
 
 MISSIONS, UAVS, SENSORS = 200, 3, 10
 # Outcomes of each mission before it is measured, by mode.

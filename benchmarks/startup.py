@@ -35,7 +35,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from service.openapi import STATE
+from service.api.openapi_examples import STATE
 
 GOAL_RATIO, GOAL_HELP_S = 1.5, 0.3
 AICVDS = str(Path(sys.executable).with_name("aicvds"))

@@ -34,10 +34,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from service.critic import Action, judge
-from service.llm.answer import NoDecision, check_answer
-from service.settings import Settings
-from service.tokens import TokenCounter
+from service.config.settings import Settings
+from service.deciding.rollout_evaluator import judge
+from service.llm.answer_format import NoDecision, check_answer
+from service.prompting.token_accounting import TokenCounter
+from shared.actions import Action
 from shared.scenario import Scenario, scenario_named
 from simulator.experiments.intervals import interval, paired
 
@@ -216,7 +217,7 @@ def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list
     for rows in zip(*answers.values(), strict=True):
         asked = rows[0].asked
         levels = scenario.max_velocity + 1
-        actions = [(sensor, v) for sensor in asked.ways[PAPER].sensors for v in range(levels)]
+        actions = [Action(sensor, v) for sensor in asked.ways[PAPER].sensors for v in range(levels)]
         said = {way: action(way, asked, one.answered, levels) for way, one in zip(answers, rows, strict=True)}
         judgement = judge(asked.situation, [*actions, *(one for one in said.values() if one is not None)])
         best, drawn = judgement.lost.min(), judgement.lost[: len(actions)].mean()

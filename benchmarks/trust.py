@@ -23,23 +23,22 @@ import uvicorn
 from rich.console import Console
 from rich.progress import track
 
-from service.app import create_app
-from service.asking import Asking, Word, by_action
-from service.candidates import Offer
-from service.critic import Action
-from service.engine import Engine
-from service.llm.servers import Servers
-from service.metrics import Metrics
-from service.mission import Mission
-from service.prompt import Prompt
-from service.settings import Settings
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.deciding.deadline import Deadline
+from service.deciding.llm_query import LlmAdvice, by_action
+from service.edge.engine import Engine
+from service.mission.mission import Mission
+from service.prompting.candidates import CandidateSet
+from service.prompting.prompt import Prompt
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Mode
 from simulator.client import EdgeClient
 from simulator.experiments.intervals import interval, paired
-from simulator.mission import Choice, EdgePilot, fly
+from simulator.flying.flight import fly
+from simulator.flying.pilots import Choice, EdgePilot
 from simulator.policies.mpc import RecedingHorizon
-from simulator.site import Site
+from simulator.sites.site import Site
 from simulator.world import Observation
 
 GOAL = 1.10
@@ -61,21 +60,20 @@ class Trusted:
     """Where to write the figures."""
 
 
-class Echo(Asking):
-    """Asks nobody: its word is for ``answer``, or the nearest to it that is offered."""
+class Echo:
+    """An LLM's advice without an LLM: for ``answer``, or for the candidate nearest to it."""
 
-    def __init__(self, llm: Servers, metrics: Metrics) -> None:
-        super().__init__(llm, metrics, most=64)
-        self.answer: Action = (0, 0)
+    def __init__(self) -> None:
+        self.answer: tuple[int, int] = (0, 0)
 
-    async def word(self, mission: Mission, offer: Offer, prompt: Prompt, deadline: float) -> Word:
+    async def ask(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Nearly sure of the velocity nearest to the answer's for its sensor; of the first letter without it."""
         sensor, velocity = self.answer
         letters = list(offer.labels)
         there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
         said = min(there, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
         told = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == said) for letter in letters}
-        return Word(prompt, by_action(offer, told), None, None, calibrated=False, model=self._llm.model)
+        return LlmAdvice(prompt, by_action(offer, told), None, None, calibrated=False, model=None)
 
 
 class Pilot(EdgePilot):
@@ -134,7 +132,9 @@ def main(args: Trusted) -> int:
     lost: dict[str, list[int]] = {"planner": [], "echo": []}
     trust: list[list[float]] = []
     with edge() as (url, engine):
-        engine.asking = echo = Echo(engine._llm, engine._metrics)
+        echo = Echo()
+        # In the place of the method that asks an LLM about one UAV.
+        setattr(engine.queries, "ask", echo.ask)  # noqa: B010
         for seed in track(seeds, "Flying", console=console):
             lost["planner"].append(flown(url, site, seed, echo, "policy")[0])
             total, weights = flown(url, site, seed, echo, "guided")

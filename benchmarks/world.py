@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from shared.scenario import Scenario, scenario_named
-from simulator.vector import Draw, VectorWorld
 from simulator.world import PipelineWorld
+from simulator.world.batch import Draw, VectorWorld
 
 GOAL_BATCH, GOAL_SINGLE = 300_000, 5_000
 

@@ -14,6 +14,7 @@ from shared.scenario import Scenario
 _SPEED_OF_LIGHT = 299_792_458.0
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 def path_loss_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:

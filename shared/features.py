@@ -55,6 +55,13 @@ class State:
         """Share of the sensors heard that are expected to overflow before their next visit, 0..1; 0 of none."""
         return float(self.overflow[self.heard].mean()) if self.heard.any() else 0.0
 
+    def reach_ahead(self, uav_id: int, scenario: Scenario) -> Reach:
+        """The UAV's reach after the next step, in any preset; preset ``reach`` has it already."""
+        if self.reach is not None:
+            return self.reach
+        ahead = distances_ahead(uav_id, self.position, self.progress_m, self.places, scenario)
+        return Reach.of(ahead, np.where(self.able, self.queue, 0.0), self.urgency, scenario)
+
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """What attention sees of the admissible sensors, ``(n, d)``, each number 0..1.
 

@@ -13,10 +13,11 @@ from typing import Any
 import httpx
 import pytest
 
-from service.app import create_app
-from service.settings import Settings
-from service.store import Store
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.storage.store import Store
 from tests.running import serving
+from tests.waiting import PATIENCE_S
 
 # Edges that are started as processes keep nothing, unless a test says so: they would share the user's store.
 os.environ["AICVDS_STORE"] = "none"
@@ -29,16 +30,27 @@ _PROGRAMS = ("chromium", "prometheus")
 Edge = Callable[..., httpx.Client]
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer waits for a slow disk as long as it takes, unless a test says otherwise."""
+    monkeypatch.setattr("service.edge.engine._STORE_S", PATIENCE_S)
+
+
 @pytest.fixture
 def edge(tmp_path: Path) -> Iterator[Edge]:
-    """Starts real edges with stores and the settings given (no LLM unless told), and returns a client of each."""
+    """Starts real edges with stores and the settings given (no LLM unless told), and returns a client of each.
+
+    The deadline is far unless told: a busy machine must not decide what a decision is.
+    """
     count = itertools.count()
     with ExitStack() as stack:
 
         def start(**settings: Any) -> httpx.Client:
             store = Store(str(tmp_path / f"missions-{next(count)}.db"))
-            url = stack.enter_context(serving(create_app(Settings(**{"mode": "value", **settings}), store)))
-            return stack.enter_context(httpx.Client(base_url=url, timeout=30))
+            url = stack.enter_context(
+                serving(create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), store))
+            )
+            return stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S))
 
         yield start
 

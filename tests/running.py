@@ -11,7 +11,8 @@ from contextlib import contextmanager
 import uvicorn
 from starlette.types import ASGIApp
 
-from service.heads import BoundedHeads
+from service.server.connection_limits import BoundedHttpProtocol
+from tests.waiting import PATIENCE_S
 
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 
@@ -19,7 +20,7 @@ Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]
 @contextmanager
 def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
     """The application under a real uvicorn, with the edge's bounds on heads; yields its base URL."""
-    config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", http=BoundedHeads, ws="none")
+    config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", http=BoundedHttpProtocol, ws="none")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
@@ -32,7 +33,7 @@ def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
         yield f"http://127.0.0.1:{port}"
     finally:
         server.should_exit = True
-        thread.join(timeout=30)
+        thread.join(PATIENCE_S)
 
 
 @contextmanager
@@ -66,10 +67,10 @@ def listening(handler: Handler) -> Iterator[str]:
     stop = asyncio.Event()
     thread = threading.Thread(target=lambda: loop.run_until_complete(until_stopped()), daemon=True)
     thread.start()
-    started.wait(timeout=10)
+    assert started.wait(PATIENCE_S)
     try:
         yield address[0]
     finally:
         loop.call_soon_threadsafe(stop.set)
-        thread.join(timeout=10)
+        thread.join(PATIENCE_S)
         loop.close()

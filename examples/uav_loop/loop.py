@@ -15,8 +15,8 @@ from shared.scenario import Point, Scenario
 from shared.trajectory import trajectories
 from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Outcome
 from simulator.client import AsyncEdgeClient, EdgeError, EdgeRefused, Exchange
-from simulator.mission import decide_request
-from simulator.policies import policy_named
+from simulator.client.observation_report import decide_request
+from simulator.policies.registry import policy_named
 from simulator.world import Observation
 
 DEADLINE_MS = 3000

@@ -11,7 +11,7 @@ import numpy as np
 from examples.uav_loop.vehicle import Beacon, Collected, LocalFrame, Vehicle
 from shared.channel import FloatArray, channel_gain_db, link_holds, packets_per_step, rate_bps
 from shared.scenario import Point, Scenario
-from simulator.sensors import Sensors, Streams
+from simulator.world.sensors import Sensors, Streams
 
 GROUND_ABOVE_SEA_M = 1850.0
 ENDURANCE_S = 1500.0

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
 from collections.abc import Collection, Mapping, Sequence
 
-from service.llm.answer import NoDecision, check_labels
+from service.llm.answer_format import NoDecision, check_labels
 from service.llm.completion import Completion
-from service.llm.servers import Servers
+from service.llm.server_pool import ServerPool
+from shared.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ _KEPT = 64
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
 # The model, the static block, and how many lists of labels.
-_Asked = tuple[str | None, str, int]
+_Question = tuple[str | None, str, int]
 
 
 def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
@@ -76,10 +76,10 @@ class LabelReader:
     One question may have several lists of labels, of each of which the answer is to name one.
     """
 
-    def __init__(self, llm: Servers) -> None:
+    def __init__(self, llm: ServerPool) -> None:
         self._llm = llm
-        self._bias: OrderedDict[_Asked, list[dict[str, float]]] = OrderedDict()
-        self._attempts: dict[_Asked, int] = {}
+        self._bias = BoundedDict[_Question, list[dict[str, float]]](_KEPT)
+        self._attempts: dict[_Question, int] = {}
         self._task: asyncio.Task[None] | None = None
 
     def bias(self, model: str | None, static: str, lists: int = 1) -> list[dict[str, float]] | None:
@@ -118,7 +118,7 @@ class LabelReader:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
-    async def _measure(self, key: _Asked, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
+    async def _measure(self, key: _Question, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
             async with asyncio.timeout(_TIMEOUT_S):
                 answers = [await self.ask(key[1], text, lists) for text in texts]
@@ -133,8 +133,6 @@ class LabelReader:
             {label: sum(answer[at][label] for answer in told) / len(told) for label in labels}
             for at, labels in enumerate(lists)
         ]
-        while len(self._bias) > _KEPT:
-            self._bias.popitem(last=False)
         if len(self._attempts) > 16 * _KEPT:
             self._attempts.clear()
 

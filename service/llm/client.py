@@ -10,8 +10,8 @@ import aiohttp
 import httpx
 from yarl import URL
 
-from service.llm.answer import NoDecision
-from service.llm.bounded import BoundedConnector, allowing
+from service.llm.answer_format import NoDecision
+from service.llm.bounded_connections import BoundedConnector, allowing
 from service.llm.completion import Completion, NotUnderstood, Unreachable, places_of
 
 # No honest chat completion of two integers comes near this; an endless body must not fill the memory.

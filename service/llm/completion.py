@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from service.llm.answer import NoDecision
-from service.llm.bodies import TOLD_TOKENS
+from service.llm.answer_format import NoDecision
+from service.llm.request_bodies import TOLD_TOKENS
 
 _MOST_PLACES = 256
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from shared.fleetplan.belief import FleetBelief
 from shared.fleetplan.greedy import look_ahead
-from shared.fleetplan.problem import Course, FleetProblem, IntArray, fly, price
+from shared.fleetplan.problem import Course, FleetProblem, fly, price
 from shared.fleetplan.receding import Draft, RecedingHorizon
 from shared.fleetplan.risk import neglect
 from shared.fleetplan.solver import Budget, Interrupted, News, Plan, least_loss, plan
@@ -15,7 +15,6 @@ __all__ = [
     "Draft",
     "FleetBelief",
     "FleetProblem",
-    "IntArray",
     "Interrupted",
     "News",
     "Plan",

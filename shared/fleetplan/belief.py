@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray, Links, packets_per_step
+from shared.channel import FloatArray, IntArray, Links, packets_per_step
 from shared.scenario import Point, Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
-IntArray = NDArray[np.int64]
 # Sensors, by index.
 Which = slice | list[int]
 # Out of reach of everything.

@@ -29,8 +29,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from ortools.sat.python import cp_model
 
-from shared.channel import packets_per_step, rate_bps
-from shared.fleetplan.problem import Course, FleetProblem, IntArray, fly
+from shared.channel import IntArray, packets_per_step, rate_bps
+from shared.fleetplan.problem import Course, FleetProblem, fly
 
 # Booleans that serve a sensor in a step, and the packets that each moves.
 Visits = list[tuple[Any, int]]

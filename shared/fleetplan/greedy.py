@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, packets_per_step
-from shared.fleetplan.problem import FleetProblem, IntArray
+from shared.channel import FloatArray, IntArray, packets_per_step
+from shared.fleetplan.problem import FleetProblem
 from shared.fleetplan.risk import normal_below
 from shared.scenario import Scenario
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, link_holds, packets_per_step, rate_bps
+from shared.channel import FloatArray, IntArray, link_holds, packets_per_step, rate_bps
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.channel import IntArray
 from shared.fleetplan.belief import FAR_M, FleetBelief
 from shared.fleetplan.greedy import look_ahead
-from shared.fleetplan.problem import FleetProblem, IntArray, price
+from shared.fleetplan.problem import FleetProblem, price
 from shared.fleetplan.risk import neglect
 from shared.fleetplan.solver import Budget, Plan, plan
 from shared.guidance import NO_GUIDANCE, Guidance

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from shared.channel import IntArray
 from shared.fleetplan.greedy import look_ahead
-from shared.fleetplan.problem import FleetProblem, IntArray, fly, price
+from shared.fleetplan.problem import FleetProblem, fly, price
 
 # OR-Tools takes a second to import, and only planning needs it.
 if TYPE_CHECKING:

@@ -1,9 +1,9 @@
-"""What is decided from: the paper's features or also what comes in reach, each UAV's reports or the fleet's belief."""
+"""Ablation of the modules' inputs: features of the paper or with reach, each UAV's reports or the fleet's belief."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import OFF, Scheme, llm, over_edge, value, value_as_written
 
 
@@ -25,9 +25,9 @@ EXPERIMENT = Experiment(
     summary="the paper's features, those of an edge that knows the trajectory (reach), and the fleet's belief",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "velocity", "llm_decided_pct"),
-    drawings=(
-        Drawing("ablation_features", "curves", LOSS_CURVES, "Losses by the features that the modules see."),
-        Drawing(
+    figures=(
+        FigureSpec("ablation_features", "curves", LOSS_CURVES, "Losses by the features that the modules see."),
+        FigureSpec(
             "ablation_features_totals", "bars", LOSSES, "Losses of a mission by the features that the modules see."
         ),
     ),

@@ -1,11 +1,11 @@
-"""What of the prompt carries the decision: the rows' format, their order, the experiences."""
+"""Ablation of the prompt: the rows' format, their order, and the experiences."""
 
 from __future__ import annotations
 
 from itertools import product
 
 from simulator.experiments.measures import LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import Scheme, over_edge
 
 _FORMATS, _ORDERS, _EXPERIENCES = ("csv", "json", "markdown"), ("score", "shuffled"), (0, 6, 30)
@@ -20,7 +20,7 @@ def _scheme(form: str, order: str, experiences: int) -> Scheme:
 
 def _schemes(setup: Setup) -> list[Scheme]:
     cells = product(_FORMATS, _ORDERS, _EXPERIENCES)
-    # In a quick run only those that differ from the base in one thing.
+    # A quick run has only the schemes that differ from the base in one option.
     return [_scheme(*cell) for cell in cells if not setup.quick or _differences(cell) <= 1]
 
 
@@ -34,9 +34,9 @@ EXPERIMENT = Experiment(
     summary="rows as CSV, JSON, Markdown; best first or shuffled; 0, 6, 30 experiences",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "state_tokens", "prompt_tokens", "rtt_p50", "llm_decided_pct"),
-    drawings=(
-        Drawing("ablation_prompt", "bars", LOSSES, "Losses by the rows' format, their order, and experiences kept."),
-        Drawing("ablation_prompt_cost", "bars", ("prompt_tokens", "rtt_p50"), "What each prompt costs."),
+    figures=(
+        FigureSpec("ablation_prompt", "bars", LOSSES, "Losses by the rows' format, their order, and experiences kept."),
+        FigureSpec("ablation_prompt_cost", "bars", ("prompt_tokens", "rtt_p50"), "What each prompt costs."),
     ),
     reference="_".join(map(str, _BASE)),
     notes=("Mode llm, k = 5. Experiences are those kept at most; the older half is dropped when there are more.",),

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from simulator.experiments.plan import Drawing, Experiment
+from simulator.experiments.plan import Experiment, FigureSpec
 from simulator.experiments.schemes import every_scheme
 
 _AGES = ("aoi_mean", "aoi_peak", "aoi_worst")
-
-
 EXPERIMENT = Experiment(
     name="aoi",
     title="Age of information",
     summary="mean and peak age of information a sensor, with the nearest-neighbour baseline",
     schemes=lambda setup: every_scheme(),
     measures=(*_AGES, "lost_packets", "events"),
-    drawings=(
-        Drawing("aoi", "curves", ("aoi_per_step",), "Age of information, mean over the sensors."),
-        Drawing("aoi_totals", "bars", ("aoi_mean", "aoi_peak"), "Mean and peak age of information of a mission."),
+    figures=(
+        FigureSpec("aoi", "curves", ("aoi_per_step",), "Age of information, mean over the sensors."),
+        FigureSpec("aoi_totals", "bars", ("aoi_mean", "aoi_peak"), "Mean and peak age of information of a mission."),
     ),
     reference="nearest",
     paired_measures=("aoi_mean", "aoi_peak", "lost_packets"),

@@ -1,9 +1,9 @@
-"""With and without attention (the paper finds no significant difference in what is lost)."""
+"""With and without attention (the paper finds no significant difference in losses)."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import Scheme, llm, over_edge, value_as_written
 
 
@@ -23,9 +23,9 @@ EXPERIMENT = Experiment(
     summary="mode llm with attention (k = 5) and without, from the shipped and from a random start",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "state_tokens", "prompt_tokens", "llm_decided_pct"),
-    drawings=(
-        Drawing("attention", "curves", LOSS_CURVES, "With attention (k = 5) and without: what is lost."),
-        Drawing("attention_totals", "bars", LOSSES, "With attention (k = 5) and without: losses of a mission."),
+    figures=(
+        FigureSpec("attention", "curves", LOSS_CURVES, "With attention (k = 5) and without: what is lost."),
+        FigureSpec("attention_totals", "bars", LOSSES, "With attention (k = 5) and without: losses of a mission."),
     ),
     pairs=(
         ("llm", "llm_all"),

@@ -1,4 +1,7 @@
-"""Every experiment by name, in the order in which `all` makes them."""
+"""Every experiment by name, in the order of `all`: the paper's figures and tables, and those beyond it.
+
+Each experiment is one module of this room. Its flights are flown once and stored, and experiments share them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the paper states, and whether our results bear it out: rules with numbers in, verdicts out.
+"""The paper's claims, and rules that judge them by our results.
 
 A result of a quick run gets no verdict. "Zero" is as in ``evidence.settled_at``.
 """
@@ -25,7 +25,7 @@ from simulator.experiments.plots import label_of, measured
 from simulator.experiments.result import Interval, Paired, Result
 
 CLAIM_SEEDS = 30
-# Steps by which "zero at step 20" may be missed.
+# The tolerance of "zero at step 20" in steps.
 NEAR_STEPS = 4
 # The paper's numbers.
 OURS_ZERO_AT, HEURISTICS_ZERO_AT, MADQN_ZERO_AT = 4, 20, 27
@@ -36,7 +36,7 @@ LOSSES = {"lost_packets_per_step": "lost packets", "events_per_step": "loss even
 
 
 class Verdict(StrEnum):
-    """What can be said of a claim."""
+    """The verdict on a claim."""
 
     REPRODUCED = "reproduced"
     NOT_REPRODUCED = "not reproduced"
@@ -45,7 +45,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Judged:
-    """A rule's outcome: our numbers in words, the verdict, why, and the fewest seeds that it rests on."""
+    """A rule's outcome: our numbers in words, the verdict, its reason, and the smallest number of seeds behind it."""
 
     ours: str
     verdict: Verdict
@@ -55,7 +55,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class Claim:
-    """One of the paper's statements, in our words; the experiment that looks at it, and the rule that judges."""
+    """One of the paper's statements in our words, the experiment that tests it, and the rule that judges it."""
 
     stated: str
     experiment: str
@@ -64,7 +64,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Finding:
-    """A line of the verdict table. Without a ``verdict`` the claim was not judged, and ``why`` says why not."""
+    """A line of the verdict table; without a ``verdict`` the claim is not judged, for the reason ``why``."""
 
     stated: str
     experiment: str
@@ -76,12 +76,12 @@ class Finding:
 
     @property
     def few_seeds(self) -> bool:
-        """Whether it rests on fewer seeds than a claim should."""
+        """Whether it has fewer seeds than a claim needs."""
         return self.seeds is not None and self.seeds < CLAIM_SEEDS
 
 
 def judge(runs: Runs) -> list[Finding]:
-    """A finding for each of the paper's claims, whatever has been run."""
+    """A finding for each of the paper's claims, including those of experiments not run."""
     return [_finding(claim, runs) for claim in CLAIMS]
 
 
@@ -103,7 +103,7 @@ def _finding(claim: Claim, runs: Runs) -> Finding:
 
 
 def elsewhere(result: Result) -> str | None:
-    """Why these are not the paper's worlds and missions; ``None`` when they are."""
+    """The difference from the paper's worlds and missions; ``None`` if there is none."""
     paper = Scenario()
     if result.scenario != paper.name:
         return f"flown in scenario {result.scenario}"
@@ -113,7 +113,7 @@ def elsewhere(result: Result) -> str | None:
     return None
 
 
-def _told(found: Interval | Paired, digits: int = 1) -> str:
+def _text(found: Interval | Paired, digits: int = 1) -> str:
     return f"{found.mean:,.{digits}f} [{found.low:,.{digits}f}, {found.high:,.{digits}f}]"
 
 
@@ -125,7 +125,7 @@ _RANKING_ALONE = f"{_NO_BETTER}: this measures attention's ranking, not what an 
 
 
 def _zero_by(name: str, step: int, near: int | None) -> Callable[[Result, Runs], Judged]:
-    """``near``: how far from ``step`` on either side it may be; ``None`` for any step up to it."""
+    """The rule of a claim of zero by ``step``; with a tolerance ``near`` on either side, or before it if ``None``."""
 
     def rule(result: Result, runs: Runs) -> Judged:
         means = {label: _curve(result, name, measure) for measure, label in LOSSES.items()}
@@ -135,10 +135,10 @@ def _zero_by(name: str, step: int, near: int | None) -> Callable[[Result, Runs],
         if all(len(mean) <= step for mean in means.values()):
             return Judged(ours, Verdict.NOT_COMPARABLE, f"the missions end before step {step}", seeds)
         if near is None:
-            held = all(at is not None and at <= step for at in settled)
+            reached = all(at is not None and at <= step for at in settled)
         else:
-            held = all(at is not None and abs(at - step) <= near for at in settled)
-        if held:
+            reached = all(at is not None and abs(at - step) <= near for at in settled)
+        if reached:
             return Judged(ours, Verdict.REPRODUCED, "both losses are zero by then and stay so", seeds)
         return Judged(ours, Verdict.NOT_REPRODUCED, _why_not_zero(result, runs, name, step, settled), seeds)
 
@@ -187,7 +187,7 @@ def _loses_least(result: Result, runs: Runs) -> Judged:
     won = all(d.high < 0 for d in apart.values())
     if missing and won:
         raise Unmeasured(f"lost_packets of {', '.join(missing)}")
-    ours = "; ".join(f"to {label_of(result, name)} {_told(d)} packets" for name, d in apart.items())
+    ours = "; ".join(f"to {label_of(result, name)} {_text(d)} packets" for name, d in apart.items())
     seeds = seeds_flown(result, METHOD, *apart)
     if won:
         return Judged(ours, Verdict.REPRODUCED, "fewer than each, by paired intervals", seeds)
@@ -205,7 +205,7 @@ def _halved(what: str, measure: str, why_not: str) -> Callable[[Result, Runs], J
     def rule(result: Result, runs: Runs) -> Judged:
         name = _method_in(result)
         saved = interval_of(result, name, measure)
-        ours, seeds = f"{what} {_told(saved)} % shorter", seeds_flown(result, name)
+        ours, seeds = f"{what} {_text(saved)} % shorter", seeds_flown(result, name)
         stated = 100 * (1 - TOKENS_WITH / TOKENS_WITHOUT)
         if abs(saved.mean - stated) <= NEAR_SAVED_POINTS:
             why = f"within {NEAR_SAVED_POINTS:g} points of {stated:.0f} %"
@@ -218,8 +218,8 @@ def _halved(what: str, measure: str, why_not: str) -> Callable[[Result, Runs], J
 def _token_counts(result: Result, runs: Runs) -> Judged:
     name = _method_in(result)
     ours = "; ".join(
-        f"{what} {interval_of(result, name, whole).mean:.1f} to {interval_of(result, name, kept).mean:.1f}"
-        for what, whole, kept in (
+        f"{what} {interval_of(result, name, whole).mean:.1f} to {interval_of(result, name, sent).mean:.1f}"
+        for what, whole, sent in (
             ("prompt", "prompt_uncompressed", "prompt_tokens"),
             ("state block", "state_uncompressed", "state_tokens"),
         )
@@ -237,29 +237,31 @@ def _method_in(result: Result) -> str:
 
 def _fair(result: Result, runs: Runs) -> Judged:
     kinds = {"jain": "served", "jain_scheduled": "scheduled"}
-    found = {told: i for measure, told in kinds.items() if (i := measured(result, METHOD, measure))}
+    found = {kind: i for measure, kind in kinds.items() if (i := measured(result, METHOD, measure))}
     if not found:
         raise Unmeasured(f"jain of {METHOD}")
-    ours = "; ".join(f"visits {told} {_told(index, 3)}" for told, index in found.items())
+    ours = "; ".join(f"visits {kind} {_text(index, 3)}" for kind, index in found.items())
     seeds = seeds_flown(result, METHOD)
-    even = [told for told, index in found.items() if index.high >= JAIN - NEAR_JAIN]
+    even = [kind for kind, index in found.items() if index.high >= JAIN - NEAR_JAIN]
     if len(even) == len(found):
         return Judged(ours, Verdict.REPRODUCED, f"reaches {JAIN:.3f} to within {NEAR_JAIN:g}", seeds)
     if even:
         why = f"it holds for visits {even[0]} only, and the paper's statement does not say which it counts"
         return Judged(ours, Verdict.NOT_COMPARABLE, why, seeds)
-    known = [(index.mean, name) for name in result.schemes if (index := measured(result, name, "jain"))]
-    most = f"; the most even served here are {label_of(result, max(known)[1])}'s ({max(known)[0]:.3f})" if known else ""
+    served = [(index.mean, name) for name in result.schemes if (index := measured(result, name, "jain"))]
+    most = ""
+    if served:
+        most = f"; the most even served here are {label_of(result, max(served)[1])}'s ({max(served)[0]:.3f})"
     return Judged(ours, Verdict.NOT_REPRODUCED, f"visits are less even{most}", seeds)
 
 
-# --- what attention keeps
+# --- attention
 
 
 def _attention_harmless(result: Result, runs: Runs) -> Judged:
     without = "llm_all"
     apart = difference(result, METHOD, without, "lost_packets")
-    ours = f"with less without attention: {_told(apart)} packets"
+    ours = f"with less without attention: {_text(apart)} packets"
     seeds = seeds_flown(result, METHOD, without)
     if beats_chance(result, runs) is False:
         return Judged(ours, Verdict.NOT_COMPARABLE, _RANKING_ALONE, seeds)
@@ -287,19 +289,19 @@ def _more_is_no_better(result: Result, runs: Runs) -> Judged:
 
 
 def _against_five(
-    result: Result, runs: Runs, which: Callable[[int], bool], holds: Callable[[Paired], bool], so: str, but: str
+    result: Result, runs: Runs, which: Callable[[int], bool], agrees: Callable[[Paired], bool], so: str, but: str
 ) -> Judged:
     names = _by_k(result)
     others = {k: name for k, name in sorted(names.items()) if which(k)}
     if 5 not in names or not others:
         raise Unmeasured("lost packets at k=5 and at the k to compare")
     apart = {k: difference(result, name, names[5], "lost_packets") for k, name in others.items()}
-    ours = "; ".join(f"k={k} less k=5: {_told(d)} packets" for k, d in apart.items())
+    ours = "; ".join(f"k={k} less k=5: {_text(d)} packets" for k, d in apart.items())
     seeds = seeds_flown(result, names[5], *others.values())
     if beats_chance(result, runs) is False:
         return Judged(ours, Verdict.NOT_COMPARABLE, _RANKING_ALONE, seeds)
-    held = all(map(holds, apart.values()))
-    return Judged(ours, Verdict.REPRODUCED if held else Verdict.NOT_REPRODUCED, so if held else but, seeds)
+    reproduced = all(map(agrees, apart.values()))
+    return Judged(ours, Verdict.REPRODUCED if reproduced else Verdict.NOT_REPRODUCED, so if reproduced else but, seeds)
 
 
 CLAIMS: tuple[Claim, ...] = (

@@ -1,4 +1,4 @@
-"""The edges that an experiment flies against: started as needed, one at a time, with nothing inherited by chance."""
+"""The edges of an experiment: started as needed, one at a time, with a controlled environment."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ import httpx
 from rich.console import Console
 
 from shared.scenario import Scenario
-from simulator.client import EdgeClient, EdgeError
-from simulator.demo import HOST, check_alive, edge_process, usable_port
-from simulator.experiments.schemes import ASKED, CHANCE, OFF, WORST, Backing
+from simulator.client import EdgeClient
+from simulator.client.lossy_transport import LossyTransport
+from simulator.errors import EdgeError
+from simulator.experiments.schemes import CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
 from simulator.experiments.stand_ins import answering, drawn, worst
-from simulator.simulate import API_KEY
-from simulator.uplink import LossyTransport
+from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
+from simulator.flying.run import API_KEY
 
-# Settings that say how to reach the LLM or what this machine can bear. Every other one changes what is decided, and
-# a figure must not depend on what happens to be exported.
+# Settings for the machine's capacity and paths. Every other setting may change decisions, and a figure must not depend
+# on the user's environment.
 _INHERITED = {"AICVDS_LLM_THREADS", "AICVDS_LLM_CONTEXT", "AICVDS_CACHE_DIR"}
 _MODEL = "AICVDS_LLM_MODEL"
 _OF_A_SERVER = {_MODEL, "AICVDS_LLM_API_KEY"}
@@ -33,35 +34,35 @@ _DEFAULT_TIMEOUT_S = 65.0
 
 @dataclass(frozen=True)
 class Llm:
-    """What ``--llm``, ``--model`` and ``--edge`` say: where the LLM of the schemes that ask one is."""
+    """The LLM of the schemes that query one: ``option`` is ``--llm``, ``edge`` is ``--edge``."""
 
-    asked: str = "embedded"
+    option: str = "embedded"
     edge: str | None = None
 
     @property
     def embedded(self) -> bool:
-        """Whether it is the embedded one, on an edge started here."""
-        return self.asked == "embedded" and self.edge is None
+        """Whether it is the embedded LLM of an edge started here."""
+        return self.option == "embedded" and self.edge is None
 
     @property
-    def there(self) -> bool:
-        """Whether schemes that ask what ``--llm`` names can fly."""
-        return self.asked != "none" or self.edge is not None
+    def available(self) -> bool:
+        """Whether schemes with the LLM of ``--llm`` can fly."""
+        return self.option != "none" or self.edge is not None
 
     def identity(self, backing: Backing) -> str:
-        """What a flight's key says of the LLM: two of one identity answer alike."""
+        """The LLM in a flight's key; LLMs of one identity answer alike."""
         if backing in (OFF, CHANCE, WORST):
             return backing
-        if backing == ASKED:
+        if backing == NAMED_BY_OPTION:
             if self.edge is not None:
                 return f"edge {self.edge}"
-            return self.asked if self.embedded else f"{self.asked} {os.environ.get(_MODEL, '')}".strip()
+            return self.option if self.embedded else f"{self.option} {os.environ.get(_MODEL, '')}".strip()
         return f"{Path(backing).stem} {_sha256(Path(backing))[:16]}"
 
 
 @dataclass(frozen=True)
 class EdgeAt:
-    """An edge that is ready. ``alive`` raises :class:`EdgeError` with its log's end once its process has ended."""
+    """An edge that is ready. ``alive`` raises :class:`EdgeError` with the log's end if the edge's process has ended."""
 
     url: str
     model: str | None
@@ -70,12 +71,12 @@ class EdgeAt:
 
 @contextmanager
 def edge_for(backing: Backing, llm: Llm, log: Path, console: Console) -> Iterator[EdgeAt]:
-    """The edge that has what ``backing`` names behind it, started here and stopped on leaving; or ``--edge``'s.
+    """Within the context, run an edge with that backing, or use the edge of ``--edge``.
 
     Raises:
-        EdgeError: it died, is not ready in time, or has no LLM ready though it should have one.
+        EdgeError: the edge died, is not ready in time, or lacks a ready LLM that it needs.
     """
-    if backing == ASKED and llm.edge is not None:
+    if backing == NAMED_BY_OPTION and llm.edge is not None:
         with _ready(llm.edge, lambda: None, console) as (readiness_model, llm_state):
             _refuse_without_llm(backing, llm_state)
             yield EdgeAt(llm.edge, readiness_model, lambda: None)
@@ -95,24 +96,24 @@ def edge_for(backing: Backing, llm: Llm, log: Path, console: Console) -> Iterato
 
 @contextmanager
 def environment_for(backing: Backing, llm: Llm) -> Iterator[Mapping[str, str]]:
-    """The settings of an edge with that behind it, and of this process's only what cannot change a decision."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("AICVDS_") or k in _INHERITED}
-    # A mission a flight, and a full run has thousands of flights, none of which is gone back to.
-    kept |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning", "AICVDS_STORE": "none"}
-    # Mode llm as the paper writes it, unless a scheme says otherwise.
-    kept["AICVDS_VERIFY"] = "off"
+    """The environment of an edge with that backing; it inherits only settings that cannot change a decision."""
+    base = {k: v for k, v in os.environ.items() if not k.startswith("AICVDS_") or k in _INHERITED}
+    # A full run has thousands of flights with a mission each, and never returns to one.
+    base |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning", "AICVDS_STORE": "none"}
+    # Mode llm as in the paper, unless a scheme overrides it.
+    base["AICVDS_VERIFY"] = "off"
     if backing == OFF:
-        yield kept | {"AICVDS_MODE": "value"}
+        yield base | {"AICVDS_MODE": "value"}
     elif backing in (CHANCE, WORST):
         with answering(drawn if backing == CHANCE else worst) as url:
-            yield kept | {"AICVDS_LLM_URL": url}
-    elif backing != ASKED:
-        yield kept | {"AICVDS_LLM_GGUF": str(Path(backing).resolve())}
+            yield base | {"AICVDS_LLM_URL": url}
+    elif backing != NAMED_BY_OPTION:
+        yield base | {"AICVDS_LLM_GGUF": str(Path(backing).resolve())}
     elif llm.embedded:
-        yield kept
+        yield base
     else:
         of_a_server = {name: os.environ[name] for name in _OF_A_SERVER & os.environ.keys()}
-        yield kept | of_a_server | {"AICVDS_LLM_URL": llm.asked}
+        yield base | of_a_server | {"AICVDS_LLM_URL": llm.option}
 
 
 @contextmanager
@@ -134,7 +135,7 @@ def _refuse_without_llm(backing: Backing, state: str) -> None:
 
 
 def radio(url: str, deadline_ms: int | None, scenario: Scenario, seed: int) -> EdgeClient:
-    """The fleet's way to the edge, which loses requests where the scenario says so."""
+    """The client of the fleet's radio link to the edge, lossy if the scenario's uplink is."""
     transport = None
     if scenario.uplink_drop or scenario.uplink_jitter_ms:
         inner = httpx.HTTPTransport()

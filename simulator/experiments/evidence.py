@@ -1,4 +1,4 @@
-"""What results say when asked: how far two schemes are apart, when losses end, whether an LLM beats chance."""
+"""Evidence from results: the difference of two schemes, the end of losses, and whether an LLM beats chance."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ from simulator.experiments.plots import measured
 from simulator.experiments.result import Interval, Paired, Result
 from simulator.experiments.stand_ins import NAMES
 
-# In the mean over missions, a step.
+# The largest mean loss a step over missions that counts as zero.
 ZERO = 0.05
-# The paper's method among our schemes; who draws at random in the LLM's place, or, as a weaker test, the fleet's.
+# The paper's method among our schemes, and its references by chance: random draws in place of the LLM or, as a weaker
+# test, of the whole scheme.
 METHOD, CHANCE = "llm", ("llm_chance", "random")
 
 Runs = Mapping[str, Result]
 
 
 class Unmeasured(Exception):
-    """The results at hand lack what a rule needs; the text says what."""
+    """The results lack a number that a rule needs; the text names it."""
 
 
 def settled_at(means: Sequence[float]) -> int | None:
-    """The step from which on a curve stays at ``ZERO`` or less; ``None`` when it does not by its end."""
+    """The step from which on a curve stays at ``ZERO`` or less; ``None`` if it does not by its end."""
     late = [step for step, mean in enumerate(means) if mean > ZERO]
     settled = late[-1] + 1 if late else 0
     return settled if settled < len(means) else None
 
 
 def seeds_flown(result: Result, *names: str) -> int:
-    """The fewest seeds that any of the schemes flew."""
+    """The smallest number of seeds that one of the schemes flew."""
     return min(len(result.seeds_of.get(name, result.seeds)) for name in names)
 
 
 def flew_all(result: Result, name: str) -> bool:
-    """Whether a scheme flew every world of the result; the means of two that did not cannot be compared."""
+    """Whether a scheme flew every world of the result; means over different worlds cannot be compared."""
     return len(result.seeds_of.get(name, result.seeds)) == len(result.seeds)
 
 
@@ -64,7 +65,7 @@ def _by_seed(result: Result, name: str, measure: str) -> dict[int, float]:
 
 
 def interval_of(result: Result, name: str, measure: str) -> Interval:
-    """The scheme's interval of the measure; raises ``Unmeasured`` when there is none."""
+    """The scheme's interval of the measure; raises ``Unmeasured`` without one."""
     found = measured(result, name, measure)
     if found is None:
         raise Unmeasured(f"{measure} of {name}")
@@ -72,9 +73,9 @@ def interval_of(result: Result, name: str, measure: str) -> Interval:
 
 
 def beats_chance(result: Result, runs: Runs) -> bool | None:
-    """Whether what the LLM decides loses fewer packets than draws at random; ``None`` when nobody drew beside it.
+    """Whether the LLM's decisions lose fewer packets than random draws; ``None`` without a scheme by chance.
 
-    ``result`` itself is asked first, then the other runs of the same LLM.
+    The comparison is within ``result``, or else within another run of the same LLM.
     """
     beside = [run for run in runs.values() if _same_model(run, result) and (result.quick or not run.quick)]
     for chance in CHANCE:

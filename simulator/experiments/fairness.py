@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from simulator.experiments.plan import Drawing, Experiment
+from simulator.experiments.plan import Experiment, FigureSpec
 from simulator.experiments.schemes import every_scheme
 
 EXPERIMENT = Experiment(
@@ -11,9 +11,11 @@ EXPERIMENT = Experiment(
     summary="Jain's index of served visits for every scheme, random included",
     schemes=lambda setup: every_scheme(),
     measures=("jain", "jain_scheduled", "lost_packets", "events"),
-    drawings=(
-        Drawing("fairness", "bars", ("jain", "jain_scheduled"), "Jain's index of the sensors' visits."),
-        Drawing("fairness_and_loss", "bars", ("jain", "lost_packets"), "Jain's index, and the packets lost meanwhile."),
+    figures=(
+        FigureSpec("fairness", "bars", ("jain", "jain_scheduled"), "Jain's index of the sensors' visits."),
+        FigureSpec(
+            "fairness_and_loss", "bars", ("jain", "lost_packets"), "Jain's index, and the packets lost meanwhile."
+        ),
     ),
     reference="random",
     paired_measures=("jain", "jain_scheduled", "lost_packets"),

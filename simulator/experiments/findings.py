@@ -8,26 +8,27 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from io import StringIO
 
-from simulator.experiments.flight import Flown
+from simulator.errors import UsageError
+from simulator.experiments.flight import FlightRecord
 from simulator.experiments.intervals import METHOD, curve, interval, paired
-from simulator.experiments.measures import MEASURES, STEP_MEASURES, policys_instead
-from simulator.experiments.plan import Drawing, Experiment, Plan, Setup
+from simulator.experiments.measures import MEASURES, STEP_MEASURES, substituted_decisions
+from simulator.experiments.plan import Experiment, FigureSpec, Plan, Setup
 from simulator.experiments.result import Curve, Figure, Interval, Paired, Result
 from simulator.experiments.schemes import BOUND, OverEdge, Scheme
-from simulator.record import BadUse
 
-# Of one flight's decisions: a few late answers are the LLM's own weather, more are another method's result.
+# The largest share of substituted decisions without a note: a few late answers belong to the LLM, more of them make the
+# result another method's.
 _FEW_PCT = 3.0
 
 
 @dataclass(frozen=True)
 class Group:
-    """The flights of one scheme on one site, in order of their seeds; ``suffix`` tells sites apart in names."""
+    """The flights of one scheme on one site in order of their seeds; ``suffix`` marks the site in names."""
 
     scheme: Scheme
     site: str
     suffix: str
-    flights: list[Flown]
+    flights: list[FlightRecord]
 
     @property
     def seeds(self) -> list[int]:
@@ -36,21 +37,26 @@ class Group:
 
 
 def findings(
-    plan: Plan, setup: Setup, command: str, commit: str | None, load: Callable[[str], Flown | None], said: Sequence[str]
+    plan: Plan,
+    setup: Setup,
+    command: str,
+    commit: str | None,
+    load: Callable[[str], FlightRecord | None],
+    notes: Sequence[str],
 ) -> Result:
-    """The result of an experiment whose flights are all there, but for schemes that cannot fly.
+    """The result of an experiment from its stored flights; schemes that cannot fly have none.
 
     Args:
-        load: a flight by its key; ``None`` where the scheme could not fly.
-        said: notes of the run, such as why a scheme could not fly.
+        load: a flight by its key; ``None`` if the scheme could not fly.
+        notes: of the run, such as the reason why a scheme could not fly.
 
     Raises:
-        BadUse: no scheme flew at all.
+        UsageError: no scheme flew at all.
     """
     groups = _groups(plan, load)
     flying = [group for group in groups if group.scheme.name != BOUND.name]
     if not flying:
-        raise BadUse(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(said)}")
+        raise UsageError(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(notes)}")
     experiment, seeds = plan.experiment, max((group.seeds for group in flying), key=len)
     schemes, curves, lacking = _scores(experiment, flying)
     return Result(
@@ -69,10 +75,10 @@ def findings(
         curves=curves,
         paired=_paired(plan, flying, groups),
         sweep=experiment.sweep,
-        figures=[_figure(drawing, flying, seeds, command) for drawing in experiment.drawings],
-        labels=_labels(flying, experiment.measures, experiment.drawings),
+        figures=[_figure(spec, flying, seeds, command) for spec in experiment.figures],
+        labels=_labels(flying, experiment.measures, experiment.figures),
         seeds_of={group.scheme.name: group.seeds for group in flying if group.seeds != seeds},
-        notes=[*experiment.notes, *_notes(plan, setup, groups), *said, *lacking],
+        notes=[*experiment.notes, *_notes(plan, setup, groups), *notes, *lacking],
     )
 
 
@@ -94,9 +100,9 @@ def _once(bound: dict[str, Interval]) -> dict[str, Interval]:
     return {name: found for name, found in bound.items() if name in MEASURES}
 
 
-def _groups(plan: Plan, load: Callable[[str], Flown | None]) -> list[Group]:
+def _groups(plan: Plan, load: Callable[[str], FlightRecord | None]) -> list[Group]:
     sites = list(dict.fromkeys(planned.site_name for planned in plan.flights))
-    flights: dict[tuple[str, str], list[Flown]] = {}
+    flights: dict[tuple[str, str], list[FlightRecord]] = {}
     schemes = {planned.scheme.name: planned.scheme for planned in plan.flights}
     broken = set()
     for planned in plan.flights:
@@ -116,7 +122,7 @@ def _groups(plan: Plan, load: Callable[[str], Flown | None]) -> list[Group]:
 def _scores(
     experiment: Experiment, flying: Sequence[Group]
 ) -> tuple[dict[str, dict[str, Interval]], dict[str, dict[str, Curve]], list[str]]:
-    """Measures and curves by scheme, and notes on what is lacking."""
+    """Measures and curves by scheme, and notes on missing ones."""
     schemes: dict[str, dict[str, Interval]] = {}
     curves: dict[str, dict[str, Curve]] = {}
     lacking: list[str] = []
@@ -124,7 +130,7 @@ def _scores(
         found, missing = _measured(group, experiment.measures)
         schemes.setdefault(group.scheme.name, {}).update(found)
         lacking += missing
-        if drawn := _curves(group, experiment.drawings):
+        if drawn := _curves(group, experiment.figures):
             curves.setdefault(group.scheme.name, {}).update(drawn)
     return schemes, curves, lacking
 
@@ -133,25 +139,25 @@ def _measured(group: Group, measures: Sequence[str]) -> tuple[dict[str, Interval
     found, missing = {}, []
     for name in measures:
         values = [MEASURES[name].of(flight) for flight in group.flights]
-        there = [value for value in values if value is not None]
-        if len(there) == len(values):
-            found[name + group.suffix] = interval(there)
-        elif there:
+        present = [value for value in values if value is not None]
+        if len(present) == len(values):
+            found[name + group.suffix] = interval(present)
+        elif present:
             missing.append(
                 f"{group.scheme.label}: {MEASURES[name].label} is left out, for it has none on "
-                f"{len(values) - len(there)} of {len(values)} seeds."
+                f"{len(values) - len(present)} of {len(values)} seeds."
             )
     return found, missing
 
 
-def _curves(group: Group, drawings: Sequence[Drawing]) -> dict[str, Curve]:
-    names = [m for drawing in drawings if drawing.kind == "curves" for m in drawing.measures]
+def _curves(group: Group, figures: Sequence[FigureSpec]) -> dict[str, Curve]:
+    names = [m for spec in figures if spec.kind == "curves" for m in spec.measures]
     found = {}
     for name in names:
         rows = [STEP_MEASURES[name].of(flight) for flight in group.flights]
-        there = [row for row in rows if row is not None]
-        if len(there) == len(rows):
-            found[name + group.suffix] = curve(there)
+        present = [row for row in rows if row is not None]
+        if len(present) == len(rows):
+            found[name + group.suffix] = curve(present)
     return found
 
 
@@ -161,14 +167,14 @@ def _bound(groups: Sequence[Group]) -> dict[str, Interval]:
 
 
 def _paired(plan: Plan, flying: Sequence[Group], groups: Sequence[Group]) -> list[Paired]:
-    by_place = {(group.scheme.name, group.site): group for group in flying}
+    by_site = {(group.scheme.name, group.site): group for group in flying}
     reference = plan.experiment.reference
     pairs = [(g.scheme.name, reference) for g in flying if reference and g.scheme.name != reference]
     found: list[Paired] = []
     for name, other in dict.fromkeys([*pairs, *plan.experiment.pairs]):
         for site in dict.fromkeys(group.site for group in flying):
-            if (name, site) in by_place and (other, site) in by_place:
-                found += _pair(by_place[name, site], by_place[other, site], plan.experiment.paired_measures)
+            if (name, site) in by_site and (other, site) in by_site:
+                found += _pair(by_site[name, site], by_site[other, site], plan.experiment.paired_measures)
     for bound in (group for group in groups if group.scheme.name == BOUND.name):
         for group in flying:
             found += _over_bound(group, bound)
@@ -181,10 +187,10 @@ def _pair(group: Group, other: Group, measures: Sequence[str]) -> list[Paired]:
     found: list[Paired] = []
     for name in measures:
         values = [(MEASURES[name].of(a), MEASURES[name].of(b)) for a, b in both]
-        there = [(a, b) for a, b in values if a is not None and b is not None]
-        if there and len(there) == len(values):
-            ours, its = zip(*there, strict=True)
-            found += paired(group.scheme.name, other.scheme.name, name + group.suffix, ours, its)
+        present = [(a, b) for a, b in values if a is not None and b is not None]
+        if present and len(present) == len(values):
+            ours, others = zip(*present, strict=True)
+            found += paired(group.scheme.name, other.scheme.name, name + group.suffix, ours, others)
     return found
 
 
@@ -196,33 +202,33 @@ def _over_bound(group: Group, bound: Group) -> list[Paired]:
     return paired(group.scheme.name, BOUND.name, "lost_packets" + group.suffix, *zip(*ours, strict=True))
 
 
-def _figure(drawing: Drawing, flying: Sequence[Group], seeds: Sequence[int], command: str) -> Figure:
+def _figure(spec: FigureSpec, flying: Sequence[Group], seeds: Sequence[int], command: str) -> Figure:
     suffixes = list(dict.fromkeys(group.suffix for group in flying))
     flown = {len(group.seeds) for group in flying if group.scheme.asks_llm}
     fewer = f" ({', '.join(str(n) for n in sorted(flown))} for those that ask an LLM)" if flown - {len(seeds)} else ""
     return Figure(
-        name=drawing.name,
-        kind=drawing.kind,
-        measures=[measure + suffix for measure in drawing.measures for suffix in suffixes],
-        caption=f"{drawing.caption} Mean over {len(seeds)} seeds{fewer}, {flying[0].flights[0].steps} steps, with "
+        name=spec.name,
+        kind=spec.kind,
+        measures=[measure + suffix for measure in spec.measures for suffix in suffixes],
+        caption=f"{spec.caption} Mean over {len(seeds)} seeds{fewer}, {flying[0].flights[0].steps} steps, with "
         f"its {METHOD}. Made by `{command}`.",
     )
 
 
-def _labels(flying: Sequence[Group], measures: Sequence[str], drawings: Sequence[Drawing]) -> dict[str, str]:
+def _labels(flying: Sequence[Group], measures: Sequence[str], figures: Sequence[FigureSpec]) -> dict[str, str]:
     labels = {group.scheme.name: group.scheme.label for group in flying}
-    shown = dict.fromkeys([*measures, *(m for drawing in drawings for m in drawing.measures)])
+    shown = dict.fromkeys([*measures, *(m for spec in figures for m in spec.measures)])
     for group in flying:
-        place = f", {group.site}" if group.suffix else ""
+        where = f", {group.site}" if group.suffix else ""
         for name in shown:
-            known = MEASURES.get(name) or STEP_MEASURES[name]
-            labels[name + group.suffix] = known.label + place
+            measure = MEASURES.get(name) or STEP_MEASURES[name]
+            labels[name + group.suffix] = measure.label + where
     return labels
 
 
 def _model(flying: Sequence[Group]) -> str | None:
-    asked = [f.model for group in flying if group.scheme.asks_llm for f in group.flights if f.model]
-    return ", ".join(dict.fromkeys(asked)) or None
+    models = [f.model for group in flying if group.scheme.asks_llm for f in group.flights if f.model]
+    return ", ".join(dict.fromkeys(models)) or None
 
 
 def _notes(plan: Plan, setup: Setup, groups: Sequence[Group]) -> list[str]:
@@ -233,9 +239,9 @@ def _notes(plan: Plan, setup: Setup, groups: Sequence[Group]) -> list[str]:
             f"Quick run: missions of {steps} steps, few seeds. It shows that the figure can be made, not what it says."
         )
     if plan.left_out:
-        told = ", ".join(scheme.label for scheme in plan.left_out)
-        why = "by --quick, whose missions with an LLM would be too short for it" if setup.llm.there else "by --llm none"
-        notes.append(f"Left out {why}: {told}.")
+        labels = ", ".join(scheme.label for scheme in plan.left_out)
+        short = "by --quick, whose missions with an LLM would be too short for it"
+        notes.append(f"Left out {short if setup.llm.available else 'by --llm none'}: {labels}.")
     for group in groups:
         notes += _doubts(group)
     notes += _below_bound(groups)
@@ -264,7 +270,7 @@ def _below_bound(groups: Sequence[Group]) -> list[str]:
 def _doubts(group: Group) -> list[str]:
     notes = []
     decisions = sum(len(flight.decisions) for flight in group.flights)
-    instead = sum(policys_instead(flight) for flight in group.flights)
+    instead = sum(substituted_decisions(flight) for flight in group.flights)
     if group.scheme.is_answered and 100 * instead > _FEW_PCT * decisions:
         reasons = sorted(
             {d.reason for f in group.flights for d in f.decisions if d.reason and d.reason != "no_candidate"}

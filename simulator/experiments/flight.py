@@ -1,4 +1,4 @@
-"""A flight: one scheme on one world, as an experiment keeps it, and the folder where flights are kept."""
+"""A stored flight of one scheme on one world, and the folder of stored flights."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from typing import Any
 
 from shared.guidance import Guidance, GuidanceState
 from simulator.experiments.schemes import Scheme
-from simulator.record import Record, naming_out
-from simulator.site import Site
+from simulator.records.record import Record
+from simulator.records.run_folder import naming_out
+from simulator.sites.site import Site
 
-# Part of every key: raise it when what a flight keeps, or means, changes.
+# Part of every key: increment it when the content or the meaning of a stored flight changes.
 FORMAT = 1
 _TORN_S = 3600.0
 
 
-class Counted(Record):
+class TokenCounts(Record):
     """Token counts of one decision; see ``shared.wire.Tokens``."""
 
     prompt: int
@@ -33,8 +34,8 @@ class Counted(Record):
     completion: int | None = None
 
 
-class Decided(Record):
-    """One decision and what came of it; the last four are ``None`` or empty of a decision without an edge."""
+class DecisionRecord(Record):
+    """One decision and its outcome; the last four fields are ``None`` or empty for a decision without an edge."""
 
     step: int
     uav: int
@@ -44,13 +45,13 @@ class Decided(Record):
     collected: int
     source: str
     reason: str | None = None
-    tokens: Counted | None = None
+    tokens: TokenCounts | None = None
     rtt_ms: float | None = None
     latency_ms: dict[str, float] = {}
 
 
 class BoundFound(Record):
-    """The clairvoyant bound of one world, packets; see ``simulator.bound``."""
+    """The clairvoyant bound of one world, packets; see ``simulator.flying.clairvoyant_bound``."""
 
     lower_bound: float
     lost_packets: int
@@ -58,11 +59,11 @@ class BoundFound(Record):
     gap: float
 
 
-class Flown(Record):
+class FlightRecord(Record):
     """One flight. ``failures``, ``overflows`` and ``lost_packets`` have one entry a step.
 
-    Of the bound the lists are empty and ``bound`` is there. ``commit`` is the code's that flew it. Where an operator
-    asked for something, ``meant`` is what, and ``guidance`` how the edge took it.
+    For the bound the lists are empty and ``bound`` is set. ``commit`` is that of the code at the flight. With an
+    operator, ``meant`` is the guidance intended, and ``guidance`` is its state at the edge.
     """
 
     seed: int
@@ -77,22 +78,22 @@ class Flown(Record):
     failures: list[int] = []
     overflows: list[int] = []
     lost_packets: list[int] = []
-    decisions: list[Decided] = []
+    decisions: list[DecisionRecord] = []
     bound: BoundFound | None = None
     meant: Guidance | None = None
     guidance: GuidanceState | None = None
 
 
 def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> str:
-    """What makes a flight that flight, as a hash: who decides (not what they are called), where, and the seed.
+    """The identity of a flight as a hash: the scheme's decider without its name, the site, and the seed.
 
     Args:
-        identity: what of who decides the scheme does not say: the LLM behind the edge, or a network's weights.
+        identity: of the decider beyond the scheme: the LLM behind the edge, or a network's weights.
     """
     arrivals = None if site.arrivals is None else hashlib.sha256(site.arrivals.tobytes()).hexdigest()
     decides: dict[str, Any] = scheme.decides.model_dump(mode="json")
     if decides.get("operator") is None:
-        # Flights without one keep the key that they had before there were any.
+        # So the keys of flights without an operator are those of versions without operators.
         decides.pop("operator", None)
     if identity is not None:
         decides["identity"] = identity
@@ -107,10 +108,10 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
 
 
 class FlightStore:
-    """Flights in a folder, one gzipped JSON file each; a file is there whole or not at all.
+    """Flights in a folder, each in one gzipped JSON file that is written atomically.
 
     Raises:
-        BadUse: the folder cannot be made.
+        UsageError: the folder cannot be made.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -118,23 +119,23 @@ class FlightStore:
         with naming_out(folder):
             folder.mkdir(parents=True, exist_ok=True)
             for torn in folder.glob(".*.part"):
-                # Another run may be writing here now; what a killed one left is old.
+                # A recent file may belong to another run that writes now; an old one is of a killed run.
                 if time.time() - torn.stat().st_mtime > _TORN_S:
                     torn.unlink(missing_ok=True)
 
     def path(self, key: str) -> Path:
-        """Where the flight of that key is, or would be."""
+        """The path of the flight with that key."""
         return self._folder / f"{key}.json.gz"
 
-    def load(self, key: str) -> Flown | None:
-        """The flight of that key; ``None`` if it is not there or its file is broken, and must be flown."""
+    def load(self, key: str) -> FlightRecord | None:
+        """The flight with that key; ``None`` if its file is missing or broken."""
         try:
-            return Flown.model_validate_json(gzip.decompress(self.path(key).read_bytes()))
+            return FlightRecord.model_validate_json(gzip.decompress(self.path(key).read_bytes()))
         except (OSError, EOFError, ValueError, zlib.error):
             return None
 
-    def save(self, key: str, flight: Flown) -> None:
-        """Keep a flight; raises ``BadUse`` if it cannot be written."""
+    def save(self, key: str, flight: FlightRecord) -> None:
+        """Store a flight; raises ``UsageError`` if it cannot be written."""
         part = self._folder / f".{key}.{os.getpid()}.part"
         with naming_out(self._folder):
             part.write_bytes(gzip.compress(flight.model_dump_json(exclude_defaults=True).encode(), mtime=0))

@@ -1,19 +1,19 @@
-"""Mode guided by the LLM behind it, with the planner among its advisers and without."""
+"""Mode guided with different LLMs, with and without the planner among its advisers."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import (
     BOUND,
     CHANCE,
     WORST,
     Scheme,
     at_full_speed,
+    available_locals,
     edge_planner,
     edge_policy,
     guided,
-    locals_there_are,
     value,
 )
 
@@ -31,7 +31,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         edge_planner(),
         value(),
         edge_policy(),
-        *locals_there_are(*_POLICIES),
+        *available_locals(*_POLICIES),
         at_full_speed("eof"),
         BOUND,
     ]
@@ -43,9 +43,9 @@ EXPERIMENT = Experiment(
     summary="mode guided with the LLM at hand, with one that draws or names the worst, and without the planner",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "velocity", "prompt_tokens"),
-    drawings=(
-        Drawing("guided", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), per step and cumulative."),
-        Drawing("guided_totals", "bars", LOSSES, "Lost packets and loss events (Eq. 5) of a mission."),
+    figures=(
+        FigureSpec("guided", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), per step and cumulative."),
+        FigureSpec("guided_totals", "bars", LOSSES, "Lost packets and loss events (Eq. 5) of a mission."),
     ),
     reference="edge_planner",
     pairs=(

@@ -1,8 +1,8 @@
-"""Means over seeds with 95% bootstrap intervals, alone and paired; the same numbers in, the same numbers out.
+"""Means over seeds with 95% bootstrap intervals, single and paired; deterministic in their inputs.
 
-Intervals are bias-corrected and accelerated (BCa, Efron 1987), by scipy. Where BCa is undefined (samples nearly all
-equal, or very few) they are percentile intervals; where all samples are equal, or there is one, the interval is
-the mean itself.
+Intervals are bias-corrected and accelerated (BCa, Efron 1987), by scipy. If BCa is undefined (samples nearly all equal,
+or very few), they are percentile intervals. If all samples are equal, or there is only one, the interval is the mean
+itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from simulator.experiments.result import Curve, Interval, Paired
 METHOD = "95% bootstrap interval (BCa)"
 _SEED = 0
 _RESAMPLES = 9999
-# A curve has an interval a step, and they are read by eye.
+# Fewer for curves, which have an interval a step and need less precision.
 _CURVE_RESAMPLES = 2000
 
 Statistic = Callable[..., Any]
@@ -36,7 +36,7 @@ def interval(values: Sequence[float]) -> Interval:
 
 
 def curve(rows: Sequence[Sequence[float]]) -> Curve:
-    """Mean and interval at each step, of one row of T values a seed."""
+    """Mean and interval at each step, from one row of T values a seed."""
     sample = np.asarray(rows, dtype=float).T
     low, high = np.array([_bounds((at_step,), np.mean, _CURVE_RESAMPLES) for at_step in sample]).T
     return Curve(mean=sample.mean(axis=1).tolist(), low=low.tolist(), high=high.tolist())
@@ -45,7 +45,7 @@ def curve(rows: Sequence[Sequence[float]]) -> Curve:
 def paired(
     scheme: str, reference: str, measure: str, values: Sequence[float], reference_values: Sequence[float]
 ) -> list[Paired]:
-    """The difference of the means and, where the reference's is never 0, their ratio; resampled by seed.
+    """The difference of the means and, unless the reference's is 0, their ratio; resampled by seed.
 
     Args:
         values: of ``scheme``, one a seed.
@@ -58,7 +58,7 @@ def paired(
     if theirs.mean() == 0:
         return found
     low, high = _bounds((ours, theirs), _ratio, _RESAMPLES)
-    # A resample may consist of seeds on which the reference lost nothing; the ratio then says nothing.
+    # In a resample of seeds on which the reference lost nothing, the ratio is undefined.
     if np.isfinite([low, high]).all():
         mean = float(ours.mean() / theirs.mean())
         found.append(Paired(**names, kind="ratio", mean=mean, low=float(low), high=float(high)))

@@ -1,20 +1,20 @@
-"""An LLM turned against its fleet, and what is left of the harm when its answers are held to hard rules."""
+"""An LLM turned against its fleet, with and without hard rules on its answers."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import ASKED, CHANCE, WORST, Scheme, edge_policy, guided, local, over_edge
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
+from simulator.experiments.schemes import CHANCE, NAMED_BY_OPTION, WORST, Scheme, edge_policy, guided, local, over_edge
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    asked = "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"
+    label = "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"
     of_llms = [
         over_edge(f"{name}_{verify}", f"{label}, rules {verify}", backing=backing, verify=verify, planner="off")
         for name, label, backing in (
             ("turned", "LLM turned against the fleet", WORST),
             ("draws", "uniform draws", CHANCE),
-            ("llm_rules", asked, ASKED),
+            ("llm_rules", label, NAMED_BY_OPTION),
         )
         for verify in ("off", "on")
     ]
@@ -28,7 +28,7 @@ EXPERIMENT = Experiment(
     summary="mode llm with an LLM that names the farthest sensor and hovers, with the rule verifier and without",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "llm_decided_pct"),
-    drawings=(Drawing("jailbreak", "bars", LOSSES, "Losses with the rule verifier and without, mode llm, k = 5."),),
+    figures=(FigureSpec("jailbreak", "bars", LOSSES, "Losses with the rule verifier and without, mode llm, k = 5."),),
     reference="turned_off",
     pairs=(("turned_on", "turned_off"), ("draws_on", "draws_off"), ("llm_rules_on", "llm_rules_off")),
     notes=(

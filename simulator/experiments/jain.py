@@ -1,9 +1,9 @@
-"""What Jain's index says by itself: its value by chance, and for visits in proportion to need.
+"""Jain's index of random visits, and of visits in proportion to need.
 
 With n_j visits of sensor j, N in all and J sensors, Jain's index is N^2 / (J sum n_j^2) = 1 / (1 + X/N), where
 X = sum (n_j - N/J)^2 / (N/J) is Pearson's statistic against equal visits. Where each of N/I steps visits I different
 sensors, drawn uniformly, n_j has the variance (N/J) (1 - I/J), so E[X] = J - I, and X is about (J - I)/(J - 1) times
-a chi-squared variable of J - 1 degrees of freedom. With I = 1 every visit is a draw of its own.
+a chi-squared variable of J - 1 degrees of freedom. With I = 1 all visits are independent draws.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ def expected_by_chance(visits: int, sensors: int, at_once: int = 1) -> float:
 
 
 def reached_by_chance(index: float, visits: int, sensors: int, at_once: int = 1) -> float:
-    """Probability that such visits are at least as even as ``index`` says."""
+    """Probability that such visits have an index of at least ``index``."""
     scale = (sensors - at_once) / (sensors - 1)
     return float(chi2.cdf(visits * (1 / index - 1) / scale, sensors - 1))
 
 
 def of_proportional_visits(low: float, high: float, sensors: int) -> float:
-    """The index when visits are in proportion to arrival rates that are uniform in ``low .. high``, about.
+    """The approximate index of visits in proportion to arrival rates that are uniform in ``low .. high``.
 
-    The mean squared over the mean of squares, with the variance that ``sensors`` draws show of themselves.
+    It is the squared mean over the mean of squares, with the expected sample variance of ``sensors`` draws.
     """
     mean, variance = (low + high) / 2, (high - low) ** 2 / 12
     return mean**2 / (mean**2 + variance * (sensors - 1) / sensors)

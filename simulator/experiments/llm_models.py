@@ -1,21 +1,24 @@
-"""One LLM beside another, beside none, and beside one that answers at random."""
+"""Several LLMs, no LLM, and random answers in comparison."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import ASKED, CHANCE, Scheme, edge_policy, guided, local, over_edge, value
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
+from simulator.experiments.schemes import CHANCE, NAMED_BY_OPTION, Scheme, edge_policy, guided, local, over_edge, value
 
 _DEMONSTRATIONS = 6
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
     embedded = "SmolLM2-135M (embedded)" if setup.llm.embedded else "the LLM of --llm"
-    asked = [*((f"llm_{path.stem}", path.stem, str(path)) for path in setup.models), ("llm", embedded, ASKED)]
+    backings = [
+        *((f"llm_{path.stem}", path.stem, str(path)) for path in setup.models),
+        ("llm", embedded, NAMED_BY_OPTION),
+    ]
     shown = {"demonstrations": _DEMONSTRATIONS}
     of_llms = [
         scheme
-        for name, label, backing in asked
+        for name, label, backing in backings
         for scheme in (
             over_edge(name, label, backing=backing),
             over_edge(f"{name}_shown", f"{label}, {_DEMONSTRATIONS} demonstrations", backing=backing, prompt=shown),
@@ -27,13 +30,13 @@ def _schemes(setup: Setup) -> list[Scheme]:
 
 EXPERIMENT = Experiment(
     name="llm-models",
-    title="By the LLM asked",
+    title="By the LLM backings",
     summary="each --model GGUF and the embedded LLM, with demonstrations and without, beside uniform draws and no LLM",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "rtt_p50", "llm_decided_pct"),
-    drawings=(
-        Drawing("llm_models", "bars", LOSSES, "Losses by the LLM that decides, k = 5."),
-        Drawing("llm_models_latency", "bars", ("rtt_p50",), "Median round trip by the LLM that decides."),
+    figures=(
+        FigureSpec("llm_models", "bars", LOSSES, "Losses by the LLM that decides, k = 5."),
+        FigureSpec("llm_models_latency", "bars", ("rtt_p50",), "Median round trip by the LLM that decides."),
     ),
     reference="llm_chance",
     notes=(

@@ -1,4 +1,4 @@
-"""What is measured of a flight: one number a mission, or one a step."""
+"""Measures of a flight: one number a mission, or one a step."""
 
 from __future__ import annotations
 
@@ -8,34 +8,36 @@ from itertools import accumulate
 
 import numpy as np
 
-from simulator.experiments.flight import Counted, Decided, Flown
-from simulator.record import jain_index
+from simulator.experiments.flight import DecisionRecord, FlightRecord, TokenCounts
+from simulator.records.statistics import jain_index
 
-# Decisions that the policy took because the LLM gave none; `no_candidate` is not among them: nobody was to be asked.
-_INSTEAD_OF_LLM = ("llm_", "answer_", "edge_", "critic_")
+# Prefixes of the reasons of decisions taken because the LLM gave none. `no_candidate` is none of them, since the LLM
+# had no question to answer.
+_SUBSTITUTED = ("llm_", "answer_", "edge_", "critic_")
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One number of a flight, ``None`` where it has none; ``label`` has the unit."""
+    """One number of a flight, ``None`` if undefined; ``label`` has the unit."""
 
     label: str
-    of: Callable[[Flown], float | None]
+    of: Callable[[FlightRecord], float | None]
 
 
 @dataclass(frozen=True)
 class StepMeasure:
-    """One number a step of a flight, ``None`` where it has none; ``label`` has the unit."""
+    """One number a step of a flight, ``None`` if undefined; ``label`` has the unit."""
 
     label: str
-    of: Callable[[Flown], list[float] | None]
+    of: Callable[[FlightRecord], list[float] | None]
 
 
-def ages(flight: Flown) -> np.ndarray:
+def ages(flight: FlightRecord) -> np.ndarray:
     """Age of information at the end of each step, shape ``(T, J)``, in steps.
 
-    ``A_j(t) = 1`` where sensor j was served in step t, else ``A_j(t-1) + 1``, with ``A_j(-1) = 0``: all are fresh at
-    take-off, and what a UAV took in a step is one step old at its end. Served means f = 0, an empty queue included.
+    ``A_j(t) = 1`` if sensor j was served in step t, else ``A_j(t-1) + 1``, with ``A_j(-1) = 0``: all information is
+    fresh at take-off, and information collected in a step is one step old at its end. Served means f = 0, an empty
+    queue included.
     """
     served = np.zeros((flight.steps, flight.sensors), dtype=bool)
     for decision in flight.decisions:
@@ -49,28 +51,28 @@ def ages(flight: Flown) -> np.ndarray:
     return age
 
 
-def events_per_step(flight: Flown) -> list[float]:
+def events_per_step(flight: FlightRecord) -> list[float]:
     """Eq. 5's loss: failed transmissions plus overflowing sensors, a step."""
     return [float(f + g) for f, g in zip(flight.failures, flight.overflows, strict=True)]
 
 
-def policys_instead(flight: Flown) -> int:
-    """Decisions that should have been the LLM's and were the policy's, or were taken on board."""
-    return sum(d.reason is not None and d.reason.startswith(_INSTEAD_OF_LLM) for d in flight.decisions)
+def substituted_decisions(flight: FlightRecord) -> int:
+    """The number of decisions that the policy or the UAV took in place of the LLM."""
+    return sum(d.reason is not None and d.reason.startswith(_SUBSTITUTED) for d in flight.decisions)
 
 
-def _jain(flight: Flown, counts: Callable[[Decided], bool]) -> float | None:
+def _jain(flight: FlightRecord, counts: Callable[[DecisionRecord], bool]) -> float | None:
     visits = [d.sensor for d in flight.decisions if counts(d)]
     return jain_index(np.bincount(visits, minlength=flight.sensors).tolist())
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    there = [value for value in values if value is not None]
-    return sum(there) / len(there) if there else None
+    present = [value for value in values if value is not None]
+    return sum(present) / len(present) if present else None
 
 
-def _deadlines_met(flight: Flown) -> float | None:
-    """Of the steps from n - 1 on, those at whose end a sensor to be visited every n steps was served in the last n."""
+def _deadlines_met(flight: FlightRecord) -> float | None:
+    """The percentage of steps, from n - 1 on, at whose end a sensor to visit every n steps was served in the last n."""
     met = []
     for wish in flight.meant.sensors if flight.meant is not None else []:
         if wish.visit_every is None:
@@ -81,44 +83,46 @@ def _deadlines_met(flight: Flown) -> float | None:
     return 100 * sum(met) / len(met) if met else None
 
 
-def _velocities_allowed(flight: Flown) -> float | None:
+def _velocities_allowed(flight: FlightRecord) -> float | None:
     if flight.meant is None or not flight.decisions:
         return None
     return 100 * sum(flight.meant.allows(d.velocity) for d in flight.decisions) / len(flight.decisions)
 
 
-def _confirmed(flight: Flown) -> float | None:
+def _confirmed(flight: FlightRecord) -> float | None:
     return None if flight.guidance is None else 100.0 * (flight.guidance == "confirmed")
 
 
-def _tokens(field: Callable[[Counted], float | None]) -> Callable[[Flown], float | None]:
+def _tokens(field: Callable[[TokenCounts], float | None]) -> Callable[[FlightRecord], float | None]:
     return lambda flight: _mean(field(d.tokens) for d in flight.decisions if d.tokens is not None)
 
 
-def _saved_pct(kept: Callable[[Counted], int], whole: Callable[[Counted], int]) -> Callable[[Flown], float | None]:
-    def saved(flight: Flown) -> float | None:
+def _saved_pct(
+    sent: Callable[[TokenCounts], int], whole: Callable[[TokenCounts], int]
+) -> Callable[[FlightRecord], float | None]:
+    def saved(flight: FlightRecord) -> float | None:
         counts = [d.tokens for d in flight.decisions if d.tokens is not None]
         total = sum(map(whole, counts))
-        return 100 * (1 - sum(map(kept, counts)) / total) if total else None
+        return 100 * (1 - sum(map(sent, counts)) / total) if total else None
 
     return saved
 
 
-def _trip(q: float) -> Callable[[Flown], float | None]:
-    def percentile(flight: Flown) -> float | None:
+def _trip(q: float) -> Callable[[FlightRecord], float | None]:
+    def percentile(flight: FlightRecord) -> float | None:
         trips = [d.rtt_ms for d in flight.decisions if d.rtt_ms is not None]
         return float(np.percentile(trips, q)) if trips else None
 
     return percentile
 
 
-def _share(took: Callable[[Decided], float]) -> Callable[[Flown], float | None]:
-    """In percent of the mission's round-trip time."""
+def _share(took: Callable[[DecisionRecord], float]) -> Callable[[FlightRecord], float | None]:
+    """A time in percent of the mission's round-trip time."""
 
-    def share(flight: Flown) -> float | None:
-        asked = [d for d in flight.decisions if d.rtt_ms is not None]
-        whole = sum(d.rtt_ms or 0.0 for d in asked)
-        return 100 * sum(map(took, asked)) / whole if whole else None
+    def share(flight: FlightRecord) -> float | None:
+        timed = [d for d in flight.decisions if d.rtt_ms is not None]
+        whole = sum(d.rtt_ms or 0.0 for d in timed)
+        return 100 * sum(map(took, timed)) / whole if whole else None
 
     return share
 
@@ -127,13 +131,13 @@ def _stage(name: str) -> Measure:
     return Measure(f"{name}, % of the round trip", _share(lambda d: d.latency_ms.get(name, 0.0)))
 
 
-def _trips_per_step(flight: Flown) -> list[float] | None:
+def _trips_per_step(flight: FlightRecord) -> list[float] | None:
     by_step = [
         _mean(d.rtt_ms for d in flight.decisions if d.step == step and d.rtt_ms is not None)
         for step in range(flight.steps)
     ]
-    there = [mean for mean in by_step if mean is not None]
-    return there if len(there) == flight.steps else None
+    present = [mean for mean in by_step if mean is not None]
+    return present if len(present) == flight.steps else None
 
 
 def _counted(steps: list[int]) -> list[float] | None:

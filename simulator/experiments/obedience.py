@@ -1,16 +1,16 @@
-"""Whether a fleet does what its operator asks in plain words, by the way that the words take."""
+"""The obedience of a fleet to its operator's note, by the way of the note to the edge."""
 
 from __future__ import annotations
 
 from shared.guidance import Guidance, SensorWish
 from simulator.experiments.measures import LOSSES
-from simulator.experiments.operators import Operator, Told
-from simulator.experiments.plan import Drawing, Experiment, Setup
-from simulator.experiments.schemes import ASKED, OFF, Backing, Scheme, over_edge
+from simulator.experiments.operators import Intent, Operator
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
+from simulator.experiments.schemes import NAMED_BY_OPTION, OFF, Backing, Scheme, over_edge
 
-# A visit and a velocity each, in the words of different people; none is a worked example of the edge's.
+# Each has a visit and a rule for velocities, in different wordings; none is a worked example of the edge.
 _NOTES = tuple(
-    Told(note=note, meant=Guidance(sensors=[SensorWish(sensor_id=sensor, visit_every=every)], **limits))
+    Intent(note=note, meant=Guidance(sensors=[SensorWish(sensor_id=sensor, visit_every=every)], **limits))
     for (sensor, every), limits, note in (
         (
             (4, 3),
@@ -26,13 +26,13 @@ _NOTES = tuple(
 _OBEYED = ("deadlines_met_pct", "velocities_allowed_pct")
 
 
-def _flown(mode: str, says: str, label: str, backing: Backing = ASKED) -> Scheme:
+def _flown(mode: str, says: str, label: str, backing: Backing = NAMED_BY_OPTION) -> Scheme:
     operator = Operator.model_validate({"says": says, "notes": _NOTES})
     return over_edge(f"{mode}_{says}", f"mode {mode}, {label}", mode=mode, operator=operator, backing=backing)
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    asked = [
+    with_llm = [
         _flown("llm", "nothing", "no note"),
         _flown("llm", "note", "note in the prompt"),
         _flown("guided", "nothing", "no note"),
@@ -40,12 +40,12 @@ def _schemes(setup: Setup) -> list[Scheme]:
         _flown("guided", "agrees", "compiled note, confirmed where right"),
         _flown("guided", "structure", "operator's structure"),
     ]
-    unasked = [
+    without_llm = [
         _flown(mode, says, label, backing=OFF)
         for mode in ("value", "policy")
         for says, label in (("nothing", "no note"), ("structure", "operator's structure"))
     ]
-    return [*asked, *unasked]
+    return [*with_llm, *without_llm]
 
 
 EXPERIMENT = Experiment(
@@ -54,9 +54,11 @@ EXPERIMENT = Experiment(
     summary="an operator's note: not sent, in the prompt, compiled by the LLM, or given as a structure",
     schemes=_schemes,
     measures=(*_OBEYED, "guidance_confirmed_pct", *LOSSES, "failures"),
-    drawings=(
-        Drawing("obedience", "bars", _OBEYED, "Visit deadlines met at the sensor named, steps at allowed velocities."),
-        Drawing("obedience_losses", "bars", LOSSES, "What obeying costs: losses of a mission."),
+    figures=(
+        FigureSpec(
+            "obedience", "bars", _OBEYED, "Visit deadlines met at the sensor named, steps at allowed velocities."
+        ),
+        FigureSpec("obedience_losses", "bars", LOSSES, "What obeying costs: losses of a mission."),
     ),
     when_quick="no_llm",
     reference="guided_nothing",
@@ -64,7 +66,7 @@ EXPERIMENT = Experiment(
     paired_measures=(*_OBEYED, "lost_packets"),
     notes=(
         f"{len(_NOTES)} notes, one after another by seed, each with a visit to a sensor and a rule for velocities: "
-        + " | ".join(f"“{told.note}”" for told in _NOTES),
+        + " | ".join(f"“{intent.note}”" for intent in _NOTES),
         "A deadline is met in a step at whose end the named sensor was served within the last n steps, n as asked; "
         "from step n - 1 on. A UAV may begin its mission out of the sensor's reach.",
         "Compiled notes are confirmed only where the LLM's structure is what the note means; else they are "

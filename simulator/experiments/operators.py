@@ -1,4 +1,4 @@
-"""The operators of experiments: what they write to the edge, what they mean, and what they agree to."""
+"""The operators of experiments: their notes to the edge, the guidance intended, and their answers."""
 
 from __future__ import annotations
 
@@ -7,48 +7,48 @@ from typing import Literal
 
 from shared.guidance import Guidance, GuidanceAnswer, GuidanceState
 from simulator.client import EdgeClient
-from simulator.record import Record
+from simulator.records.record import Record
 
 _WAIT_S = 300.0
 _POLL_S = 0.2
 
 
-class Told(Record):
-    """A note and what it means."""
+class Intent(Record):
+    """A note and the guidance that it means."""
 
     note: str
     meant: Guidance
 
 
 class Operator(Record):
-    """Who says what to the edge; the note of a flight is by its seed, one after another.
+    """An operator; a flight's seed selects its note.
 
-    ``says`` is ``nothing``, the ``note`` alone, which then stands in the prompt; the note, of which he confirms
-    what the LLM made if that is what he means, and rejects it if not (``agrees``); or the ``structure`` that he means,
-    with the note.
+    ``says`` is ``nothing``; the ``note`` alone, which the prompt then contains; ``agrees``, the note with the LLM's
+    compilation confirmed if it equals the intended guidance and rejected otherwise; or ``structure``, the note with the
+    intended guidance as a structure.
     """
 
     says: Literal["nothing", "note", "agrees", "structure"]
-    notes: tuple[Told, ...]
+    notes: tuple[Intent, ...]
 
-    def told(self, seed: int) -> Told:
-        """The note of a flight."""
+    def intent(self, seed: int) -> Intent:
+        """The note of a flight, with its meaning."""
         return self.notes[seed % len(self.notes)]
 
     def note(self, seed: int) -> str | None:
-        """What goes into the mission's spec."""
-        return None if self.says == "nothing" else self.told(seed).note
+        """The note in the mission's spec."""
+        return None if self.says == "nothing" else self.intent(seed).note
 
     def answer(self, edge: EdgeClient, mission_id: str, seed: int) -> GuidanceState:
-        """Say what is to be said of the guidance of a mission just made; returns how it flies."""
-        meant = self.told(seed).meant
+        """Answer the guidance of a new mission; returns the state of its guidance."""
+        meant = self.intent(seed).meant
         if self.says == "structure":
             return edge.answer_guidance(mission_id, GuidanceAnswer(guidance=meant)).status
         if self.says == "agrees":
-            ends = time.monotonic() + _WAIT_S
-            while (told := edge.guidance(mission_id)).status == "compiling" and time.monotonic() < ends:
+            deadline = time.monotonic() + _WAIT_S
+            while (compiled := edge.guidance(mission_id)).status == "compiling" and time.monotonic() < deadline:
                 time.sleep(_POLL_S)
-            if told.status == "proposed":
-                answer: Literal["confirm", "reject"] = "confirm" if told.guidance == meant else "reject"
+            if compiled.status == "proposed":
+                answer: Literal["confirm", "reject"] = "confirm" if compiled.guidance == meant else "reject"
                 return edge.answer_guidance(mission_id, GuidanceAnswer(answer=answer)).status
         return edge.guidance(mission_id).status

@@ -1,4 +1,4 @@
-"""How long the rest of a run will take, from what flights of the same kind took."""
+"""The estimate of a run's remaining time, from the durations of earlier flights of the same kind."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from collections.abc import Iterable
 from simulator.experiments.plan import Planned
 from simulator.experiments.schemes import Clairvoyant, Local
 
-# Seconds a decision before the first flight of its kind was measured, on two cores.
+# Seconds a decision on two cores, for kinds of flights not measured yet.
 _LOCAL_S, _PLANNER_S, _BOUND_S, _EDGE_S, _LLM_S = 0.001, 0.2, 0.05, 0.015, 0.75
 
 
 class Pace:
-    """Seconds a decision by kind of flight; every measured flight improves it."""
+    """Seconds a decision by kind of flight, updated with every flight."""
 
     def __init__(self) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
         self._decisions: defaultdict[str, int] = defaultdict(int)
 
     def took(self, planned: Planned, seconds: float) -> None:
-        """A flight took this long."""
+        """Record the duration of a flight."""
         self._seconds[_kind(planned)] += seconds
         self._decisions[_kind(planned)] += _decisions(planned)
 
     def left_s(self, planned: Iterable[Planned]) -> float:
-        """Seconds that these flights will take, one after another."""
+        """The estimated seconds of these flights, one after another."""
         return sum(self._seconds_of(flight) for flight in planned)
 
     def _seconds_of(self, planned: Planned) -> float:
@@ -35,8 +35,8 @@ class Pace:
         return _guess(planned) * _decisions(planned)
 
 
-def told(seconds: float) -> str:
-    """A duration as people say it: ``40 s``, ``12 min``, ``3 h 20 min``."""
+def duration_text(seconds: float) -> str:
+    """A duration in words: ``40 s``, ``12 min``, ``3 h 20 min``."""
     if seconds < 90:
         return f"{max(0, round(seconds)):d} s"
     minutes = round(seconds / 60)
@@ -49,9 +49,9 @@ def _decisions(planned: Planned) -> int:
 
 def _kind(planned: Planned) -> str:
     decides = planned.scheme.decides
-    who = decides.policy if isinstance(decides, Local) else f"{decides.kind} {planned.backing}"
+    decider = decides.policy if isinstance(decides, Local) else f"{decides.kind} {planned.backing}"
     # More sensors make a longer prompt and a larger plan.
-    return f"{who} {planned.site.scenario.sensors}"
+    return f"{decider} {planned.site.scenario.sensors}"
 
 
 def _guess(planned: Planned) -> float:

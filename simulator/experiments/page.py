@@ -1,4 +1,4 @@
-"""The results page: the paper's numbers beside ours with a verdict each, then every experiment that was run."""
+"""The results page: a verdict on each of the paper's numbers, and the results of every experiment."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from rich.console import Console
 from tyro.conf import arg
 
 from shared.scenario import Scenario
-from simulator.commandline import command_main
+from simulator.cli.running import command_main
+from simulator.errors import UsageError
 from simulator.experiments import claims, jain
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.evidence import ZERO, flew_all
 from simulator.experiments.plots import draw, label_of, measured
 from simulator.experiments.result import Figure, Interval, Result
 from simulator.experiments.tables import cell, measure_tables, pair_tables, row_label
-from simulator.record import BadUse, naming_out
+from simulator.records.run_folder import naming_out
 
 RESULT = "results.json"
 FIGURES = "figures"
@@ -31,7 +32,7 @@ FIGURES = "figures"
 class Options:
     """Write the results page: the paper's numbers beside ours, and every experiment's figures and tables.
 
-    Experiments that were not run are listed as such. Run again, it replaces the page and its figures.
+    Experiments that were not run are listed as such. The command replaces an existing page and its figures.
 
     Try it:  aicvds experiment page --runs runs/experiments --out docs/results.md
 
@@ -39,13 +40,13 @@ class Options:
     """
 
     runs: Annotated[Path, arg(metavar="DIR")] = Path("runs/experiments")
-    """Folder that experiments wrote to (their --out)."""
+    """Folder of the experiments' results (their --out)."""
     out: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/results.md")
     """The page; its figures go to the folder figures beside it."""
 
 
 def main(argv: list[str]) -> int:
-    """Write the page that the command line asks for; returns the exit code."""
+    """Run ``aicvds experiment page``; returns the exit code."""
     return command_main(Options, "aicvds experiment page", argv, _page)
 
 
@@ -56,13 +57,13 @@ def _page(options: Options, console: Console) -> int:
 
 
 def write_page(runs: Path, out: Path) -> None:
-    """Write the Markdown page ``out``, and the figures that it shows into the folder ``figures`` beside it.
+    """Write the Markdown page ``out``, and its figures into the folder ``figures`` beside it.
 
     Args:
-        runs: the folder that ``aicvds experiment`` wrote to. An experiment that it lacks is on the page as not run.
+        runs: the folder of ``aicvds experiment``. The page lists experiments without a result as not run.
 
     Raises:
-        BadUse: there is no result in it, one cannot be read, or the page cannot be written.
+        UsageError: the folder has no result, a result cannot be read, or the page cannot be written.
     """
     found = results_in(runs)
     with naming_out(out):
@@ -72,14 +73,14 @@ def write_page(runs: Path, out: Path) -> None:
 
 
 def results_in(runs: Path) -> dict[str, Result]:
-    """The results in ``runs`` and its folders, by experiment; a full run before a quick one, then the latest.
+    """The results in ``runs`` and its folders by experiment; full runs win over quick ones, then later over earlier.
 
     Raises:
-        BadUse: there is none, or one cannot be read.
+        UsageError: the folder has no result, or one cannot be read.
     """
     paths = sorted([*runs.glob(RESULT), *runs.glob(f"*/{RESULT}")])
     if not paths:
-        raise BadUse(f"--runs {runs} has no {RESULT}; make some with: aicvds experiment all --out {runs}")
+        raise UsageError(f"--runs {runs} has no {RESULT}; make some with: aicvds experiment all --out {runs}")
     results = sorted((_read(path) for path in paths), key=lambda result: (not result.quick, result.created_at))
     return {result.experiment: result for result in results}
 
@@ -88,9 +89,9 @@ def _read(path: Path) -> Result:
     try:
         return Result.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
-        told = error.errors(include_url=False)[0] if isinstance(error, ValidationError) else None
-        why = f"{'.'.join(map(str, told['loc']))}: {told['msg']}" if told else str(error)
-        raise BadUse(f"{path}: {why}; run that experiment again") from None
+        first = error.errors(include_url=False)[0] if isinstance(error, ValidationError) else None
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}" if first else str(error)
+        raise UsageError(f"{path}: {why}; run that experiment again") from None
 
 
 def _figures(result: Result, folder: Path) -> list[tuple[Figure, Path]]:
@@ -106,7 +107,7 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
         loader=PackageLoader("simulator.experiments", "."), undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    environment.filters.update(cell=cell, told=told, seeds=told_seeds)
+    environment.filters.update(cell=cell, rounded=rounded, seeds=seeds_text)
     full = {name: result for name, result in results.items() if not (result.quick or claims.elsewhere(result))}
     findings = claims.judge(results)
     return environment.get_template("results.md.j2").render(
@@ -135,7 +136,7 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
 class Evenness:
     """One scheme's Jain's index of visits served and of visits scheduled, and its lost packets.
 
-    ``on_all_seeds``: whether it flew every world of the result, so that its mean can be put beside others'.
+    ``on_all_seeds``: whether it flew every world of the result, so that its mean can be compared with others'.
     """
 
     label: str
@@ -147,7 +148,7 @@ class Evenness:
 
 @dataclass(frozen=True)
 class Fairness:
-    """What Jain's index is worth: by chance, by need, and as measured, the most even first."""
+    """Jain's index by chance, by need, and as measured, the most even scheme first."""
 
     visits: int
     sensors: int
@@ -162,7 +163,7 @@ class Fairness:
 
     @classmethod
     def of(cls, result: Result | None) -> Fairness:
-        """Of the fairness experiment's result; without one, only what can be computed."""
+        """The indices from the fairness experiment's result; without one, only the computed ones."""
         paper = Scenario()
         visits = paper.uavs * paper.steps
         by_name = {
@@ -191,19 +192,22 @@ class Fairness:
 
     @property
     def most_even(self) -> Evenness | None:
-        """The most even of the schemes that flew all worlds; ``None`` where there is none."""
+        """The most even of the schemes that flew all worlds; ``None`` if there is none."""
         return next((row for row in self.rows if row.on_all_seeds), None)
 
     @property
     def least_lossy(self) -> Evenness | None:
-        """That of them which lost the fewest packets; ``None`` where losses were not measured."""
-        known = [(row.lost.mean, place) for place, row in enumerate(self.rows) if row.lost and row.on_all_seeds]
-        return self.rows[min(known)[1]] if known else None
+        """The scheme of those with the fewest lost packets; ``None`` without measured losses."""
+        losses = [(row.lost.mean, index) for index, row in enumerate(self.rows) if row.lost and row.on_all_seeds]
+        return self.rows[min(losses)[1]] if losses else None
 
 
 @dataclass(frozen=True)
 class Swap:
-    """Two schemes of which ``a`` has less of one thing than ``b`` and more of another; values are ``(a's, b's)``."""
+    """Two schemes that two measures rank differently: ``a`` is below ``b`` in ``less`` and above it in ``more``.
+
+    Values are ``(a's, b's)``.
+    """
 
     a: str
     b: str
@@ -212,7 +216,7 @@ class Swap:
 
 
 def swap(values: Mapping[str, tuple[float, float]]) -> Swap | None:
-    """The pair that the first and the second of their values rank most differently; ``None`` when both agree."""
+    """The pair of schemes that the two values rank most differently; ``None`` if the rankings agree."""
     pairs = [
         Swap(a, b, (values[a][0], values[b][0]), (values[a][1], values[b][1]))
         for a in values
@@ -223,7 +227,7 @@ def swap(values: Mapping[str, tuple[float, float]]) -> Swap | None:
 
 
 def late_and_whole(result: Result | None) -> dict[str, tuple[float, float]]:
-    """By scheme's label, lost packets in a mission's last third and in all of it, of those that flew all worlds."""
+    """Lost packets in a mission's last third and in all of it, by label of the schemes that flew all worlds."""
     curves = {
         label_of(result, name): found["lost_packets_per_step"].mean
         for name, found in (result.curves if result else {}).items()
@@ -233,7 +237,7 @@ def late_and_whole(result: Result | None) -> dict[str, tuple[float, float]]:
 
 
 def packets_and_events(result: Result | None) -> dict[str, tuple[float, float]]:
-    """By scheme's label, lost packets and loss events of a mission, of those that flew all worlds."""
+    """Lost packets and loss events of a mission, by label of the schemes that flew all worlds."""
     return {
         label_of(result, name): (packets.mean, events.mean)
         for name in (result.schemes if result else ())
@@ -245,20 +249,20 @@ def packets_and_events(result: Result | None) -> dict[str, tuple[float, float]]:
 
 
 def _learned(result: Result | None) -> tuple[Interval, Interval] | None:
-    """Lost packets by the modules' own decisions, from a random start and from the shipped one."""
+    """Lost packets in mode value, from random weights and from the shipped ones."""
     if result is None:
         return None
     found = [measured(result, name, "lost_packets") for name in ("value_random_start", "value")]
     return (found[0], found[1]) if found[0] and found[1] else None
 
 
-def told(value: float) -> str:
-    """A number in a sentence: whole when it is large."""
+def rounded(value: float) -> str:
+    """A number for a sentence, rounded to an integer from 100 on."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:,.1f}"
 
 
-def told_seeds(seeds: Sequence[int]) -> str:
-    """Seeds as people write them: ``0 to 29 (30)``."""
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Seeds in words: ``0 to 29 (30)``."""
     if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
         return f"{seeds[0]} to {seeds[-1]} ({len(seeds)})"
     return f"{', '.join(map(str, seeds))} ({len(seeds)})"

@@ -1,4 +1,4 @@
-"""Experiments as declared, and the flights that they need."""
+"""The declaration of experiments, and the flights that they need."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING, Literal
 from simulator.experiments.edges import Llm
 from simulator.experiments.flight import flight_key
 from simulator.experiments.result import Sweep
-from simulator.experiments.schemes import ASKED, PLANNER, Clairvoyant, Local, OverEdge, Scheme
+from simulator.experiments.schemes import NAMED_BY_OPTION, PLANNER, Clairvoyant, Local, OverEdge, Scheme
 
 if TYPE_CHECKING:
-    from simulator.site import Site
+    from simulator.sites.site import Site
 
-# So that `all --quick` ends within 15 minutes on two cores, an LLM's decision taking three quarters of a second.
+# With these, `all --quick` ends within 15 minutes on two cores, at three quarters of a second a decision of an LLM.
 QUICK_STEPS = 3
 QUICK_SEEDS, QUICK_LLM_SEEDS = 5, 2
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What the command line says of every experiment of a run.
+    """The options of the command line that apply to every experiment of a run.
 
-    ``sites`` are the worlds by name, the first the one that all but ``scenarios`` fly; ``seeds`` and ``llm_seeds``
-    how many of each, from 0; ``steps`` of a mission, or the scenario's own.
+    ``sites`` are the worlds by name; all experiments but ``scenarios`` fly the first one. ``seeds`` and ``llm_seeds``
+    are numbers of seeds, from 0. ``steps`` are those of a mission, or ``None`` for the scenario's.
     """
 
     sites: dict[str, Site]
@@ -46,8 +46,8 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """One figure: its file's name, kind (see ``result.Figure``), measures, and what the caption says first."""
+class FigureSpec:
+    """One figure: its file's name, kind (see ``result.Figure``), measures, and the beginning of its caption."""
 
     name: str
     kind: Literal["curves", "bars", "sweep"]
@@ -57,12 +57,12 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One figure or table, as its file declares it.
+    """The declaration of one figure or table of the paper, or of one beyond it.
 
-    ``summary`` is its line in ``--help``; ``measures`` and the curves among the drawings' measures are names in
-    ``measures.py``; ``reference`` is the scheme that every other is paired to, ``pairs`` are further ones.
-    ``when_quick`` says whether ``--quick`` shortens the missions of all schemes, so that they stay comparable, or
-    leaves out those that ask an LLM. ``everywhere`` experiments fly all of the setup's sites.
+    ``summary`` is its line in ``--help``. ``measures``, and the measures of curves in ``figures``, are names in
+    ``measures.py``. Every other scheme is paired with ``reference``; ``pairs`` are further pairs. With ``when_quick``
+    of ``short``, ``--quick`` shortens the missions of all schemes, so that they stay comparable; with ``no_llm`` it
+    omits the schemes that query an LLM. Experiments with ``where`` of ``everywhere`` fly all of the setup's sites.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Experiment:
     summary: str
     schemes: Callable[[Setup], list[Scheme]]
     measures: tuple[str, ...]
-    drawings: tuple[Drawing, ...]
+    figures: tuple[FigureSpec, ...]
     reference: str | None = None
     pairs: tuple[tuple[str, str], ...] = ()
     paired_measures: tuple[str, ...] = ("lost_packets", "events")
@@ -82,7 +82,7 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """One flight to fly, or already flown: the same ``key``, the same flight."""
+    """One flight of a plan, flown already or not; flights with the same ``key`` are the same."""
 
     key: str
     scheme: Scheme
@@ -92,19 +92,19 @@ class Planned:
 
     @property
     def backing(self) -> str | None:
-        """What must be behind the edge; ``None`` for a flight without an edge."""
+        """The backing of the edge; ``None`` for a flight without an edge."""
         return self.scheme.decides.backing if isinstance(self.scheme.decides, OverEdge) else None
 
     @property
     def plans(self) -> bool:
-        """Whether it runs OR-Tools, half a second a step."""
+        """Whether the flight runs OR-Tools, which takes half a second a step."""
         decides = self.scheme.decides
         return isinstance(decides, Clairvoyant) or (isinstance(decides, Local) and decides.policy == PLANNER)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """An experiment's flights, by scheme and then by site in the order to show them, and who was left out."""
+    """An experiment's flights in display order, by scheme and then by site, and the schemes omitted."""
 
     experiment: Experiment
     flights: list[Planned]
@@ -117,8 +117,12 @@ def plan(experiment: Experiment, setup: Setup) -> Plan:
     sites = dict(setup.sites) if experiment.where == "everywhere" else dict([next(iter(setup.sites.items()))])
     for scheme in experiment.schemes(setup):
         without_llm = setup.quick and experiment.when_quick == "no_llm"
-        unasked = isinstance(scheme.decides, OverEdge) and scheme.decides.backing == ASKED and not setup.llm.there
-        if scheme.asks_llm and (without_llm or unasked):
+        missing = (
+            isinstance(scheme.decides, OverEdge)
+            and scheme.decides.backing == NAMED_BY_OPTION
+            and not setup.llm.available
+        )
+        if scheme.asks_llm and (without_llm or missing):
             left_out.append(scheme)
             continue
         for name, site in sites.items():
@@ -139,7 +143,7 @@ def _identity(scheme: Scheme, setup: Setup) -> str | None:
 def weights_of(policy: str) -> str | None:
     """The hash of the trained network that ships for a policy; ``None`` for one that has none.
 
-    A scheme trained anew is flown anew.
+    As part of the flights' identity, it makes a newly trained scheme fly again.
     """
     file = files("simulator").joinpath("checkpoints", f"{policy}.pt")
     return sha256(file.read_bytes()).hexdigest()[:16] if file.is_file() else None

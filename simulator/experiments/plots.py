@@ -1,7 +1,7 @@
-"""The figures of a ``results.json``, in a two-column paper's width: PNG, SVG and PDF, byte for byte the same each time.
+"""The figures of a ``results.json`` in a two-column paper's width: PNG, SVG and PDF with reproducible bytes.
 
-Bands and whiskers are 95% intervals over seeds, small dots the seeds. A scheme looks alike on every figure (see
-``simulator.figures.POLICIES``): it is told apart by its dash and marker as well as by its colour.
+Bands and whiskers are 95% intervals over seeds; small dots are single seeds. A scheme has the same colour, dash and
+marker in every figure (see ``simulator.reporting.figures.POLICIES``).
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from matplotlib.axis import XAxis, YAxis
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator, SymmetricalLogLocator
 
-from simulator.drawing import DOUBLE_IN, RC, SINGLE_IN
 from simulator.experiments.result import Figure, Interval, Result
-from simulator.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
-from simulator.report import NAMES
+from simulator.reporting.figure_style import DOUBLE_IN, RC, SINGLE_IN
+from simulator.reporting.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
+from simulator.reporting.wording import NAMES
 
 Format = Literal["png", "svg", "pdf"]
 FORMATS: tuple[Format, ...] = ("png", "svg", "pdf")
-# Past this ratio of the largest to the smallest mean, the smaller schemes would be slivers on a linear axis.
+# The ratio of the largest to the smallest mean from which an axis is logarithmic: on a linear one, the shortest bars
+# would be invisible.
 LOG_PAST = 30.0
-# Where the least is more than this of the most, bars from zero would all look alike.
+# The ratio of the smallest to the largest mean from which points replace bars, which would all have similar lengths.
 ALIKE = 0.75
 BOUND_LABEL = "clairvoyant bound (proven)"
 BOUND = POLICIES["bound"]
@@ -52,13 +53,13 @@ _PRINT: dict[Any, Any] = {
     "savefig.dpi": 300,
     "pdf.fonttype": 42,
 }
-# What else would change from run to run, or with matplotlib's version.
+# Removes the metadata that differ between runs or between matplotlib's versions.
 _UNDATED: dict[str, dict[str, Any]] = {
     "png": {"Software": None},
     "svg": {"Date": None, "Creator": None},
     "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-# For schemes that have no style of their own; enough for sixteen, no two alike.
+# Styles of schemes without an entry in POLICIES, all different.
 _OTHERS: tuple[Style, ...] = tuple(
     (colour, dash, marker)
     for dash, markers in (("-", "sd^vX"), ("--", "oP<>*"), (":", "Dh8pv"), ("-.", "X^sod"))
@@ -69,8 +70,8 @@ _OTHERS: tuple[Style, ...] = tuple(
 def draw(result: Result, out: Path, formats: Sequence[Format] = FORMATS) -> list[Path]:
     """Draw every figure of ``result`` into the folder ``out``, one file a figure and format.
 
-    Schemes without a measure are left out of its panel, and so are numbers that are not finite; a figure of which
-    nothing was measured is not drawn.
+    A measure's panel omits schemes without it, and numbers that are not finite. A figure without any measured number is
+    not drawn.
 
     Raises:
         ValueError: a figure asks for a sweep and the result has none.
@@ -79,7 +80,7 @@ def draw(result: Result, out: Path, formats: Sequence[Format] = FORMATS) -> list
     out.mkdir(parents=True, exist_ok=True)
     drawn: list[Path] = []
     for figure in result.figures:
-        # A constant salt makes the ids, and so the whole text, the same on every run.
+        # A constant salt makes the IDs, and so the whole text, the same on every run.
         with matplotlib.style.context(["default", {**_PRINT, "svg.hashsalt": f"{result.experiment}-{figure.name}"}]):
             picture = _DRAWN_BY[figure.kind](result, figure)
             if picture is None:
@@ -94,7 +95,7 @@ def draw(result: Result, out: Path, formats: Sequence[Format] = FORMATS) -> list
 
 
 def _rounded(svg: str) -> str:
-    """Coordinates to a hundredth of a point: a third smaller, and nobody sees it."""
+    """The SVG with coordinates rounded to a hundredth of a point, a third smaller without a visible difference."""
 
     def shorter(attribute: re.Match[str]) -> str:
         return re.sub(r"\d+\.\d{3,}", lambda number: f"{float(number[0]):.2f}", attribute[0])
@@ -103,20 +104,20 @@ def _rounded(svg: str) -> str:
 
 
 def label_of(result: Result, name: str) -> str:
-    """How people call a scheme or a measure; a scheme that flew fewer seeds than the rest says how many."""
-    told = result.labels.get(name) or NAMES.get(name) or name.replace("_", " ")
-    return f"{told} ({len(result.seeds_of[name])} seeds)" if name in result.seeds_of else told
+    """The label of a scheme or a measure; with the number of seeds for a scheme that flew fewer than the rest."""
+    label = result.labels.get(name) or NAMES.get(name) or name.replace("_", " ")
+    return f"{label} ({len(result.seeds_of[name])} seeds)" if name in result.seeds_of else label
 
 
 def styles(result: Result) -> dict[str, Style]:
-    """Colour, dash and marker of every scheme, no two alike."""
+    """Colour, dash and marker of every scheme, all different."""
     names = [*result.schemes, *(name for name in result.curves if name not in result.schemes)]
     others = (style for style in _OTHERS * (1 + len(names) // len(_OTHERS)) if style not in POLICIES.values())
     return {name: POLICIES[name] if name in POLICIES else next(others) for name in names}
 
 
 def measured(result: Result, name: str, measure: str) -> Interval | None:
-    """The scheme's interval of the measure; ``None`` when it has none, or one that is not finite."""
+    """The scheme's interval of the measure; ``None`` for a missing one or one that is not finite."""
     found = result.schemes.get(name, {}).get(measure)
     return found if found and _finite(found.mean, found.low, found.high) else None
 
@@ -171,13 +172,13 @@ def _one_curve(axes: Axes, result: Result, name: str, measure: str, look: Style,
     if curve is None:
         return
     colour, dash, marker = look
-    # Not a number, where a step was not measured, would be a gap in a line and a hole in a band.
+    # Steps without a measurement are NaN, which would interrupt the line and the band.
     triples = zip(curve.mean, curve.low, curve.high, strict=True)
-    kept = np.array([(at, *row) for at, row in enumerate(triples) if _finite(*row)], dtype=float).reshape(-1, 4)
-    at, mean, low, high = kept.T
+    points = np.array([(at, *row) for at, row in enumerate(triples) if _finite(*row)], dtype=float).reshape(-1, 4)
+    at, mean, low, high = points.T
     every = max(1, len(at) // 6)
     axes.fill_between(at, low, high, color=colour, alpha=0.14 if len(result.curves) <= 8 else 0.08, linewidth=0)
-    # The markers of schemes that coincide stand apart along the line.
+    # Offset markers keep coinciding lines distinguishable.
     axes.plot(at, mean, color=colour, linestyle=dash, marker=marker, markevery=(position % every, every))
 
 
@@ -206,7 +207,7 @@ def _bar_panel(axes: Axes, result: Result, measure: str, shown: Sequence[str], l
     means = [i.mean for i in found.values()]
     bound = _bound_of(result, measure)
     alike = bool(means) and min(means) > ALIKE * max(means) and bound is None
-    # A bar's length means nothing where its axis does not begin at zero, or is logarithmic.
+    # Without zero on its axis, or on a logarithmic one, a bar's length has no meaning.
     barred = not (alike or _spans_decades(means))
     for row, interval in found.items():
         colour, _, marker = looks[shown[row]]
@@ -238,12 +239,12 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
     if result.sweep is None:
         raise ValueError(f"figure {figure.name!r} of {result.experiment!r} is a sweep, but the result has no `sweep`")
     looks = styles(result)
-    places = sorted(
+    points = sorted(
         (at, name)
         for name, at in result.sweep.at.items()
         if any(measured(result, name, measure) for measure in figure.measures)
     )
-    if not places:
+    if not points:
         return None
     beside = [
         name
@@ -255,7 +256,7 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
     keys = len(beside) + bounded
     picture, panels = _panels(figure, 2.1, _legend_in(keys, width))
     for axes, measure in zip(panels, figure.measures, strict=True):
-        _sweep_panel(axes, result, measure, places)
+        _sweep_panel(axes, result, measure, points)
         for name in beside:
             if reference := measured(result, name, measure):
                 axes.axhspan(reference.low, reference.high, color=looks[name][0], alpha=0.14, linewidth=0)
@@ -269,10 +270,10 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
     return picture
 
 
-def _sweep_panel(axes: Axes, result: Result, measure: str, places: Sequence[tuple[float, str]]) -> None:
-    found = [(at, i) for at, name in places if (i := measured(result, name, measure))]
+def _sweep_panel(axes: Axes, result: Result, measure: str, points: Sequence[tuple[float, str]]) -> None:
+    found = [(at, i) for at, name in points if (i := measured(result, name, measure))]
     colour, dash, marker = POLICIES["llm"]
-    gap = min((b - a for (a, _), (b, _) in zip(places, places[1:], strict=False) if b > a), default=1.0)
+    gap = min((b - a for (a, _), (b, _) in zip(points, points[1:], strict=False) if b > a), default=1.0)
     for at, interval in found:
         seeds = [value for value in interval.values if _finite(value)]
         if len(seeds) > 1:
@@ -283,7 +284,7 @@ def _sweep_panel(axes: Axes, result: Result, measure: str, places: Sequence[tupl
     axes.errorbar(
         [at for at, _ in found], mean, yerr=reach, color=colour, linestyle=dash, marker=marker, capsize=2, zorder=4
     )
-    axes.set_xticks([at for at, _ in places])
+    axes.set_xticks([at for at, _ in points])
 
 
 _DRAWN_BY: dict[str, Callable[[Result, Figure], mpl.Figure | None]] = {
@@ -299,10 +300,10 @@ def _spans_decades(means: Sequence[float]) -> bool:
 
 
 def _scale(axis: XAxis | YAxis, means: Sequence[float]) -> None:
-    """Make the axis logarithmic where the means ask for it; zeros keep a linear stretch around zero."""
+    """Make the axis logarithmic if the means span decades, with a linear part around zero."""
     if not _spans_decades(means):
         return
-    # Four decades at most, or the least of the schemes would squeeze the rest.
+    # At most four decades, so that the smallest mean does not compress the rest.
     least = max(min(mean for mean in means if mean > 0), max(means) / 1e4)
     threshold = 10.0 ** math.floor(math.log10(least))
     scale = axis.axes.set_xscale if isinstance(axis, XAxis) else axis.axes.set_yscale
@@ -342,7 +343,7 @@ def _legend_in(keys: int, width: float) -> float:
 
 
 def _legend(picture: mpl.Figure, keys: list[Line2D], bounded: bool, width: float) -> None:
-    """Below all panels, where it covers no data."""
+    """Add the legend below all panels, where it covers no data."""
     if bounded:
         keys = [*keys, _key(BOUND_LABEL, (BOUND[0], BOUND[1], ""))]
     if keys:

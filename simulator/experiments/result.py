@@ -1,15 +1,15 @@
-"""``results.json``: what an experiment found, for the figures, the tables and the results page."""
+"""``results.json``: the results of an experiment, for the figures, the tables and the results page."""
 
 from __future__ import annotations
 
 from datetime import datetime
 from typing import Literal
 
-from simulator.record import Record
+from simulator.records.record import Record
 
 
 class Interval(Record):
-    """A mean over seeds with its 95% bootstrap interval; ``values`` one a seed, in the order of ``Result.seeds``."""
+    """A mean over seeds with its 95% bootstrap interval; ``values`` has one value a seed, as ``Result.seeds``."""
 
     mean: float
     low: float
@@ -26,7 +26,7 @@ class Curve(Record):
 
 
 class Paired(Record):
-    """Two schemes on the same worlds: ``scheme``'s measure over (or less) ``reference``'s, with a 95% interval."""
+    """A comparison on the same worlds: ``scheme``'s measure over or minus ``reference``'s, with a 95% interval."""
 
     scheme: str
     reference: str
@@ -38,7 +38,7 @@ class Paired(Record):
 
 
 class Figure(Record):
-    """One figure to draw of a result.
+    """One figure of a result.
 
     ``curves``: the measures by step, one panel each; ``bars``: a bar a scheme, one panel a measure;
     ``sweep``: each measure over ``Result.sweep``.
@@ -51,18 +51,18 @@ class Figure(Record):
 
 
 class Sweep(Record):
-    """The x axis of a sweep: its label, and where each scheme stands on it."""
+    """The x axis of a sweep: its label, and the position of each scheme."""
 
     label: str
     at: dict[str, float]
 
 
 class Result(Record):
-    """One experiment's findings.
+    """One experiment's results.
 
-    ``schemes`` is by scheme's name, then by measure's, in the order to show them; ``labels`` says how people
-    call schemes and measures; ``seeds_of`` names schemes that flew fewer seeds than the rest. ``bound`` is, by
-    measure, the proven least that any fleet could have reached: a line of its own, never a scheme that flies.
+    ``schemes`` is by the name of the scheme, then of the measure, in display order. ``labels`` are the labels of
+    schemes and measures. ``seeds_of`` has the schemes that flew fewer seeds than the rest. ``bound`` is the proven
+    lower bound of each measure, a separate line and no scheme.
     """
 
     experiment: str

@@ -1,4 +1,4 @@
-"""Fly what is missing, keep every flight at once, and write each experiment as soon as its flights are there."""
+"""The run of experiments: fly and store missing flights, and write each experiment once its flights are complete."""
 
 from __future__ import annotations
 
@@ -14,25 +14,27 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from simulator.errors import UsageError
 from simulator.experiments.edges import edge_for
-from simulator.experiments.flight import FlightStore, Flown
-from simulator.experiments.flying import CannotFly, commit, fly_here, fly_over
-from simulator.experiments.measures import policys_instead
-from simulator.experiments.pace import Pace, told
+from simulator.experiments.execution import CannotFly, commit, fly_locally, fly_with_edge
+from simulator.experiments.flight import FlightRecord, FlightStore
+from simulator.experiments.measures import substituted_decisions
+from simulator.experiments.pace import Pace, duration_text
 from simulator.experiments.plan import Experiment, Plan, Planned, Setup, plan
 from simulator.experiments.result import Result
-from simulator.record import BadUse, naming_out
+from simulator.records.run_folder import naming_out
 
 FLIGHTS, RESULT, TABLE = "flights", "results.json", "results.csv"
-# Where nobody watches a progress bar, a line this often.
-_TELL_EVERY_S = 30.0
+# The interval of progress lines without a terminal.
+_REPORT_EVERY_S = 30.0
 
 
 @dataclass
 class Run:
-    """One run of the command: what there is to fly, where to keep it, and what came of it.
+    """One run of the command.
 
-    ``command_of`` is the command line that makes one experiment; ``workers`` processes fly what needs no edge.
+    ``command_of`` gives the command line that makes one experiment. ``workers`` processes fly the flights without an
+    edge.
     """
 
     setup: Setup
@@ -45,18 +47,18 @@ class Run:
     flown: int = 0
 
     def make(self, experiments: Sequence[Experiment]) -> list[Result]:
-        """Make the experiments, from flights kept and flown.
+        """Make the experiments from stored and new flights.
 
         Raises:
-            BadUse: the folder cannot be written.
-            EdgeError: an edge died, or has no LLM though it should have one.
-            KeyboardInterrupt: interrupted; what was flown is kept.
+            UsageError: the folder cannot be written.
+            EdgeError: an edge died, or lacks an LLM that it needs.
+            KeyboardInterrupt: the run was interrupted; finished flights are stored.
         """
         self.store = FlightStore(self.out / FLIGHTS)
         plans = self._plans(experiments)
         missing = self._missing(plans)
         waiting = {id(p): {f.key for f in p.flights} & missing.keys() for p in plans}
-        self._tell_start(plans, missing)
+        self._print_start(plans, missing)
         results = [self._write(p) for p in plans if not waiting[id(p)]]
         for key in self._fly(missing):
             for p in plans:
@@ -70,87 +72,87 @@ class Run:
         plans = [plan(experiment, self.setup) for experiment in experiments]
         empty = [p.experiment.name for p in plans if not p.flights]
         if len(empty) == len(plans):
-            raise BadUse(f"experiment {', '.join(empty)}: every scheme of it asks an LLM; name one with --llm")
+            raise UsageError(f"experiment {', '.join(empty)}: every scheme of it asks an LLM; name one with --llm")
         if empty:
             self.console.print(f"Without an LLM there is nothing to fly for {', '.join(empty)}.", highlight=False)
         return [p for p in plans if p.flights]
 
     def _missing(self, plans: Sequence[Plan]) -> dict[str, Planned]:
-        missing, there = {}, set()
+        missing, stored = {}, set()
         for planned in (flight for p in plans for flight in p.flights):
-            if planned.key in there or planned.key in missing:
+            if planned.key in stored or planned.key in missing:
                 continue
             flight = self.store.load(planned.key)
             if flight is None:
                 missing[planned.key] = planned
             else:
-                there.add(planned.key)
+                stored.add(planned.key)
                 self.pace.took(planned, flight.duration_s)
         return missing
 
-    def _tell_start(self, plans: Sequence[Plan], missing: dict[str, Planned]) -> None:
+    def _print_start(self, plans: Sequence[Plan], missing: dict[str, Planned]) -> None:
         needed = {flight.key for p in plans for flight in p.flights}
-        left = f"about {told(self.pace.left_s(missing.values()))}" if missing else "nothing to fly"
+        left = f"about {duration_text(self.pace.left_s(missing.values()))}" if missing else "nothing to fly"
         self.console.print(
             f"{len(needed)} flights, {len(needed) - len(missing)} of them flown before; {left}.", highlight=False
         )
 
     def _fly(self, missing: dict[str, Planned]) -> Iterator[str]:
-        """Fly them all, cheap ones first; yields each key when its flight is kept, or cannot be flown."""
+        """Fly all of them, cheap ones first; yields each key once its flight is stored or has proved impossible."""
         left = dict(sorted(missing.items(), key=lambda item: _order(item[1])))
-        with _progress(self.console, len(left)) as tell:
+        with _progress(self.console, len(left)) as advance:
             for planned, flight in self._flights(list(left.values())):
                 del left[planned.key]
                 self.flown += 1
                 if flight is not None:
                     self.store.save(planned.key, flight)
                     self.pace.took(planned, flight.duration_s)
-                    self._doubt(planned, flight)
-                tell(planned, self.pace.left_s(left.values()))
+                    self._warn_of_substitutes(planned, flight)
+                advance(planned, self.pace.left_s(left.values()))
                 yield planned.key
 
-    def _flights(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, Flown | None]]:
-        yield from self._here([planned for planned in flights if planned.backing is None])
+    def _flights(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
+        yield from self._fly_locally([planned for planned in flights if planned.backing is None])
         for backing in dict.fromkeys(planned.backing for planned in flights if planned.backing is not None):
             name = "".join(c if c.isalnum() else "-" for c in Path(backing).stem)
             with edge_for(backing, self.setup.llm, self.out / f"edge-{name}.log", self.console) as edge:
                 for planned in (p for p in flights if p.backing == backing):
-                    yield planned, fly_over(edge, planned)
+                    yield planned, fly_with_edge(edge, planned)
 
-    def _here(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, Flown | None]]:
-        apart = [planned for planned in flights if self.workers > 1 or planned.plans]
-        for planned in (planned for planned in flights if planned not in apart):
-            yield planned, self._landed(planned, lambda planned=planned: fly_here(planned))  # type: ignore[misc]
-        if apart:
+    def _fly_locally(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
+        pooled = [planned for planned in flights if self.workers > 1 or planned.plans]
+        for planned in (planned for planned in flights if planned not in pooled):
+            yield planned, self._record_of(planned, lambda planned=planned: fly_locally(planned))  # type: ignore[misc]
+        if pooled:
             with _workers(self.workers) as pool:
-                futures = {pool.submit(fly_here, planned): planned for planned in apart}
+                futures = {pool.submit(fly_locally, planned): planned for planned in pooled}
                 for future in as_completed(futures):
-                    yield futures[future], self._landed(futures[future], future.result)
+                    yield futures[future], self._record_of(futures[future], future.result)
 
-    def _landed(self, planned: Planned, fly: Callable[[], Flown]) -> Flown | None:
+    def _record_of(self, planned: Planned, fly: Callable[[], FlightRecord]) -> FlightRecord | None:
         try:
             return fly()
         except CannotFly as error:
             self.grounded.setdefault(f"{planned.scheme.label} on {planned.site_name}", str(error))
             return None
 
-    def _doubt(self, planned: Planned, flight: Flown) -> None:
-        instead = policys_instead(flight)
-        if planned.scheme.is_answered and instead > 3:
+    def _warn_of_substitutes(self, planned: Planned, flight: FlightRecord) -> None:
+        substituted = substituted_decisions(flight)
+        if planned.scheme.is_answered and substituted > 3:
             self.console.print(
-                f"{planned.scheme.label}, seed {planned.seed}: {instead} of {len(flight.decisions)} decisions were not "
-                "the LLM's but taken in its place; the result says so",
+                f"{planned.scheme.label}, seed {planned.seed}: {substituted} of {len(flight.decisions)} decisions were "
+                "not the LLM's but taken in its place; the result says so",
                 markup=False,
                 highlight=False,
             )
 
-    def _write(self, made: Plan) -> Result:
+    def _write(self, plan: Plan) -> Result:
         from simulator.experiments.findings import findings, tidy
         from simulator.experiments.plots import draw
 
-        said = [f"{who} cannot fly: {why}" for who, why in self.grounded.items() if _concerns(made, who)]
-        result = findings(made, self.setup, self.command_of(made.experiment), commit(), self.store.load, said)
-        folder = self.out / made.experiment.name
+        notes = [f"{label} cannot fly: {why}" for label, why in self.grounded.items() if _concerns(plan, label)]
+        result = findings(plan, self.setup, self.command_of(plan.experiment), commit(), self.store.load, notes)
+        folder = self.out / plan.experiment.name
         with naming_out(folder):
             folder.mkdir(parents=True, exist_ok=True)
             (folder / RESULT).write_text(result.model_dump_json(indent=1) + "\n", encoding="utf-8")
@@ -160,20 +162,21 @@ class Run:
         return result
 
 
-def _concerns(made: Plan, who: str) -> bool:
-    return any(who == f"{flight.scheme.label} on {flight.site_name}" for flight in made.flights)
+def _concerns(plan: Plan, label: str) -> bool:
+    return any(label == f"{flight.scheme.label} on {flight.site_name}" for flight in plan.flights)
 
 
 def _order(planned: Planned) -> tuple[bool, bool, bool]:
-    """Cheap first: policies, planners and bounds, edges without an LLM, edges with one."""
+    """The sort key for cheap flights first: policies, planners and bounds, edges without an LLM, edges with one."""
     return planned.scheme.asks_llm, planned.backing is not None, planned.plans
 
 
 @contextmanager
 def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes to fly in, ended at once when this one is interrupted.
+    """A pool of processes for flights, terminated when this process is interrupted.
 
-    Planners need one even if it is alone: OR-Tools takes SIGINT for itself to search, and does not give it back.
+    Planners need a separate process: OR-Tools installs a SIGINT handler for its search and does not restore the old
+    one.
     """
     # Forked children would inherit this process's threads and sockets.
     spawn = multiprocessing.get_context("spawn")
@@ -190,7 +193,7 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _ignore_interrupts() -> None:
-    # Ctrl-C reaches every process of the terminal; the parent alone decides what it means.
+    # Ctrl-C reaches every process of the terminal; only the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -200,20 +203,20 @@ def _progress(console: Console, total: int) -> Iterator[Callable[[Planned, float
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
-        TextColumn("flights, about {task.fields[left]} left; {task.fields[news]}"),
+        TextColumn("flights, about {task.fields[left]} left; {task.fields[flight]}"),
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("Flying", total=total, left="?", news="")
-        told_at, done = time.monotonic(), 0
+        task = progress.add_task("Flying", total=total, left="?", flight="")
+        printed_at, done = time.monotonic(), 0
 
-        def tell(planned: Planned, left_s: float) -> None:
-            nonlocal told_at, done
+        def advance(planned: Planned, left_s: float) -> None:
+            nonlocal printed_at, done
             done += 1
-            news = f"{planned.scheme.name}, seed {planned.seed}"
-            progress.update(task, advance=1, left=told(left_s), news=news)
-            if not console.is_terminal and time.monotonic() - told_at > _TELL_EVERY_S:
-                told_at = time.monotonic()
-                console.print(f"{done} of {total} flights, about {told(left_s)} left; {news}", highlight=False)
+            flight, left = f"{planned.scheme.name}, seed {planned.seed}", duration_text(left_s)
+            progress.update(task, advance=1, left=left, flight=flight)
+            if not console.is_terminal and time.monotonic() - printed_at > _REPORT_EVERY_S:
+                printed_at = time.monotonic()
+                console.print(f"{done} of {total} flights, about {left} left; {flight}", highlight=False)
 
-        yield tell
+        yield advance

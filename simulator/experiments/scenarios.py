@@ -1,19 +1,19 @@
-"""The main schemes beyond the paper's world: a pipeline, a weak link, a dense field, a lossy uplink, one's own."""
+"""The main schemes beyond the paper's world: a pipeline, a weak link, a dense field, a lossy uplink, a user's world."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import (
     CHANCE,
     PLANNER,
     Scheme,
     at_full_speed,
+    available_locals,
     edge_planner,
     edge_policy,
     guided,
     llm,
-    locals_there_are,
     value,
     value_as_written,
 )
@@ -24,7 +24,7 @@ _POLICIES = ("madqn", "mappo", PLANNER, "eof", "wqcs", "max_gain", "nearest", "r
 def _schemes(setup: Setup) -> list[Scheme]:
     draws = guided("guided_chance", "guided, LLM draws", backing=CHANCE)
     ours = [llm(), guided(), draws, value_as_written(), value(), edge_policy(), edge_planner()]
-    return [*ours, *locals_there_are(*_POLICIES), at_full_speed("eof")]
+    return [*ours, *available_locals(*_POLICIES), at_full_speed("eof")]
 
 
 EXPERIMENT = Experiment(
@@ -33,9 +33,9 @@ EXPERIMENT = Experiment(
     summary="the main schemes on paper, pipeline, stress, dense, lossy_uplink, and on --world's",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "jain", "llm_decided_pct"),
-    drawings=(
-        Drawing("scenarios_packets", "bars", ("lost_packets",), "Lost packets of a mission by scenario."),
-        Drawing("scenarios_events", "bars", ("events",), "Loss events (Eq. 5) of a mission by scenario."),
+    figures=(
+        FigureSpec("scenarios_packets", "bars", ("lost_packets",), "Lost packets of a mission by scenario."),
+        FigureSpec("scenarios_events", "bars", ("events",), "Loss events (Eq. 5) of a mission by scenario."),
     ),
     reference="eof",
     pairs=(("guided", "wqcs"), ("guided_chance", "wqcs")),

@@ -1,9 +1,9 @@
-"""Every scheme on the same worlds, and the least that any could have lost (the paper's comparison of schedulers)."""
+"""Every scheme and the clairvoyant bound on the same worlds (the paper's comparison of schedulers)."""
 
 from __future__ import annotations
 
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import BOUND, Scheme, every_scheme
 
 
@@ -17,9 +17,11 @@ EXPERIMENT = Experiment(
     summary="every scheme and the clairvoyant bound: lost packets and loss events, per step and cumulative",
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "collected", "velocity", "llm_decided_pct"),
-    drawings=(
-        Drawing("scheduler", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), per step and cumulative."),
-        Drawing("scheduler_totals", "bars", LOSSES, "Lost packets and loss events (Eq. 5) of a mission."),
+    figures=(
+        FigureSpec(
+            "scheduler", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), per step and cumulative."
+        ),
+        FigureSpec("scheduler_totals", "bars", LOSSES, "Lost packets and loss events (Eq. 5) of a mission."),
     ),
     reference="eof",
     notes=(

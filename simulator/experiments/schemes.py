@@ -1,4 +1,4 @@
-"""Schemes: who decides for the fleet in an experiment, and what people call them."""
+"""The schemes of experiments: deciders for the fleet, with their names and labels."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from pydantic import Field
 
 from shared.wire import MissionSpec
 from simulator.experiments.operators import Operator
-from simulator.record import Record
+from simulator.records.record import Record
 
-# Decisions through an edge are compared for what they are, not for how fast this machine is.
+# So long that the speed of this machine does not change an edge's decisions.
 GENEROUS_DEADLINE_MS = 30_000
 
-# What answers behind an edge: nothing, what --llm names, uniform draws, the worst of what is offered, or a model file
-# by its path.
+# The LLM behind an edge: none, that of --llm, uniform draws, the worst of the candidates, or a model file by its path.
 Backing = str
-OFF, ASKED, CHANCE, WORST = "off", "asked", "chance", "worst"
+OFF, NAMED_BY_OPTION, CHANCE, WORST = "off", "asked", "chance", "worst"
 
 
 class Local(Record):
-    """A policy of the simulator's own; ``velocity`` is the policy's or the scenario's highest throughout."""
+    """A local policy; ``velocity`` is the policy's own, or the scenario's highest throughout."""
 
     kind: Literal["local"] = "local"
     policy: str
@@ -28,29 +27,29 @@ class Local(Record):
 
 
 class OverEdge(Record):
-    """An edge asked over HTTP. ``spec`` is the mission to make, its scenario and seed aside.
+    """An edge over HTTP. ``spec`` is its mission's, without scenario and seed.
 
-    ``backing`` is ``off`` (an edge without LLM), ``asked`` (what ``--llm`` names), ``chance`` (an LLM that answers
-    uniform draws), ``worst`` (the emptiest queue, as fast as can be) or a GGUF file's path. ``deadline_ms`` of ``None``
-    is the edge's own. ``operator`` says what is asked of the fleet in words, if anything is.
+    ``backing`` is ``off`` (no LLM), ``asked`` (the LLM of ``--llm``), ``chance`` (an LLM that answers uniform draws),
+    ``worst`` (the emptiest queue at the highest velocity) or a GGUF file's path. ``deadline_ms`` of ``None`` is the
+    edge's default. ``operator`` guides the fleet, if set.
     """
 
     kind: Literal["edge"] = "edge"
     spec: dict[str, Any]
-    backing: Backing = ASKED
+    backing: Backing = NAMED_BY_OPTION
     deadline_ms: int | None = GENEROUS_DEADLINE_MS
     operator: Operator | None = None
 
 
 class Clairvoyant(Record):
-    """No scheme but the bound to judge them by: the least that a fleet could lose, all arrivals known."""
+    """The clairvoyant bound, a reference for all schemes: the least that a fleet could lose, all arrivals known."""
 
     kind: Literal["bound"] = "bound"
     seconds: float = 60.0
 
 
 class Scheme(Record):
-    """Who decides, under a name for files and a label for people."""
+    """A decider, with a name for files and a label for display."""
 
     name: str
     label: str
@@ -58,17 +57,17 @@ class Scheme(Record):
 
     @property
     def is_answered(self) -> bool:
-        """Whether its decisions are answers of what is behind its edge, and the edge's policy's are not its own."""
+        """Whether its decisions are those of its edge's backing, so that decisions of the edge's policy are not."""
         return isinstance(self.decides, OverEdge) and self.decides.backing != OFF
 
     @property
     def asks_llm(self) -> bool:
-        """Whether a flight takes an LLM's time."""
+        """Whether its flights query a real LLM."""
         return self.is_answered and not (isinstance(self.decides, OverEdge) and self.decides.backing in (CHANCE, WORST))
 
 
 PLANNER = "mpc"
-# In the order to show them. Which of them a figure shows depends on which policies this version has.
+# In display order. A figure shows those that are policies of this version.
 _POLICY_LABELS = {
     "madqn": "MADQN",
     "mappo": "MAPPO",
@@ -89,14 +88,14 @@ def local(name: str) -> Scheme:
 
 
 def at_full_speed(name: str) -> Scheme:
-    """Another policy's sensors at the scenario's highest velocity, to tell scheduling from flying fast."""
+    """Another policy's sensors at the scenario's highest velocity, to separate scheduling from speed."""
     label = f"{_POLICY_LABELS.get(name, name)} at full speed"
     return Scheme(name=f"{name}_fast", label=label, decides=Local(policy=name, velocity="full"))
 
 
-def locals_there_are(*names: str) -> list[Scheme]:
-    """Those of ``names`` that this version of the simulator has, in the order to show them; of no names, all."""
-    from simulator.policies import POLICY_NAMES
+def available_locals(*names: str) -> list[Scheme]:
+    """The local policies of ``names`` that this version has, in display order; without names, all of them."""
+    from simulator.policies.registry import POLICY_NAMES
 
     wanted = names or (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
     return [local(name) for name in wanted if name in POLICY_NAMES]
@@ -106,19 +105,19 @@ def over_edge(
     name: str,
     label: str,
     *,
-    backing: Backing = ASKED,
+    backing: Backing = NAMED_BY_OPTION,
     deadline_ms: int | None = GENEROUS_DEADLINE_MS,
     operator: Operator | None = None,
     **spec: Any,
 ) -> Scheme:
-    """An edge whose mission has the ``spec`` fields given; 5 sensors kept and mode ``llm`` unless told.
+    """An edge whose mission has the given ``spec`` fields; by default k is 5 and the mode is ``llm``.
 
     Raises:
-        pydantic.ValidationError: the spec is no mission's.
+        pydantic.ValidationError: the spec is invalid.
     """
     whole = MissionSpec.model_validate({"mode": "llm", "top_k": 5, **spec})
-    kept = whole.model_dump(mode="json", exclude_defaults=True, exclude={"scenario", "seed"})
-    decides = OverEdge(spec=kept, backing=backing, deadline_ms=deadline_ms, operator=operator)
+    given = whole.model_dump(mode="json", exclude_defaults=True, exclude={"scenario", "seed"})
+    decides = OverEdge(spec=given, backing=backing, deadline_ms=deadline_ms, operator=operator)
     return Scheme(name=name, label=label, decides=decides)
 
 
@@ -133,26 +132,26 @@ def guided(name: str = "guided", label: str = "AIC-VDS, mode guided", **spec: An
 
 
 def value_as_written(name: str = "value", label: str = "AIC-VDS, mode value, paper's view", **spec: Any) -> Scheme:
-    """What the edge's modules have learned decides, from the paper's features and each UAV's own reports; no LLM."""
+    """The edge's learned modules without an LLM, with the paper's features and each UAV's own reports."""
     return over_edge(name, label, mode="value", features="paper", belief="reported", backing=OFF, **spec)
 
 
 def value() -> Scheme:
-    """The same with features that look along the trajectory, from the fleet's belief."""
+    """The edge's learned modules without an LLM, with features along the trajectory from the fleet's belief."""
     return over_edge("value_reach", "AIC-VDS, mode value", mode="value", backing=OFF)
 
 
 def edge_planner() -> Scheme:
-    """What the edge answers while its LLM is down."""
+    """The edge's planner, which decides while the LLM is down."""
     return over_edge("edge_planner", "edge's planner (LLM down)", mode="policy", backing=OFF)
 
 
 def edge_policy() -> Scheme:
-    """The same where the planner is not installed, from each UAV's own reports."""
+    """The edge's look-ahead, which decides without the planner, from each UAV's own reports."""
     return over_edge("edge_policy", "edge's look-ahead (no planner)", planner="off", backing=OFF)
 
 
 def every_scheme() -> list[Scheme]:
-    """All that can fly, in the order to show them."""
+    """All schemes that can fly, in display order."""
     ours = [llm(), guided(), value_as_written(), value(), edge_policy(), edge_planner()]
-    return [*ours, *locals_there_are(), at_full_speed("eof"), at_full_speed("wqcs")]
+    return [*ours, *available_locals(), at_full_speed("eof"), at_full_speed("wqcs")]

@@ -1,6 +1,6 @@
-"""LLM servers that stand in for an LLM: one answers a uniform draw among what it may say, one the worst of it.
+"""Servers in place of an LLM: one answers a uniform draw of the allowed answers, one the worst of them.
 
-What a scheme with them loses is what everything but the LLM gives by itself; an LLM must beat that.
+The losses of a scheme with them show the contribution of everything but the LLM, which an LLM must beat.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ROW = re.compile(r"^([A-Z])(\d+),", re.MULTILINE)
 
 
 def drawn(body: dict[str, Any]) -> str:
-    """An answer uniform over what the request's grammar allows; the same request gets the same answer.
+    """A uniform draw of the answers that the request's grammar allows; the same request gets the same answer.
 
     Raises:
         ValueError: the request has no grammar such as ``root ::= ("3" | "5") " " ("0" | "1")`` or
@@ -44,9 +44,9 @@ def drawn(body: dict[str, Any]) -> str:
 
 
 def worst(body: dict[str, Any]) -> str:
-    """The row of the emptiest queue at its fastest velocity in mode ``guided``; in ``llm`` the farthest, hovering.
+    """In mode ``guided`` the emptiest queue at its highest velocity; in ``llm`` the farthest sensor at velocity 0.
 
-    Whatever else is asked, such as what an edge asks to see that the grammar is obeyed, is answered by a draw.
+    Other requests, such as an edge's probe of the grammar, are answered by a draw.
 
     Raises:
         ValueError: as :func:`drawn`.
@@ -68,7 +68,7 @@ def worst(body: dict[str, Any]) -> str:
     return [letter for letter in letters if letter < (min(later) if later else "[")][-1]
 
 
-# What each calls itself, as a model.
+# The model name of each.
 NAMES: dict[Answer, str] = {drawn: "uniform draws", worst: "the worst"}
 
 
@@ -101,7 +101,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def answering(answer: Answer) -> Iterator[str]:
-    """Such a server on a free loopback port; yields its base URL, up to and including ``/v1``."""
+    """Within the context, run the server on a free loopback port; yields its base URL up to and including ``/v1``."""
     handler = type("Handler", (_Handler,), {"answer": staticmethod(answer)})
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.daemon_threads = True

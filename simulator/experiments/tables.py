@@ -1,7 +1,7 @@
-"""The results page's tables: a result's measures and its paired comparisons, none too wide to read.
+"""The results page's tables: a result's measures and its paired comparisons, each narrow enough for a page.
 
-What was measured in one scenario has a row a scheme and a column a measure. What was measured in several is told one
-measure a table, with a column a scenario.
+Measures of one scenario have a row a scheme and a column a measure. A measure of several scenarios has its own table,
+with a column a scenario.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ Found = Interval | Paired | None
 
 @dataclass(frozen=True)
 class Table:
-    """A table to print: a row has a cell a column; ``caption`` is empty where the columns say all.
+    """A table to print, with a cell a row and column.
 
-    Without rows the caption says all.
+    ``caption`` may be empty. A table without rows consists of its caption.
     """
 
     caption: str
@@ -34,18 +34,18 @@ class Table:
 
 
 def measure_tables(result: Result) -> list[Table]:
-    """What every scheme scored; its label is marked where its seeds are few."""
+    """The measures of every scheme; a mark at the label means few seeds."""
     measures = list(dict.fromkeys(m for found in result.schemes.values() for m in found))
     if any(_site_of(measure) for measure in measures):
         return _by_site(result, measures)
-    left, tables = iter(measures), []
-    while some := list(islice(left, COLUMNS)):
+    remaining, tables = iter(measures), []
+    while some := list(islice(remaining, COLUMNS)):
         rows = {row_label(result, name): [measured(result, name, m) for m in some] for name in result.schemes}
         if result.bound.keys() & set(some):
             rows[BOUND_LABEL] = [result.bound.get(m) for m in some]
         digits = [_digits(column) for column in zip(*rows.values(), strict=True)]
-        told = [[label, *map(cell, cells, digits)] for label, cells in rows.items()]
-        tables.append(Table("", ["scheme", *(label_of(result, m) for m in some)], told))
+        texts = [[label, *map(cell, cells, digits)] for label, cells in rows.items()]
+        tables.append(Table("", ["scheme", *(label_of(result, m) for m in some)], texts))
     return tables
 
 
@@ -57,13 +57,13 @@ def _by_site(result: Result, measures: Sequence[str]) -> list[Table]:
             for scheme in result.schemes
         }
         digits = _digits([found for cells in rows.values() for found in cells])
-        told = {label: [cell(found, digits) for found in cells] for label, cells in rows.items()}
+        texts = {label: [cell(found, digits) for found in cells] for label, cells in rows.items()}
         caption = _sited_label(result, name, sites[0])
-        values = {text for cells in told.values() for text in cells} - {NONE}
+        values = {text for cells in texts.values() for text in cells} - {NONE}
         if len(values) == 1:
             tables.append(Table(f"{caption}: {values.pop()} for every scheme in every scenario", [], []))
         else:
-            tables.append(Table(caption, ["scheme", *sites], [[label, *cells] for label, cells in told.items()]))
+            tables.append(Table(caption, ["scheme", *sites], [[label, *cells] for label, cells in texts.items()]))
     return tables
 
 
@@ -79,9 +79,9 @@ def pair_tables(result: Result) -> list[Table]:
             label_of(result, scheme),
             _reference_label(result, reference),
             label_of(result, measure),
-            *(_pair_cell(told.get(kind)) for kind in ("difference", "ratio")),
+            *(_pair_cell(kinds.get(kind)) for kind in ("difference", "ratio")),
         ]
-        for (scheme, reference, measure), told in both.items()
+        for (scheme, reference, measure), kinds in both.items()
     ]
     return [Table("", ["scheme", "against", "measure", "difference", "ratio"], rows)] if rows else []
 
@@ -105,7 +105,7 @@ def _pairs_by_site(result: Result, both: Mapping[tuple[str, str, str], Mapping[s
 
 
 def _site_of(measure: str) -> str:
-    """The site that a measure's name has, such as ``stress`` of ``events@stress``; empty where there was only one."""
+    """The site in a measure's name, such as ``stress`` in ``events@stress``; empty for a result of one site."""
     return measure.partition("@")[2]
 
 
@@ -127,7 +127,7 @@ def _reference_label(result: Result, name: str) -> str:
 
 
 def row_label(result: Result, name: str) -> str:
-    """How people call a scheme, marked where its seeds are too few for a claim."""
+    """A scheme's label, with a mark if its seeds are too few for a claim."""
     return label_of(result, name) + (FEW if seeds_flown(result, name) < CLAIM_SEEDS else "")
 
 
@@ -141,7 +141,7 @@ def _pair_cell(found: Paired | None) -> str:
 
 
 def cell(found: Found, digits: int = 1) -> str:
-    """A mean with its interval, to so many decimals and whole when it is large; a dash where there is none."""
+    """A mean with its interval, with so many decimals below 100 and none from there on; a dash for ``None``."""
     if found is None:
         return NONE
     decimals = 0 if abs(found.mean) >= 100 else digits

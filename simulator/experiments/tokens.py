@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from simulator.experiments.plan import Drawing, Experiment, Setup
+from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.schemes import Scheme, edge_policy, guided, llm, over_edge, value
 
 _STATE = ("state_tokens", "state_uncompressed")
@@ -19,11 +19,11 @@ EXPERIMENT = Experiment(
     summary="state-block and prompt tokens a decision, with and without attention",
     schemes=_schemes,
     measures=(*_STATE, "state_saved_pct", *_PROMPT, "prompt_saved_pct", "cached_tokens", "completion_tokens"),
-    drawings=(
-        Drawing(
+    figures=(
+        FigureSpec(
             "tokens_state", "bars", _STATE, "Tokens of the state block a decision, as sent and as it would be whole."
         ),
-        Drawing(
+        FigureSpec(
             "tokens_prompt", "bars", _PROMPT, "Tokens of the whole prompt a decision, as sent and with a whole state."
         ),
     ),

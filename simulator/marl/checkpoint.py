@@ -1,4 +1,4 @@
-"""Trained weights in a file: what they are for, how they were made, and the network that they make."""
+"""Trained weights in a file, with their scenario and their origin, and the network made from them."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ import torch
 from torch import Tensor, nn
 
 from shared.scenario import Scenario
+from simulator.errors import UsageError
 from simulator.marl.networks import two_heads
-from simulator.record import BadUse
 
 
-class Misfit(BadUse, ValueError):
-    """The weights are for scenarios of another size; a command tells it in one line, as it does any bad use."""
+class Misfit(UsageError, ValueError):
+    """The weights are for scenarios of another size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Weights of :func:`simulator.marl.networks.two_heads` in float32, and where they come from.
+    """Weights of :func:`simulator.marl.networks.two_heads` in float32, and their origin.
 
     Attributes:
-        scenario: that they were trained in.
-        episodes, seed: missions flown in training, and the seed of it.
-        command: that made them.
-        version: of this package, then.
+        scenario: of the training.
+        episodes, seed: number of training missions, and the training's seed.
+        command: the command line of the training.
+        version: of this package at the training.
         weights: the network's ``state_dict``.
     """
 
@@ -41,34 +41,34 @@ class Checkpoint:
     weights: dict[str, Tensor] = field(repr=False)
 
     def save(self, path: Path) -> None:
-        """Write it whole or not at all."""
+        """Write the checkpoint atomically."""
         write({**asdict(self), "scenario": self.scenario.model_dump_json()}, path)
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
-        """Read one.
+        """Read a checkpoint.
 
         Raises:
-            ValueError: the file holds no such checkpoint.
-            OSError: it cannot be read.
+            ValueError: the file contains no such checkpoint.
+            OSError: the file cannot be read.
         """
-        held = read(path)
+        content = read(path)
         try:
-            return cls(**{**held, "scenario": Scenario.model_validate_json(held["scenario"])})
+            return cls(**{**content, "scenario": Scenario.model_validate_json(content["scenario"])})
         except (KeyError, TypeError, ValueError):
-            raise ValueError(f"{path} holds no trained policy: train one with `aicvds train`") from None
+            raise ValueError(f"{path} has no trained policy: train one with `aicvds train`") from None
 
     def network(self, scenario: Scenario) -> nn.Module:
-        """The network, for missions of a scenario.
+        """The network for missions of a scenario.
 
         Raises:
             Misfit: the network was trained for other numbers of sensors, UAVs or velocities.
         """
         for name in ("sensors", "uavs", "max_velocity"):
-            trained, asked = getattr(self.scenario, name), getattr(scenario, name)
-            if trained != asked:
+            trained, requested = getattr(self.scenario, name), getattr(scenario, name)
+            if trained != requested:
                 raise Misfit(
-                    f"{self.scheme} was trained for {name} {trained}, scenario {scenario.name} has {asked}: "
+                    f"{self.scheme} was trained for {name} {trained}, scenario {scenario.name} has {requested}: "
                     f"train one with `aicvds train {self.scheme} --scenario {scenario.name}`"
                 )
         network = two_heads(scenario)
@@ -83,28 +83,28 @@ def shipped(scheme: str) -> Checkpoint:
 
 
 def write(content: dict[str, Any], path: Path) -> None:
-    """Tensors and plain values to a file, which is there whole or as it was before, even after a power cut."""
+    """Write tensors and plain values to a file atomically, even across a power cut."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    half = path.with_name(f"{path.name}.part")
-    with half.open("wb") as file:
+    part = path.with_name(f"{path.name}.part")
+    with part.open("wb") as file:
         torch.save(content, file)
         file.flush()
         os.fsync(file.fileno())
-    half.replace(path)
+    part.replace(path)
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What ``write`` wrote; runs no code from the file.
+    """Read a file of ``write`` without running code from it.
 
     Raises:
-        ValueError: the file is none of ours.
-        OSError: it cannot be read.
+        ValueError: the file is no checkpoint.
+        OSError: the file cannot be read.
     """
     try:
         with path.open("rb") as file:
-            held: dict[str, Any] = torch.load(file, weights_only=True)
+            content: dict[str, Any] = torch.load(file, weights_only=True)
     except OSError:
         raise
     except Exception as error:
         raise ValueError(f"{path} is no checkpoint of `aicvds train` ({type(error).__name__})") from None
-    return held
+    return content

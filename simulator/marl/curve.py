@@ -1,4 +1,4 @@
-"""The learning curve of a training: rows as it goes, a CSV, a plot."""
+"""The learning curve of a training: its points, a CSV file and a plot."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class Point:
     """One row of a learning curve.
 
     Attributes:
-        episode: missions flown in training by then.
-        lost_packets: a mission, mean of those flown since the row before, exploration included.
-        episode_return: mean over the UAVs of the sum of rewards of a mission, of the same missions.
-        loss: the mean training loss since the row before.
-        greedy_lost_packets: a mission without exploration, mean over held-out worlds.
+        episode: number of training missions so far.
+        lost_packets: mean per mission since the previous row, exploration included.
+        episode_return: of the same missions, the mean over missions and UAVs of the sum of rewards.
+        loss: the mean training loss since the previous row.
+        greedy_lost_packets: mean per mission over held-out worlds, without exploration.
     """
 
     episode: int
@@ -28,7 +28,7 @@ class Point:
 
 
 def write_csv(points: Sequence[Point], path: Path) -> None:
-    """One line a point, under the names of the fields."""
+    """Write one line a point, with the names of the fields as the header."""
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.DictWriter(file, [field.name for field in fields(Point)], lineterminator="\n")
         rows.writeheader()
@@ -36,7 +36,7 @@ def write_csv(points: Sequence[Point], path: Path) -> None:
 
 
 def read_csv(path: Path) -> list[Point]:
-    """What ``write_csv`` wrote."""
+    """Read a file of ``write_csv``."""
     with path.open(newline="", encoding="utf-8") as file:
         return [
             Point(int(row.pop("episode")), **{name: float(value) for name, value in row.items()})
@@ -45,7 +45,7 @@ def read_csv(path: Path) -> list[Point]:
 
 
 def plot(points: Sequence[Point], title: str, stem: Path) -> None:
-    """Lost packets over episodes, as PNG and SVG beside each other."""
+    """Plot lost packets over episodes, to a PNG and an SVG file."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.0, 3.6), layout="constrained")

@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 
 from shared.scenario import Scenario
 from simulator.marl.observation import stacked, width
-from simulator.vector import BatchObservation, VectorWorld
 from simulator.world import Cost
+from simulator.world.batch import BatchObservation, VectorWorld
 
 
 class PipelineEnv(EnvBase):  # type: ignore[misc]
@@ -25,14 +25,14 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
     | key | shape, type | meaning |
     |---|---|---|
     | ``agents, observation`` | ``(B, I, F)`` float32 | each UAV's, by :func:`simulator.marl.observation.view` |
-    | ``agents, action_mask`` | ``(B, I, J + V)`` bool | what each may choose |
+    | ``agents, action_mask`` | ``(B, I, J + V)`` bool | the slots and velocities allowed |
     | ``agents, action`` | ``(B, I, 2)`` int64 | slot of the sensor in the UAV's own order, velocity in m/s |
     | ``agents, reward`` | ``(B, I, 1)`` float32 | minus the world's cost |
     | ``state`` | ``(B, 1 + 2 I + 4 J)`` float32 | the true state, for a critic |
     | ``lost_packets`` | ``(B, 1)`` float32 | of the step, for the learning curve |
 
-    At step T a mission is done and terminated, not truncated: what is lost later is no part of its loss, and the
-    observation tells the step.
+    At step T a mission is done and terminated, not truncated: later losses are no part of its loss, and the observation
+    has the step.
     """
 
     batch_locked = True
@@ -61,24 +61,24 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         worlds = self.batch_size[0]
-        seen = self._world.reset(range(self.next_seed, self.next_seed + worlds))
+        observation = self._world.reset(range(self.next_seed, self.next_seed + worlds))
         self.next_seed += worlds
-        return self._told(seen, np.zeros(worlds))
+        return self._tensors(observation, np.zeros(worlds))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["agents", "action"].numpy()
         sensors = np.take_along_axis(self._order, action[..., :1], axis=-1)[..., 0]
-        seen, came = self._world.step(sensors, action[..., 1])
-        told = self._told(seen, came.lost_packets)
-        told["agents", "reward"] = torch.from_numpy(came.reward.astype(np.float32)[..., None])
-        return told
+        observation, outcome = self._world.step(sensors, action[..., 1])
+        tensors = self._tensors(observation, outcome.lost_packets)
+        tensors["agents", "reward"] = torch.from_numpy(outcome.reward.astype(np.float32)[..., None])
+        return tensors
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.next_seed = seed
 
-    def _told(self, seen: BatchObservation, lost: NDArray[Any]) -> TensorDict:
-        views = stacked(self._world.scenario, seen)
+    def _tensors(self, observation: BatchObservation, lost: NDArray[Any]) -> TensorDict:
+        views = stacked(self._world.scenario, observation)
         self._order = views.order
         over = torch.full((*self.batch_size, 1), self._world.steps_flown == self._world.scenario.steps)
         agents = {"observation": torch.from_numpy(views.features), "action_mask": torch.from_numpy(views.mask)}

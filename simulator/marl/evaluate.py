@@ -1,4 +1,4 @@
-"""How well a network flies: greedy missions over a batch of worlds."""
+"""Evaluation of a network by greedy missions over a batch of worlds."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from collections.abc import Sequence
 import numpy as np
 from torch import nn
 
+from shared.channel import IntArray
 from shared.scenario import Scenario
 from simulator.marl.networks import greedy
 from simulator.marl.observation import of_uav, view, without
-from simulator.sensors import IntArray
-from simulator.vector import VectorWorld
+from simulator.world.batch import VectorWorld
 
 
 def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -> IntArray:
-    """Packets that a greedy fleet loses in each world, ``(B,)``: what ``rollout`` of the trained policy would lose.
+    """Packets that a greedy fleet loses in each world, ``(B,)``; equal to those of ``rollout`` with the trained policy.
 
-    UAV 0 decides first, and none takes a sensor that an earlier one took.
+    UAV 0 decides first, and no UAV takes a sensor that an earlier one took.
     """
     world = VectorWorld(scenario)
-    seen = world.reset(seeds)
+    observation = world.reset(seeds)
     rows = np.arange(len(seeds))
     lost = np.zeros(len(seeds), dtype=np.int64)
     for _ in range(scenario.steps):
         taken = np.zeros((len(seeds), scenario.sensors), dtype=np.bool_)
         actions = np.zeros((len(seeds), scenario.uavs, 2), dtype=np.int64)
         for uav in range(scenario.uavs):
-            own = view(scenario, uav, of_uav(seen, uav))
+            own = view(scenario, uav, of_uav(observation, uav))
             slot, velocity = greedy(network, scenario.sensors, own.features, without(own, taken)).T
             actions[:, uav] = np.stack((own.order[rows, slot], velocity), axis=-1)
             taken[rows, actions[:, uav, 0]] = True
-        seen, came = world.step(actions[..., 0], actions[..., 1])
-        lost += came.lost_packets
+        observation, outcome = world.step(actions[..., 0], actions[..., 1])
+        lost += outcome.lost_packets
     return lost

@@ -1,4 +1,4 @@
-"""MADQN: every UAV learns by itself the value of its own choices, with TorchRL's DQN loss and replay buffer."""
+"""MADQN: every UAV learns the value of its own choices independently, with TorchRL's DQN loss and replay buffer."""
 
 from __future__ import annotations
 
@@ -25,23 +25,24 @@ REPLAY = 1_000_000
 TAU = 0.005
 UPDATE_TARGET_EVERY = 3
 EPISODES = 1000
-# Where the table is silent.
+# Not in the paper's table.
 WORLDS = 10
 ITERATIONS_A_STEP = 4
 WARM_UP = 900
 EPSILON_END = 0.05
 EPSILON_SHARE = 0.5
-# Where the loss keeps the weights of the first module of the actor.
+# The prefix of the actor's first module in the loss's parameter names.
 _VALUES = "module.0.module."
 
 
 class Madqn:
-    """Independent deep Q-learning with one network for all UAVs, told apart by the features.
+    """Independent deep Q-learning with one network for all UAVs; the features identify the UAV.
 
-    The value of a choice is the sum of its heads', ``Q(sensor) + Q(velocity)``: that is how the library trains two
-    heads, so neither knows what the other chose. An iteration is one gradient step on 100 transitions out of the
-    replay buffer. The target network follows every third by ``tau``; being the mean of many, it flies steadier than the
-    one in training, and is what ``network`` gives. The reward is minus Eq. 5's cost, the same for every UAV.
+    The value of a choice is the sum over its heads, ``Q(sensor) + Q(velocity)``: the library trains two heads this way,
+    and neither head sees the choice of the other. An iteration is one gradient step on 100 transitions from the replay
+    buffer. Every third iteration updates the target network by ``tau``. The target network averages many iterations, so
+    it is steadier than the online network, and ``network`` returns it. The reward is minus Eq. 5's cost, the same for
+    every UAV.
 
     Args:
         episodes: missions of the whole training, for the schedule of epsilon and the size of the replay buffer.
@@ -56,7 +57,7 @@ class Madqn:
         self._split = [scenario.sensors, scenario.max_velocity + 1]
         self._env = PipelineEnv(scenario, WORLDS, first_seed, cost="paper")
         online = two_heads(scenario)
-        self._flown = two_heads(scenario)
+        self._target = two_heads(scenario)
         choices = MultiOneHot(self._split)
         chooser = QValueModule(
             action_space="mult_one_hot",
@@ -81,7 +82,7 @@ class Madqn:
         self._loss.make_value_estimator(gamma=DISCOUNT)
         self._follow = SoftUpdate(self._loss, tau=TAU)
         self._optimiser = torch.optim.Adam(self._loss.parameters(), lr=LEARNING_RATE, fused=True)
-        # Memory that a short training never fills need not be set aside.
+        # A short training never fills a larger buffer.
         capacity = min(REPLAY, episodes * scenario.steps * scenario.uavs)
         self._replay = ReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=BATCH)
         self._iterations = 0
@@ -90,28 +91,28 @@ class Madqn:
     def network(self) -> nn.Module:
         """The target network."""
         weights = self._loss.target_value_network_params.flatten_keys(".")
-        self._flown.load_state_dict({name.removeprefix(_VALUES): weight for name, weight in weights.items()})
-        return self._flown
+        self._target.load_state_dict({name.removeprefix(_VALUES): weight for name, weight in weights.items()})
+        return self._target
 
     def round(self) -> Round:
-        """Fly ``worlds`` missions, learning as they go."""
-        seen = self._env.reset()
-        lost, paid, losses = 0.0, 0.0, [0.0]
+        """Fly ``worlds`` missions, and learn at each step."""
+        before = self._env.reset()
+        lost, reward, losses = 0.0, 0.0, [0.0]
         for _ in range(self._steps):
-            agents = self._choose(seen["agents"])
+            agents = self._choose(before["agents"])
             slot, velocity = (part.argmax(-1) for part in agents["choice"].split(self._split, -1))
-            seen["agents", "action"] = torch.stack((slot, velocity), -1).view(*seen["agents"].batch_size, 2)
-            after = self._env.step(seen)["next"]
+            before["agents", "action"] = torch.stack((slot, velocity), -1).view(*before["agents"].batch_size, 2)
+            after = self._env.step(before)["next"]
             self._remember(agents, after)
             lost += float(after["lost_packets"].mean())
-            paid += float(after["agents", "reward"].mean())
+            reward += float(after["agents", "reward"].mean())
             if len(self._replay) >= WARM_UP:
                 losses += [self._iterate() for _ in range(ITERATIONS_A_STEP)]
-            seen = after
-        return Round(loss=sum(losses) / max(1, len(losses) - 1), lost_packets=lost, reward=paid)
+            before = after
+        return Round(loss=sum(losses) / max(1, len(losses) - 1), lost_packets=lost, reward=reward)
 
     def state(self) -> dict[str, Any]:
-        """All that a later ``restore`` needs to go on as if nothing had happened, but for the random generator."""
+        """The state for ``restore``, without that of the random generator."""
         return {
             "next_seed": self._env.next_seed,
             "iterations": self._iterations,
@@ -122,7 +123,7 @@ class Madqn:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a ``state``."""
+        """Continue from a ``state``."""
         self._env.next_seed = state["next_seed"]
         self._iterations = state["iterations"]
         self._loss.load_state_dict(state["loss"])
@@ -143,9 +144,9 @@ class Madqn:
         of_team = after["done"].repeat_interleave(rows // WORLDS, dim=0)
         following = after["agents"].select("observation", "action_mask", "reward").reshape(-1)
         following["done"], following["terminated"] = of_team, of_team.clone()
-        told = agents.select("observation", "action_mask")
-        told["choice"], told["next"] = agents["choice"].to(torch.uint8), following
-        self._replay.extend(told)
+        transitions = agents.select("observation", "action_mask")
+        transitions["choice"], transitions["next"] = agents["choice"].to(torch.uint8), following
+        self._replay.extend(transitions)
 
     def _iterate(self) -> float:
         loss: Tensor = self._loss(self._replay.sample())["loss"]

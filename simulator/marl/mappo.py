@@ -29,10 +29,10 @@ CLIP = 0.2
 ENTROPY = 0.01
 VALUE = 0.5
 EPOCHS = 4
-# Where the table is silent.
+# Not in the paper's table.
 EPISODES = 21_600
 WORLDS = 40
-SETTLING_ROUNDS = 40
+DECAY_ROUNDS = 40
 MINIBATCHES = 4
 DISCOUNT = 0.99
 LAMBDA = 0.9
@@ -41,10 +41,10 @@ GRADIENT_NORM = 0.5
 
 
 class SlotAndVelocity(Distribution):
-    """Two independent categorical choices as one, ``(..., 2)``, from logits ``(..., J + V)`` side by side.
+    """A pair of independent categorical choices, ``(..., 2)``, from concatenated logits ``(..., J + V)``.
 
     Args:
-        mask: of what may be chosen, like the logits.
+        mask: the choices allowed, of the logits' shape.
         velocities: V.
     """
 
@@ -57,27 +57,27 @@ class SlotAndVelocity(Distribution):
         super().__init__(logits.shape[:-1], torch.Size([2]), validate_args=False)
 
     def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Drawn choices."""
+        """A random pair of choices."""
         return torch.stack([part.sample(sample_shape) for part in self._parts], -1)  # type: ignore[no-untyped-call]
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Of both choices together, ``(...)``."""
+        """The joint log-probability of both choices, ``(...)``."""
         slot, velocity = self._parts
         both: Tensor = slot.log_prob(value[..., 0]) + velocity.log_prob(value[..., 1])  # type: ignore[no-untyped-call]
         return both
 
     def entropy(self) -> Tensor:
-        """Of both choices together, ``(...)``."""
+        """The joint entropy of both choices, ``(...)``."""
         return torch.stack([part.entropy() for part in self._parts]).sum(0)  # type: ignore[no-untyped-call]
 
     @property
     def mode(self) -> Tensor:
-        """The likeliest choices."""
+        """The most probable pair of choices."""
         return torch.stack([part.logits.argmax(-1) for part in self._parts], -1)
 
 
 class Critic(nn.Module):
-    """The value of the true state for each UAV, ``(..., I, 1)``: from the state and what that UAV sees."""
+    """The value of the true state for each UAV, ``(..., I, 1)``, from the state and the UAV's observation."""
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__()
@@ -93,9 +93,9 @@ class Critic(nn.Module):
 class Mappo:
     """Proximal policy optimisation with one actor network for all UAVs and one centralised critic.
 
-    A round flies ``worlds`` missions by the actors' draws, then takes 4 epochs over them in minibatches. Only the
-    critic sees the true state, and only in training. The reward is minus Eq. 5's cost, the same for every UAV. The
-    learning rate is the table's until the last 40 rounds, in which it falls to zero in even steps.
+    A round flies ``worlds`` missions with actions drawn by the actors, then trains for 4 epochs over them in
+    minibatches. Only the critic sees the true state, and only in training. The reward is minus Eq. 5's cost, the same
+    for every UAV. The learning rate is the table's until the last 40 rounds, in which it falls linearly to zero.
 
     Args:
         episodes: missions of the whole training.
@@ -108,10 +108,10 @@ class Mappo:
     def __init__(self, scenario: Scenario, episodes: int, first_seed: int) -> None:
         self._steps = scenario.steps
         self._last_seed = first_seed + episodes
-        self._settling = min(SETTLING_ROUNDS, max(1, episodes // WORLDS))
+        self._decay_rounds = min(DECAY_ROUNDS, max(1, episodes // WORLDS))
         self._env = PipelineEnv(scenario, WORLDS, first_seed, cost="paper")
         self.network = two_heads(scenario)
-        # The first draws should be as good as uniform, whatever the features.
+        # With small last weights, the first draws are almost uniform whatever the features.
         last = self.network[-1]
         assert isinstance(last, nn.Linear)
         nn.init.orthogonal_(last.weight, 0.01)
@@ -123,7 +123,7 @@ class Mappo:
                 out_keys=[("agents", "action")],
                 distribution_class=SlotAndVelocity,
                 distribution_kwargs={"velocities": scenario.max_velocity + 1},
-                # The library's default is the likeliest choice, from which nothing new is learned.
+                # The library's default is the most probable choice, which explores nothing.
                 default_interaction_type=InteractionType.RANDOM,
                 return_log_prob=True,
                 log_prob_key=("agents", "action_log_prob"),
@@ -149,13 +149,13 @@ class Mappo:
 
     def round(self) -> Round:
         """Fly ``worlds`` missions, then learn from them."""
-        left = (self._last_seed - self._env.next_seed) // WORLDS
-        self._optimiser.param_groups[0]["lr"] = LEARNING_RATE * min(1.0, left / self._settling)
+        rounds_left = (self._last_seed - self._env.next_seed) // WORLDS
+        self._optimiser.param_groups[0]["lr"] = LEARNING_RATE * min(1.0, rounds_left / self._decay_rounds)
         with torch.no_grad():
             flown = self._env.rollout(self._steps, self._actor, break_when_any_done=False)
             reward = flown["next", "agents", "reward"]
             lost = float(flown["next", "lost_packets"].sum()) / WORLDS
-            paid = float(reward.mean(dim=-2).sum()) / WORLDS
+            mission_return = float(reward.mean(dim=-2).sum()) / WORLDS
             flown["next", "agents", "reward"] = reward * REWARD_SCALE
             for flag in ("done", "terminated"):
                 flown["next", "agents", flag] = flown["next", flag].unsqueeze(-2).expand(reward.shape)
@@ -167,10 +167,10 @@ class Mappo:
         self._buffer.empty()
         self._buffer.extend(flown.reshape(-1))
         losses = [self._iterate(batch) for _ in range(EPOCHS) for batch in self._buffer]
-        return Round(loss=sum(losses) / len(losses), lost_packets=lost, reward=paid)
+        return Round(loss=sum(losses) / len(losses), lost_packets=lost, reward=mission_return)
 
     def state(self) -> dict[str, Any]:
-        """All that a later ``restore`` needs to go on as if nothing had happened, but for the random generator."""
+        """The state for ``restore``, without that of the random generator."""
         return {
             "next_seed": self._env.next_seed,
             "loss": self._loss.state_dict(),
@@ -178,7 +178,7 @@ class Mappo:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a ``state``."""
+        """Continue from a ``state``."""
         self._env.next_seed = state["next_seed"]
         self._loss.load_state_dict(state["loss"])
         self._optimiser.load_state_dict(state["optimiser"])

@@ -11,12 +11,12 @@ from shared.scenario import Scenario
 from simulator.marl.observation import width
 
 TRUNK = (400, 300)
-# Below any logit or action value, and finite, so that a softmax over it stays one.
+# The logit or action value of a masked choice: below any other, and finite, so that the softmax is defined.
 NEVER = -1e9
 
 
 def trunk(inputs: int, outputs: int) -> nn.Sequential:
-    """Fully connected, 400 and 300 wide with ReLU, and a linear layer on top."""
+    """Fully connected layers of widths 400 and 300 with ReLU, and a linear output layer."""
     first, second = TRUNK
     return nn.Sequential(
         nn.Linear(inputs, first), nn.ReLU(), nn.Linear(first, second), nn.ReLU(), nn.Linear(second, outputs)
@@ -24,9 +24,9 @@ def trunk(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def two_heads(scenario: Scenario) -> nn.Sequential:
-    """One UAV's features ``(..., F)`` to a number for each sensor slot and each velocity, ``(..., J + V)``.
+    """A network from one UAV's features ``(..., F)`` to a number for each sensor slot and velocity, ``(..., J + V)``.
 
-    Both heads sit on one trunk, so the last layer holds them side by side.
+    Both heads share one trunk, so the last layer is their concatenation.
     """
     return trunk(width(scenario), scenario.sensors + scenario.max_velocity + 1)
 

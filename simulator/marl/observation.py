@@ -1,6 +1,6 @@
-"""What an actor sees: one UAV's observation as numbers for a network, and what it may choose.
+"""An actor's input: features of one UAV's observation, and the mask of its choices.
 
-The same function serves training, over many worlds at once, and a mission, over one.
+Training calls the same function for many worlds at once as a mission for one.
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray, packets_per_step
+from shared.channel import FloatArray, IntArray, packets_per_step
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory, trajectories
-from simulator.sensors import IntArray
 
 BoolArray = NDArray[np.bool_]
 
-# The reach of a sensor is told after one step at these shares of full speed, and after these many steps at full speed.
+# A sensor's reach columns: after one step at these shares of full speed, and after these numbers of steps at full
+# speed.
 _SPEEDS = (0.0, 0.25, 0.5, 0.75, 1.0)
 _STEPS_AHEAD = (2, 3, 4, 6, 8)
 _STATE_COLUMNS = 7
-# Ages beyond this say no more than that the sensor was not heard for long.
+# Larger ages are clipped to this.
 _OLD_STEPS = 20
 _AGE_UNIT_STEPS = 10.0
 
 
 class View(NamedTuple):
-    """One UAV's observation as an actor takes it; leading dimensions are those of the observation.
+    """An actor's input from one UAV's observation; leading dimensions are those of the observation.
 
     Attributes:
         features: ``(..., F)``; the sensors are in the order of the slots.
-        mask: ``(..., J + V)``, the slots and velocities that may be chosen.
+        mask: ``(..., J + V)``, the slots and velocities allowed.
         order: ``(..., J)``, the sensor in each slot.
     """
 
@@ -48,21 +48,21 @@ def width(scenario: Scenario) -> int:
 
 
 def view(scenario: Scenario, uav: int, observation: Mapping[str, Any]) -> View:
-    """Features, mask and order of the slots, from a UAV's ``Observation`` and nothing else.
+    """Features, mask and slot order from a UAV's ``Observation`` alone.
 
-    Of the UAV: the share of the mission flown, the cosine and sine of the phase of its lap, which UAV it is, and the
-    most that one sensor is expected to yield after a step at each velocity. Of each sensor: whether it was ever heard
-    and is heard now, the queue expected by now (what was last heard plus the scenario's mean arrivals since; the
-    mean initial queue of one never heard) as a share of W, the age of that, the battery, the place relative to the
-    UAV along and across its flight, and the packets that could be moved after a step at five velocities, and after
-    several steps at full speed, as shares of the most at no distance.
+    Features of the UAV: the share of the mission flown, the cosine and sine of the phase of its lap, a one-hot of its
+    index, and for each velocity the largest expected yield of one sensor after a step. Features of each sensor: whether
+    it was ever heard and is heard now; the expected queue as a share of W (the queue last heard plus the scenario's
+    mean arrivals since, or the mean initial queue of a sensor never heard) and its age; the battery; the position
+    relative to the UAV along and across its flight; and the packets that could be moved after a step at five velocities
+    and after several steps at full speed, as shares of the most at no distance.
 
-    Slot 0 holds the sensor that is expected to yield most after the best next step, and so on; equals by
-    distance. Without an order, each slot would have to learn the same from a tenth of the data.
-    Sensors never heard are masked, unless none was.
+    Slots are in descending order of the expected yield after the best next step, equals by distance. Without this
+    order, each slot would have to learn the same from a tenth of the data. Sensors never heard are masked, unless all
+    are.
 
     Args:
-        observation: of one UAV, or of that UAV in many worlds: arrays with more dimensions in front.
+        observation: of one UAV, or of that UAV in many worlds: arrays with more leading dimensions.
     """
     path = trajectories(scenario)[uav]
     step, progress = np.asarray(observation["step"]), np.asarray(observation["progress"])
@@ -90,16 +90,16 @@ def view(scenario: Scenario, uav: int, observation: Mapping[str, Any]) -> View:
     nearer = 1e-4 * distance[..., 0] / scenario.radio_radius_m
     order = np.argsort(nearer - worth.max(axis=-1), axis=-1, kind="stable")
     sensors = np.take_along_axis(sensors, order[..., None], axis=-2)
-    own = _own(scenario, uav, step, 2.0 * np.pi * progress / path.length_m)
-    parts = (own, worth.max(axis=-2), sensors.reshape(*order.shape[:-1], -1))
+    uav_features = _uav_features(scenario, uav, step, 2.0 * np.pi * progress / path.length_m)
+    parts = (uav_features, worth.max(axis=-2), sensors.reshape(*order.shape[:-1], -1))
     features = np.concatenate(parts, axis=-1).astype(np.float32)
-    known = np.take_along_axis(heard | ~heard.any(axis=-1, keepdims=True), order, axis=-1)
+    selectable = np.take_along_axis(heard | ~heard.any(axis=-1, keepdims=True), order, axis=-1)
     velocities = np.ones((*order.shape[:-1], scenario.max_velocity + 1), dtype=np.bool_)
-    return View(features, np.concatenate((known, velocities), axis=-1), order)
+    return View(features, np.concatenate((selectable, velocities), axis=-1), order)
 
 
 def stacked(scenario: Scenario, observation: Mapping[str, Any]) -> View:
-    """The views of a whole fleet: of arrays ``(B, I, ...)``, again with ``(B, I)`` in front."""
+    """The views of a whole fleet, from arrays ``(B, I, ...)`` to arrays ``(B, I, ...)``."""
     fleet = range(scenario.uavs)
     views = [view(scenario, uav, of_uav(observation, uav)) for uav in fleet]
     return View(*(np.stack(parts, axis=1) for parts in zip(*views, strict=True)))
@@ -110,45 +110,45 @@ def of_uav(observation: Mapping[str, Any], uav: int) -> dict[str, Any]:
     return {key: value[:, uav] for key, value in observation.items()}
 
 
-def without(seen: View, taken: BoolArray) -> BoolArray:
-    """The mask without the sensors that other UAVs took; if that leaves no slot, all that no one took, else all.
+def without(own: View, taken: BoolArray) -> BoolArray:
+    """The mask without the sensors taken by other UAVs; if no slot remains, all free sensors; without those, all.
 
     Args:
         taken: by sensor, ``(..., J)``.
     """
-    free = ~np.take_along_axis(taken, seen.order, axis=-1)
-    count = seen.order.shape[-1]
-    slots = seen.mask[..., :count] & free
+    free = ~np.take_along_axis(taken, own.order, axis=-1)
+    count = own.order.shape[-1]
+    slots = own.mask[..., :count] & free
     slots = np.where(slots.any(axis=-1, keepdims=True), slots, free)
     slots = slots | ~slots.any(axis=-1, keepdims=True)
-    return np.concatenate((slots, seen.mask[..., count:]), axis=-1)
+    return np.concatenate((slots, own.mask[..., count:]), axis=-1)
 
 
 def taken_by(taken: Collection[int], sensors: int) -> BoolArray:
-    """Which of J sensors are in the collection, ``(J,)``."""
+    """The mask of the sensors in the collection, ``(J,)``."""
     return np.isin(np.arange(sensors), list(taken))
 
 
 def _ahead_m(scenario: Scenario) -> FloatArray:
-    """How far ahead the reach is told: each velocity for a step, then full speed for several."""
+    """The distances ahead at which the reach is computed: one step at each velocity, then several at full speed."""
     steps = [*range(scenario.max_velocity + 1), *(scenario.max_velocity * n for n in _STEPS_AHEAD)]
     return np.array(steps) * scenario.step_s
 
 
 def _reach_columns(scenario: Scenario) -> list[int]:
-    """Which of those are told of every sensor."""
+    """The indices of the distances that are features of every sensor."""
     top = scenario.max_velocity
     return [*(round(share * top) for share in _SPEEDS), *range(top + 1, top + 1 + len(_STEPS_AHEAD))]
 
 
 def _expected_queue(scenario: Scenario, observation: Mapping[str, Any], age: IntArray, heard: BoolArray) -> FloatArray:
-    """As a share of W."""
+    """The expected queues, as shares of W."""
     capacity = scenario.queue_capacity
-    begun = (scenario.initial_queue_min + 1.0) / 2.0 * capacity
-    known = np.where(heard, observation["queue"], begun)
+    mean_initial = (scenario.initial_queue_min + 1.0) / 2.0 * capacity
+    last = np.where(heard, observation["queue"], mean_initial)
     # Of a sensor never heard, last_heard is -1, so its age is one more than the steps flown.
     steps = np.where(heard, age, age - 1)
-    return np.asarray(np.minimum(known + steps * scenario.mean_arrival_rate, capacity) / capacity)
+    return np.asarray(np.minimum(last + steps * scenario.mean_arrival_rate, capacity) / capacity)
 
 
 def _in_flight(path: Trajectory, progress: FloatArray, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -159,7 +159,7 @@ def _in_flight(path: Trajectory, progress: FloatArray, offset: FloatArray) -> tu
     return offset[..., 0] * x + offset[..., 1] * y, offset[..., 1] * x - offset[..., 0] * y
 
 
-def _own(scenario: Scenario, uav: int, step: ArrayLike, phase: FloatArray) -> FloatArray:
-    who = np.zeros((*phase.shape[:-1], scenario.uavs))
-    who[..., uav] = 1.0
-    return np.concatenate((np.asarray(step) / scenario.steps, np.cos(phase), np.sin(phase), who), axis=-1)
+def _uav_features(scenario: Scenario, uav: int, step: ArrayLike, phase: FloatArray) -> FloatArray:
+    one_hot = np.zeros((*phase.shape[:-1], scenario.uavs))
+    one_hot[..., uav] = 1.0
+    return np.concatenate((np.asarray(step) / scenario.steps, np.cos(phase), np.sin(phase), one_hot), axis=-1)

@@ -1,4 +1,4 @@
-"""What makes a training the one it is; without torch, so that a command can refuse bad use at once."""
+"""The identity of a training; without torch, so that a command can refuse unusable options at once."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from shared.scenario import Scenario
-from simulator.explore import FIRST_TRAINING_SEED
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
-# The file in a training's folder to resume from.
+# The file in a training's folder from which it resumes.
 STATE = "state.pt"
 MOST_EPISODES = 1_000_000
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What makes a training the one it is: the same plan gives the same weights, to the bit, on the same machine."""
+    """The inputs of a training: the same plan gives the same weights to the bit on the same machine."""
 
     scheme: str
     scenario: Scenario
@@ -25,9 +25,9 @@ class Plan:
 
     @property
     def first_seed(self) -> int:
-        """Of the training worlds; no two trainings, nor a training and an evaluation, share a world."""
+        """The first seed of the training worlds; two trainings share no world, nor do a training and an evaluation."""
         return FIRST_TRAINING_SEED + (self.seed + 1) * MOST_EPISODES
 
-    def told(self) -> dict[str, Any]:
-        """As plain values."""
+    def plain(self) -> dict[str, Any]:
+        """The fields as plain values."""
         return {**asdict(self), "scenario": self.scenario.model_dump_json()}

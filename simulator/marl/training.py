@@ -13,21 +13,21 @@ from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
 from shared.scenario import Scenario
-from simulator.explore import FIRST_TRAINING_SEED
+from simulator.errors import UsageError
 from simulator.marl import checkpoint
 from simulator.marl.curve import Point
 from simulator.marl.evaluate import lost_packets
 from simulator.marl.plan import STATE, Plan
-from simulator.record import BadUse
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 TENSORBOARD = "tensorboard"
 _CURVE_POINTS = 50
-# Apart from the training worlds, which begin a million later, and from what `aicvds explore` records.
+# Apart from the training worlds, which begin a million later, and from the worlds of `aicvds explore`.
 _HELD_OUT = range(FIRST_TRAINING_SEED + 900_000, FIRST_TRAINING_SEED + 900_100)
 
 
 class Round(NamedTuple):
-    """What came of a round: its mean loss, and of its missions the packets lost and the return, means."""
+    """The results of a round: the mean loss, and the means over its missions of the lost packets and the return."""
 
     loss: float
     lost_packets: float
@@ -35,7 +35,7 @@ class Round(NamedTuple):
 
 
 class Learner(Protocol):
-    """A scheme in training. ``worlds`` missions make a round; ``network`` is the actors'."""
+    """A scheme in training; a round is ``worlds`` missions, and ``network`` is that of the actors."""
 
     @property
     def worlds(self) -> int: ...
@@ -48,21 +48,21 @@ class Learner(Protocol):
         ...
 
     def state(self) -> dict[str, Any]:
-        """Tensors and plain values to go on from."""
+        """Tensors and plain values from which ``restore`` continues."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a ``state``."""
+        """Continue from a ``state``."""
         ...
 
 
 class Training:
-    """A training from its start, or from where an earlier one of the same plan stopped.
+    """A training from its start, or from the saved state of an earlier one with the same plan.
 
     Attributes:
-        learner: in training.
+        learner: the scheme in training.
         points: the learning curve so far.
-        episodes: flown so far.
+        episodes: the missions flown so far.
     """
 
     def __init__(self, plan: Plan, make: Callable[[Scenario, int, int], Learner], out: Path) -> None:
@@ -71,7 +71,7 @@ class Training:
         self.plan = plan
         self.learner = make(plan.scenario, plan.episodes, plan.first_seed)
         if plan.episodes % self.learner.worlds:
-            raise BadUse(
+            raise UsageError(
                 f"--episodes {plan.episodes} is not a multiple of {self.learner.worlds}, the missions flown together"
             )
         self.points: list[Point] = []
@@ -80,29 +80,29 @@ class Training:
         self._out = out
 
     def resume(self) -> None:
-        """Go on from the state in the folder.
+        """Continue from the state in the folder.
 
         Raises:
-            BadUse: there is none, or it is of another plan.
+            UsageError: the folder has no state, or one of another plan.
         """
         try:
             state = checkpoint.read(self._out / STATE)
         except FileNotFoundError:
-            raise BadUse(f"--resume: there is no {STATE} in {self._out}; start without --resume") from None
+            raise UsageError(f"--resume: there is no {STATE} in {self._out}; start without --resume") from None
         except ValueError as error:
-            raise BadUse(f"--resume: {error}; start anew with another --out") from None
-        for name, value in self.plan.told().items():
+            raise UsageError(f"--resume: {error}; start again with another --out") from None
+        for name, value in self.plan.plain().items():
             if state["plan"].get(name) != value:
-                began = state["plan"].get(name)
-                raise BadUse(f"--{name} differs from the training in {self._out}" + _of(name, began))
+                saved = state["plan"].get(name)
+                raise UsageError(f"--{name} differs from the training in {self._out}" + _remedy(name, saved))
         self.learner.restore(state["learner"])
         torch.set_rng_state(state["random"])
         self.episodes = state["episodes"]
         self.points = [Point(**point) for point in state["points"]]
         self._rounds = [Round(*row) for row in state["rounds"]]
 
-    def run(self, told: Callable[[Round], None], save_every_s: float) -> None:
-        """Fly the episodes that are left; ``told`` hears of every round."""
+    def run(self, on_round: Callable[[Round], None], save_every_s: float) -> None:
+        """Fly the remaining episodes; ``on_round`` is called after every round."""
         every = max(1, self.plan.episodes // self.learner.worlds // _CURVE_POINTS) * self.learner.worlds
         saved = time.monotonic()
         with SummaryWriter(str(self._out / TENSORBOARD), purge_step=self.episodes + 1) as board:
@@ -115,15 +115,15 @@ class Training:
                 if self.episodes % every == 0 or self.episodes == self.plan.episodes:
                     self._measure()
                     board.add_scalar("held_out/lost_packets", self.points[-1].greedy_lost_packets, self.episodes)
-                told(flown)
+                on_round(flown)
                 if time.monotonic() - saved >= save_every_s or self.episodes == self.plan.episodes:
                     self.save()
                     saved = time.monotonic()
 
     def save(self) -> None:
-        """Write the state to resume from."""
+        """Write the state from which the training resumes."""
         state = {
-            "plan": self.plan.told(),
+            "plan": self.plan.plain(),
             "learner": self.learner.state(),
             "random": torch.get_rng_state(),
             "episodes": self.episodes,
@@ -139,5 +139,5 @@ class Training:
         self._rounds.clear()
 
 
-def _of(name: str, began: object) -> str:
-    return ": give the same scenario" if name == "scenario" else f", which began with {began}"
+def _remedy(name: str, saved: object) -> str:
+    return ": give the same scenario" if name == "scenario" else f", which began with {saved}"

@@ -10,8 +10,8 @@ from simulator.world import Observation
 class EarliestOverflowFirst:
     """Collect from the sensor in reach with the fewest expected steps to overflow, ``(W - q_j) / rate``.
 
-    The rate is the scenario's mean arrival rate, the same for all, since a beacon does not carry it. With no free
-    sensor in radio range, the one heard longest ago. Flies at 7 m/s throughout.
+    The rate is the scenario's mean arrival rate for every sensor, since beacons do not report it. With no free sensor
+    in radio range, the choice is the one heard longest ago. The velocity is 7 m/s throughout.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:

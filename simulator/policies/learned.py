@@ -1,4 +1,4 @@
-"""The learned schemes, MADQN and MAPPO, flown by their trained networks."""
+"""The learned schemes MADQN and MAPPO as policies of their trained networks."""
 
 from __future__ import annotations
 
@@ -6,36 +6,36 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shared.scenario import Scenario
-from simulator.record import BadUse
+from simulator.errors import UsageError
 from simulator.world import Observation
 
-# Torch takes seconds to import, and whoever flies another policy may not have it.
+# Torch takes seconds to import, and is not installed without the extra `marl`.
 if TYPE_CHECKING:
     from torch import nn
 
 
 class Learned:
-    """The best sensor and velocity by a network that `aicvds train` trained; draws nothing.
+    """The greedy policy of a network trained by `aicvds train`; it draws no random number.
 
-    It sees what :func:`simulator.marl.observation.view` makes of the UAV's observation, and chooses among the sensors
-    heard at least once that no one took in this step. If there is none, among those not taken.
+    Its input is :func:`simulator.marl.observation.view` of the UAV's observation. It chooses among the free sensors
+    heard at least once, or among all free sensors if there is none.
 
     Args:
         scheme: ``madqn`` or ``mappo``.
-        checkpoint: weights of that scheme; the ones that ship with the package where none is named.
+        checkpoint: weights of that scheme; by default those that ship with the package.
 
     Raises:
-        BadUse: torch is not installed.
-        ValueError: the file holds no such weights; at ``reset``, they are for other numbers of sensors, UAVs or
+        UsageError: torch is not installed.
+        ValueError: the file has no such weights; at ``reset``, they are for other numbers of sensors, UAVs or
             velocities than the scenario's.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
 
     def __init__(self, scheme: str, checkpoint: Path | None = None) -> None:
         try:
             from simulator.marl.checkpoint import Checkpoint, shipped
         except ModuleNotFoundError as missing:
-            raise BadUse(
+            raise UsageError(
                 f"policy {scheme} needs {missing.name}, which is not installed. "
                 "Install the extra: pip install 'aic-vds[marl]'"
             ) from None

@@ -10,8 +10,8 @@ from simulator.world import Observation
 class MaximumGain:
     """Collect from the sensor in reach with the highest channel gain.
 
-    The gain falls with the distance alone, so this is the sensor closest to the UAV, whatever its queue and however
-    often it was served. With no free sensor in radio range, the one heard longest ago. Flies at 7 m/s throughout.
+    The gain depends on the distance alone, so this is the sensor closest to the UAV, whatever its queue and its visits.
+    With no free sensor in radio range, the choice is the one heard longest ago. The velocity is 7 m/s throughout.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Receding-horizon planning: what a practitioner would fly instead of asking an LLM."""
+"""Receding-horizon planning: model predictive control as the conventional alternative to an LLM."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from simulator.world import Observation
 
 
 class RecedingHorizon:
-    """The planner of :mod:`shared.fleetplan.receding`, made again for the whole fleet whenever a UAV is asked.
+    """The planner of :mod:`shared.fleetplan.receding`; every decision of a UAV plans for the whole fleet again.
 
-    Each UAV's observation adds to the fleet's belief when it is asked, and what it is told binds the plans after it.
+    Each decision adds the UAV's observation to the fleet's belief, and its action is fixed in the later plans.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:
@@ -42,7 +42,7 @@ class RecedingHorizon:
         return sensor, velocity
 
     def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
-        """The plan's action; no sensor (-1), at full speed, off the trajectory, where the way is unknown."""
+        """The plan's action; off the trajectory, where no plan exists, no sensor (-1) at full speed."""
         draft = self._planner.draft([uav], taken)
         if draft is None:
             return -1, self._scenario.max_velocity

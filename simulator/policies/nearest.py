@@ -13,10 +13,10 @@ from simulator.world import Observation
 class NearestNeighbour:
     """Collect from the nearest sensor in reach that this UAV has not chosen yet in its round.
 
-    The nearest-neighbour tour of the travelling salesman, as far as trajectories that are fixed leave room for it: a
-    UAV cannot turn towards the next sensor, only choose it while it passes. Each UAV goes by its own rounds. When
-    every free sensor in reach was chosen in this round, the next one begins. With none in reach, the nearest free
-    one, heard or not, which begins nothing and counts for nothing. Flies at 7 m/s throughout.
+    This is the nearest-neighbour tour of the travelling salesman on fixed trajectories: a UAV cannot fly towards the
+    next sensor, only choose it in passing. Each UAV has its own rounds. A new round begins once every free sensor in
+    reach was chosen in the current one. With no sensor in reach, the choice is the nearest free one, heard or not, and
+    it belongs to no round. The velocity is 7 m/s throughout.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:

@@ -12,7 +12,7 @@ from simulator.world import Observation
 class RandomChoice:
     """A sensor uniform over those not taken, heard or not, and a velocity uniform over all levels.
 
-    Its generator is its own: it shares no stream with the world of the same seed.
+    Its generator shares no stream with the world of the same seed.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""What the hand-written policies share: which sensors are in reach, and what to do when none is."""
+"""Rules that the hand-written policies share: the sensors in reach, and the choice without any."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ def cruise_velocity(scenario: Scenario) -> int:
 
 
 def free_sensors(count: int, taken: frozenset[int]) -> NDArray[np.bool_]:
-    """Which of ``count`` sensors no earlier UAV chose in this step, shape ``(J,)``; all if none is free."""
+    """Mask of the sensors that no earlier UAV of this step chose, shape ``(J,)``; all of them if none is free."""
     free = np.ones(count, dtype=np.bool_)
     free[list(taken)] = False
     return free if free.any() else ~free
 
 
 def in_reach(observation: Observation, taken: frozenset[int]) -> NDArray[np.bool_]:
-    """Which sensors are in radio range now and free, shape ``(J,)``."""
+    """Mask of the free sensors in radio range now, shape ``(J,)``."""
     heard_now = observation["last_heard"] == observation["step"]
     return np.asarray(heard_now & free_sensors(len(observation["queue"]), taken))
 
 
 def longest_silent(observation: Observation, taken: frozenset[int]) -> int:
-    """The free sensor heard longest ago, one never heard before any other; of several, the nearest."""
+    """The free sensor heard longest ago, never heard ones first; of equals the nearest."""
     free = np.flatnonzero(free_sensors(len(observation["queue"]), taken))
     distance = np.hypot(*(observation["sensor_position"][free] - observation["position"]).T)
     return int(free[np.lexsort((distance, observation["last_heard"][free]))[0]])
 
 
 def best_in_reach(score: NDArray[np.float64], observation: Observation, taken: frozenset[int]) -> int:
-    """The sensor of the highest score among those in reach, or the longest silent one if none is.
+    """The sensor in reach with the highest score; with none in reach, the one heard longest ago.
 
     Args:
         score: shape ``(J,)``; of equals the lowest index wins.

@@ -10,9 +10,9 @@ from simulator.world import Observation
 
 
 class RoundRobin:
-    """Every UAV takes the sensors in turn, in range or not; UAV i starts at sensor ``i J / I``.
+    """Every UAV cycles through the sensors, in range or not; UAV i starts at sensor ``i J / I``.
 
-    A sensor that is taken is passed over. Flies at 7 m/s throughout.
+    Sensors taken by other UAVs are skipped. The velocity is 7 m/s throughout.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:
@@ -23,6 +23,6 @@ class RoundRobin:
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
         count = len(observation["queue"])
-        turn = uav * count // self._uavs + int(observation["step"][0])
-        free = np.roll(free_sensors(count, taken), -(turn % count))
-        return (turn + int(np.argmax(free))) % count, self._velocity
+        position = uav * count // self._uavs + int(observation["step"][0])
+        free = np.roll(free_sensors(count, taken), -(position % count))
+        return (position + int(np.argmax(free))) % count, self._velocity

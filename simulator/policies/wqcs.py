@@ -13,8 +13,8 @@ from simulator.world import Observation
 class WeightedQueueChannel:
     """Collect from the sensor in reach with the highest ``0.5 q_j / W + 0.5 h_j``.
 
-    ``h_j`` is the channel gain scaled to 0 at the path-loss threshold and 1 right below the UAV. With no
-    free sensor in radio range, the one heard longest ago. Flies at 7 m/s throughout.
+    ``h_j`` is the channel gain scaled to 0 at the path-loss threshold and 1 right below the UAV. With no free sensor in
+    radio range, the choice is the one heard longest ago. The velocity is 7 m/s throughout.
     """
 
     def reset(self, scenario: Scenario, seed: int) -> None:

@@ -214,7 +214,7 @@ if getuid() == 0:
 lacks "$edge_image" simulator pettingzoo matplotlib pip
 lacks "$simulator_image" service torch scipy xllamacpp pip
 settings=$(docker run --rm --network none --entrypoint python "$edge_image" -c '
-from service.settings import Settings
+from service.config.settings import Settings
 print(*(f"AICVDS_{name.upper()}" for name in Settings.model_fields if name != "cache_dir"))')
 for name in $settings; do
   grep -Eq "^      - $name(=.*)?$" docker-compose.yml || fail "docker-compose.yml does not pass $name on"

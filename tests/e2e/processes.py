@@ -12,13 +12,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.waiting import PATIENCE_S
+
 AICVDS = Path(sys.executable).with_name("aicvds")
 
 
 def run(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     """One command to its end."""
     return subprocess.run(
-        [AICVDS, *args], capture_output=True, text=True, timeout=120, env={**os.environ, **env}, check=False
+        [AICVDS, *args], capture_output=True, text=True, timeout=170, env={**os.environ, **env}, check=False
     )
 
 
@@ -32,13 +34,13 @@ def started(*args: str, **env: str) -> Iterator[subprocess.Popen[str]]:
         yield process
     finally:
         process.kill()
-        process.communicate(timeout=30)
+        process.communicate(timeout=PATIENCE_S)
 
 
-def output_until(process: subprocess.Popen[str], pattern: str, timeout: float = 60) -> re.Match[str]:
+def output_until(process: subprocess.Popen[str], pattern: str) -> re.Match[str]:
     """Read the command's output until a line matches."""
     assert process.stdout is not None
-    seen, ends = "", time.monotonic() + timeout
+    seen, ends = "", time.monotonic() + PATIENCE_S
     while time.monotonic() < ends:
         if select.select([process.stdout], [], [], 0.2)[0]:
             chunk = os.read(process.stdout.fileno(), 65536).decode(errors="replace")
@@ -52,6 +54,6 @@ def output_until(process: subprocess.Popen[str], pattern: str, timeout: float = 
 
 @contextmanager
 def serving_edge(**env: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``aicvds serve`` on a free port; yields its URL and process."""
-    with started("serve", "--port", "0", **env) as process:
+    """``aicvds serve`` on a free port, with a far deadline unless told; yields its URL and process."""
+    with started("serve", "--port", "0", **{"AICVDS_DEADLINE_MS": "60000", **env}) as process:
         yield output_until(process, r"running on (http://[\d.:]+)")[1], process

@@ -22,6 +22,7 @@ from simulator.client import EdgeClient
 from simulator.experiments.catalogue import EXPERIMENTS
 from tests.e2e.processes import serving_edge
 from tests.simulator.edge_stub import free_port
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md")), *sorted(ROOT.glob("examples/*/README.md"))]
@@ -61,7 +62,7 @@ MADE = {
     "make test": "this is part of it",
     "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
-    "make fuzz": "some minutes; tests/service/test_fuzz.py is a short one",
+    "make fuzz": "some minutes; tests/service/api/test_fuzz.py is a short one",
     "make soak": "ten minutes",
     "make docs": "tests/test_docs.py builds the pages",
     "make release": "minutes; it tries what it builds",
@@ -147,7 +148,7 @@ def test_missions_are_flown_as_shown(workspace: Path) -> None:
     with serving_edge(AICVDS_MODE="policy") as (url, _):
         for command, more in FLOWN.items():
             shell(f"{command} {more}".replace(EDGE, url), workspace)
-        decided = httpx.get(f"{url}/metrics").text
+        decided = httpx.get(f"{url}/metrics", timeout=PATIENCE_S).text
     assert "aicvds_decisions_total{" in decided
     for written in ("mission/summary.json", "mission/report.html", "again/replay.json", "pipeline_world/report.html"):
         assert (workspace / "runs" / written).stat().st_size > 0
@@ -160,7 +161,7 @@ def in_the_background(command: str, workspace: Path) -> Iterator[None]:
         yield
     finally:
         process.kill()
-        process.wait(timeout=30)
+        process.wait(PATIENCE_S)
 
 
 def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
@@ -172,8 +173,8 @@ def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
     settings, _, rest = serve.partition(" ")
     with in_the_background(f"env {settings} AICVDS_MODE=policy {rest} --port {port}", workspace):
         with EdgeClient(url) as waiting:
-            waiting.wait_ready(60)
-        assert httpx.get(f"{url}/missions/none").status_code == 401
+            waiting.wait_ready(PATIENCE_S)
+        assert httpx.get(f"{url}/missions/none", timeout=PATIENCE_S).status_code == 401
         shell(f"KEY={key}; {fly.replace(EDGE, url)} --steps 2", workspace)
     assert (workspace / "runs" / "mission" / "summary.json").exists()
 

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -17,6 +16,7 @@ from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.result import Result
 from simulator.experiments.stand_ins import answering, drawn
 from tests.e2e.processes import AICVDS, run, serving_edge
+from tests.waiting import PATIENCE_S, until
 
 
 def result_in(out: Path, name: str) -> Result:
@@ -34,12 +34,9 @@ def started(out: Path, *args: str) -> subprocess.Popen[bytes]:
 
 
 def until_flights(out: Path, process: subprocess.Popen[bytes], count: int) -> dict[str, int]:
-    give_up = time.monotonic() + 60
-    while time.monotonic() < give_up and process.poll() is None:
-        if len(flights := flights_in(out)) >= count:
-            return flights
-        time.sleep(0.01)
-    raise AssertionError(f"there never were {count} flights; exit code {process.poll()}")
+    until(lambda: len(flights_in(out)) >= count or process.poll() is not None)
+    assert process.poll() is None, f"it ended with {process.poll()} before there were {count} flights"
+    return flights_in(out)
 
 
 def edge_of(process: subprocess.Popen[bytes]) -> int:
@@ -79,10 +76,10 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     args = ["fairness", "--llm", "none", "--steps", "2", "--seeds", "6"]
     process = started(tmp_path, *args)
     try:
-        before = until_flights(tmp_path, process, 20)
+        before = until_flights(tmp_path, process, 5)
     finally:
         process.kill()
-        process.communicate(timeout=60)
+        process.communicate(timeout=PATIENCE_S)
     assert not (tmp_path / "fairness").exists()
     ended = run("experiment", *args, "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
@@ -99,7 +96,7 @@ def test_an_interrupt_keeps_what_was_flown_and_leaves_no_edge(tmp_path: Path) ->
         until_flights(tmp_path, process, 2)
         edge = edge_of(process)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=60)
+        process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 130
@@ -112,7 +109,7 @@ def test_an_edge_that_dies_is_told_with_its_log(tmp_path: Path) -> None:
     try:
         until_flights(tmp_path, process, 1)
         os.kill(edge_of(process), signal.SIGKILL)
-        _, told = process.communicate(timeout=60)
+        _, told = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 1
@@ -147,7 +144,7 @@ def test_the_page_is_a_command_of_its_own() -> None:
 
 def test_help_comes_without_the_heavy_imports() -> None:
     code = (
-        "import sys; from simulator.experiments import command; command.main(['--help']);"
+        "import sys; from simulator.commands import experiment; experiment.main(['--help']);"
         "print([m for m in ('matplotlib', 'pettingzoo', 'scipy', 'torch') if m in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

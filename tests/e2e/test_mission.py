@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from simulator.record import read_decisions
+from simulator.records.decision_log import read_decisions
 from tests.e2e.processes import run, serving_edge
 
 

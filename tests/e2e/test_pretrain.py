@@ -5,17 +5,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from service import checkpoint as checkpoints
-from service.checkpoint import initial_modules, initial_weights, save
-from service.examples import Batch, Example, replay
-from service.learner import Modules
-from service.pretraining import losses
-from service.recall import recall, references
-from service.reward import Reward
+from service.learning import initial_weights as checkpoints
+from service.learning.initial_weights import initial_modules, initial_weights, save
+from service.learning.modules import Modules
+from service.training.reward import Reward
+from service.training.rollout_examples import Batch, Example, replay
+from service.training.teacher_agreement import recall, references
+from service.training.training_loop import losses
 from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from shared.wire import Features
-from simulator.explore import explore
+from simulator.flying.exploration import explore
 from tests.e2e.processes import run
 
 PAPER = SCENARIOS["paper"]

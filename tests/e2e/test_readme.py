@@ -3,16 +3,16 @@
 import json
 import re
 import subprocess
-import time
 from pathlib import Path
 
 import httpx
 import pytest
 
-from service.settings import Settings
+from service.config.settings import Settings
 from shared.guidance import GuidanceStatus
 from shared.wire import DecideResponse, Reason
 from tests.e2e.processes import serving_edge
+from tests.waiting import until
 
 ROOT = Path(__file__).parents[2]
 README, DECIDING, GUIDANCE, OPERATIONS = (
@@ -45,10 +45,8 @@ def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
     put, get, confirm, own = re.split(r"\n(?=curl)", GUIDE)
     with serving_edge() as (url, _):
         json.loads(pasted(put, url))
-        deadline = time.monotonic() + 60
-        while (told := GuidanceStatus.model_validate_json(pasted(get, url))).status == "compiling":
-            assert time.monotonic() < deadline
-            time.sleep(0.2)
+        until(lambda: GuidanceStatus.model_validate_json(pasted(get, url)).status != "compiling")
+        told = GuidanceStatus.model_validate_json(pasted(get, url))
         assert told.status == "proposed" and told.guidance is not None, told.failure
         assert [wish.model_dump() for wish in told.guidance.sensors] == [
             {"sensor_id": 4, "weight": 1.0, "visit_every": 3}

@@ -8,7 +8,6 @@ import socket
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import pytest
 from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.running import listening
 from tests.service.stub_llm import misbehaving, wait_for
+from tests.waiting import PATIENCE_S, Gate, until
 
 
 def test_help_names_every_command() -> None:
@@ -84,7 +84,7 @@ def test_other_addresses_are_served_with_keys_or_when_told_to(tmp_path: Path) ->
         with started("serve", "--port", "0", "--host", "0.0.0.0", AICVDS_MODE="policy", **env) as process:
             port = output_until(process, r"running on http://0\.0\.0\.0:(\d+)")[1]
             url = f"http://127.0.0.1:{port}/metrics"
-            assert httpx.get(url, timeout=30).status_code == (401 if "AICVDS_KEYS" in env else 200)
+            assert httpx.get(url, timeout=PATIENCE_S).status_code == (401 if "AICVDS_KEYS" in env else 200)
             assert httpx.get(url, timeout=30, headers={"Authorization": f"Bearer {key}"}).status_code == 200
 
 
@@ -107,7 +107,7 @@ def test_ctrl_c_while_loading_is_quiet() -> None:
     with started("serve", "--port", "0") as process:
         output_until(process, "loading")
         process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=15)
+        output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode in (0, 130, -signal.SIGINT)
     assert "Traceback" not in output
 
@@ -115,45 +115,46 @@ def test_ctrl_c_while_loading_is_quiet() -> None:
 @pytest.mark.parametrize("ask", [signal.SIGTERM, signal.SIGINT])
 def test_it_stops_when_asked_in_its_first_second(ask: signal.Signals) -> None:
     with serving_edge() as (url, process):
-        assert httpx.get(f"{url}/healthz", timeout=60).status_code == 200
+        assert httpx.get(f"{url}/healthz", timeout=PATIENCE_S).status_code == 200
         process.send_signal(ask)
-        output, _ = process.communicate(timeout=15)
+        output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode in (0, 130, -ask)
     assert "Traceback" not in output
 
 
 def test_a_decision_asked_for_before_it_is_loaded_is_answered(report: Callable[..., dict[str, Any]]) -> None:
     with serving_edge(AICVDS_MODE="policy") as (url, _):
-        answer = httpx.post(f"{url}/decide", json=report(deadline_ms=60_000), timeout=60)
+        answer = httpx.post(f"{url}/decide", json=report(deadline_ms=60_000), timeout=PATIENCE_S)
     assert (answer.status_code, answer.json()["source"]) == (200, "policy")
 
 
 @pytest.mark.parametrize("ask", [signal.SIGTERM, signal.SIGINT])
 def test_the_edge_stops_when_asked(ask: signal.Signals) -> None:
     with serving_edge() as (url, process):
-        assert httpx.get(f"{url}/readyz", timeout=60).status_code == 200
+        assert httpx.get(f"{url}/readyz", timeout=PATIENCE_S).status_code == 200
         process.send_signal(ask)
-        assert process.wait(timeout=15) in (0, 130, -ask)
-
-
-async def _silent(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    await reader.read()
+        assert process.wait(PATIENCE_S) in (0, 130, -ask)
 
 
 def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable[..., dict[str, Any]]) -> None:
     """Its LLM is silent and its deadline far: the policy answers, in less time than `docker stop` grants."""
+    gate = Gate()
+
+    async def held(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await gate.passed()
+
     with (
-        listening(misbehaving(_silent)) as llm,
+        listening(misbehaving(held)) as llm,
         serving_edge(AICVDS_LLM_URL=f"{llm}/v1", AICVDS_LLM_MODEL="x") as (url, process),
-        httpx.Client(base_url=url, timeout=60) as client,
+        httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
         ThreadPoolExecutor() as pool,
     ):
         wait_for(client, "ready")
         waiting = pool.submit(client.post, "/decide", json=report(deadline_ms=60_000))
-        time.sleep(0.5)
+        until(lambda: gate.came)
         process.send_signal(signal.SIGTERM)
-        answer = waiting.result(timeout=30)
-        process.wait(timeout=15)
+        answer = waiting.result(timeout=PATIENCE_S)
+        process.wait(PATIENCE_S)
     assert (answer.status_code, answer.json()["reason"]) == (200, "llm_timeout")
 
 
@@ -162,22 +163,21 @@ def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..
     head = "POST /decide HTTP/1.1\r\nHost: edge\r\nContent-Type: application/json\r\n"
     head += f"Content-Length: {len(body)}\r\n\r\n"
     with serving_edge(AICVDS_MODE="policy") as (url, process):
-        assert httpx.get(f"{url}/readyz", timeout=60).status_code == 200
+        assert httpx.get(f"{url}/readyz", timeout=PATIENCE_S).status_code == 200
         door = ("127.0.0.1", int(url.rpartition(":")[2]))
-        with socket.create_connection(door) as early:
-            process.send_signal(signal.SIGTERM)
-            with suppress(OSError):
-                while True:
-                    socket.create_connection(door).close()
-                    time.sleep(0.01)
+        # It stands still for longer than uvicorn's tick: who has come, and that it is to end, it finds at once.
+        process.send_signal(signal.SIGSTOP)
+        with socket.create_connection(door, timeout=PATIENCE_S) as early:
             early.sendall(head.encode() + body)
-            early.settimeout(10)
+            process.send_signal(signal.SIGTERM)
+            time.sleep(0.15)
+            process.send_signal(signal.SIGCONT)
             assert early.recv(65536).startswith(b"HTTP/1.1 200")
-        process.wait(timeout=15)
+        process.wait(PATIENCE_S)
 
 
 def test_empty_variables_are_unset_ones(tmp_path: Path) -> None:
     """docker-compose passes every variable on, set or not."""
     empty = {f"AICVDS_{name}": "" for name in ("LLM_URL", "LLM_MODEL", "LLM_API_KEY", "LLM_GGUF", "MODE", "TOP_K")}
     with serving_edge(**empty) as (url, _):
-        assert httpx.get(f"{url}/readyz", timeout=60).json()["llm"] in ("loading", "ready")
+        assert httpx.get(f"{url}/readyz", timeout=PATIENCE_S).json()["llm"] in ("loading", "ready")

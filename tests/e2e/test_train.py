@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
-import signal
-import time
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from simulator.marl.checkpoint import Checkpoint
 from simulator.marl.curve import read_csv
-from tests.e2e.processes import run, started
+from tests.e2e.processes import run
+from tests.waiting import until
 
 EPISODES = ("--episodes", "120")
+# A training that goes no further than its first save.
+STANDS_STILL = """
+import signal, sys
+from simulator.marl import train, training
+
+save = training.Training.save
+
+def stand_still(self):
+    save(self)
+    signal.pause()
+
+training.Training.save = stand_still
+sys.exit(train.main())
+"""
 
 
 def weights_of(folder: Path) -> list[list[float]]:
@@ -23,12 +38,14 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     ended = run("train", "mappo", *EPISODES, "--out", str(whole))
     assert ended.returncode == 0, ended.stderr
-    with started("train", "mappo", *EPISODES, "--out", str(killed), "--save-s", "0") as process:
-        ends = time.monotonic() + 60
-        while not (killed / "state.pt").exists() and time.monotonic() < ends:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
-    assert not (killed / "mappo.pt").exists(), "it was over before it was killed"
+    command = [sys.executable, "-c", STANDS_STILL, "mappo", *EPISODES, "--out", str(killed), "--save-s", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        until(lambda: (killed / "state.pt").exists() or process.poll() is not None)
+    finally:
+        process.kill()
+        process.wait()
+    assert (killed / "state.pt").exists() and not (killed / "mappo.pt").exists()
     resumed = run("train", "mappo", *EPISODES, "--out", str(killed), "--resume")
     assert resumed.returncode == 0, resumed.stderr
     assert weights_of(killed) == weights_of(whole)
@@ -39,7 +56,7 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
         assert list((folder / "tensorboard").glob("events.*"))
     again = run("train", "mappo", *EPISODES, "--out", str(whole))
     assert again.returncode == 2
-    assert "holds a training: give --resume" in again.stderr
+    assert "has a training: give --resume" in again.stderr
 
 
 def test_help_teaches() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,12 +14,14 @@ import httpx
 from shared.scenario import SCENARIOS
 from shared.wire import FeedbackRequest, Uplink
 from simulator.client import EdgeClient
-from simulator.mission import Choice, EdgePilot, Flight, fly
-from simulator.site import Site
-from simulator.uplink import LossyTransport
+from simulator.client.lossy_transport import LossyTransport
+from simulator.flying.flight import Flight, fly
+from simulator.flying.pilots import Choice, EdgePilot
+from simulator.sites.site import Site
 from simulator.world import Observation
 from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.simulator.edge_stub import free_port
+from tests.waiting import PATIENCE_S, until
 
 SCENARIO = SCENARIOS["paper"].model_copy(update={"steps": 12})
 
@@ -33,11 +34,12 @@ class Patient(EdgePilot):
         self._edge, self._name = client, mission_id
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
-        ends = time.monotonic() + 20
-        while (told := self._edge.mission(self._name)).learner_updates < told.feedback:
-            assert time.monotonic() < ends, told
-            time.sleep(0.002)
+        until(self._learned, lambda: self._edge.mission(self._name))
         return super().decide(uav, observation, taken)
+
+    def _learned(self) -> bool:
+        told = self._edge.mission(self._name)
+        return told.learner_updates == told.feedback
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
         assert choice.exchange is not None, self.last_error
@@ -67,9 +69,9 @@ def flown(
     transport: httpx.BaseTransport | None = None,
     on_step: Callable[[Flight], None] | None = None,
 ) -> Flight:
-    with EdgeClient(url, timeout_s=20, attempts=20, uplink=uplink, transport=transport) as client:
+    with EdgeClient(url, timeout_s=PATIENCE_S, attempts=20, uplink=uplink, transport=transport) as client:
         pilot = Patient(client, mission_id)
-        with EdgeClient(url) as ground:
+        with EdgeClient(url, timeout_s=PATIENCE_S) as ground:
             ground.put_mission(mission_id, pilot.spec)
         flight = fly(Site(SCENARIO), pilot, seed=0, on_step=on_step)
     assert pilot.last_error is None
@@ -97,7 +99,7 @@ def test_delta_is_right_where_requests_and_answers_are_lost() -> None:
     with serving_edge(AICVDS_MODE="value") as (url, _):
         lossy = LossyTransport(Deaf(), drop=0.3, jitter_ms=2, seed=0)
         full, delta = flown(url, "full", "full"), flown(url, "delta", "delta", lossy)
-        with EdgeClient(url) as ground:
+        with EdgeClient(url, timeout_s=PATIENCE_S) as ground:
             # What was sent again was decided once.
             assert ground.mission("delta").decisions == len(delta.decisions)
     assert max(d.attempts for d in delta.decisions) > 1
@@ -116,7 +118,7 @@ def test_an_edge_that_is_killed_on_the_way(tmp_path: Path) -> None:
         def restarted(flight: Flight) -> None:
             if flight.steps_flown == 6:
                 edge.kill()
-                edge.wait(20)
+                edge.wait(PATIENCE_S)
                 output_until(stack.enter_context(started("serve", "--port", port, **common)), "running on")
 
         cut = flown(f"http://127.0.0.1:{port}", "delta", "cut", on_step=restarted)
@@ -164,7 +166,19 @@ def test_simulate_tells_the_uplink_and_its_bytes(tmp_path: Path) -> None:
     with serving_edge(AICVDS_MODE="value") as (url, _):
         for uplink in ("full", "delta", "pruned"):
             out = tmp_path / uplink
-            done = run("simulate", "--edge", url, "--steps", "6", "--uplink", uplink, "--out", str(out))
+            done = run(
+                "simulate",
+                "--edge",
+                url,
+                "--steps",
+                "6",
+                "--deadline-ms",
+                "60000",
+                "--uplink",
+                uplink,
+                "--out",
+                str(out),
+            )
             assert done.returncode == 0, done.stderr
             assert f"Uplink {uplink}: " in done.stdout
             told[uplink] = json.loads((out / "summary.json").read_text())

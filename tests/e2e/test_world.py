@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from simulator.record import read_decisions
+from simulator.records.decision_log import read_decisions
 from tests.e2e.processes import run, serving_edge
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "pipeline_world"

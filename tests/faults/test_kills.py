@@ -16,10 +16,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.app import create_app
-from service.journal import Journal
-from service.settings import Settings
-from service.store import Store
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.storage.journal import Journal
+from service.storage.store import Store
 from tests.e2e.processes import serving_edge
 from tests.faults.fleet import UAVS, Report
 from tests.faults.table import Tables

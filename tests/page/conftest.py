@@ -10,9 +10,10 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 from tests.e2e.processes import serving_edge
+from tests.waiting import PATIENCE_S
 
 # As root, without a sandbox of its own, and without its calls home, which a closed network would refuse one by one.
 _FLAGS = [
@@ -24,6 +25,8 @@ _FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+
+expect.set_options(timeout=PATIENCE_S * 1e3)
 
 Start = Callable[..., tuple[str, subprocess.Popen[str]]]
 Open = Callable[..., Page]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 import sqlite3
-import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,14 +15,16 @@ import httpx
 import numpy as np
 import psutil
 
-from service.app import create_app
-from service.changes import Change
-from service.engine import Engine
-from service.mission import Mission
-from service.settings import Settings
-from service.store import Store
-from service.writers import Writer
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.edge.engine import Engine
+from service.mission.mission import Mission
+from service.storage.journal import Journal
+from service.storage.operations import Change
+from service.storage.store import Store
+from service.storage.writer import Writer
 from tests.running import serving
+from tests.waiting import PATIENCE_S, until
 
 Body = dict[str, Any]
 Report = Callable[..., Body]
@@ -30,8 +32,8 @@ Report = Callable[..., Body]
 
 @contextmanager
 def running(path: Path | str, **settings: Any) -> Iterator[tuple[httpx.Client, Engine]]:
-    app = create_app(Settings(**{"mode": "value", **settings}), Store(str(path)))
-    with serving(app) as url, httpx.Client(base_url=url, timeout=30) as client:
+    app = create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), Store(str(path)))
+    with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         yield client, app.state.engine
 
 
@@ -75,24 +77,44 @@ def copy_of(path: Path, to: Path) -> Path:
 
 
 def settled(engine: Engine, mission: Mission, updates: int) -> Mission:
-    ends = time.monotonic() + 10
-    while mission.learner.updates < updates and time.monotonic() < ends:
-        time.sleep(0.01)
+    until(lambda: mission.learner.updates >= updates, lambda: mission.learner.updates)
     assert mission.learner.updates == updates
     return mission
+
+
+def on_disk(engine: Engine) -> None:
+    """Wait until all that happened so far is."""
+    keeper = engine.journal
+    assert isinstance(keeper, Journal)
+    until(lambda: keeper._commits._written >= keeper._commits._added)
+
+
+def kept(client: httpx.Client, body: Body) -> Body:
+    """The decision of a report, which is sent again, as the same request, until that is on disk."""
+    key = {"Idempotency-Key": uuid.uuid4().hex}
+    answers: list[Body] = []
+
+    def stored() -> bool:
+        answer = client.post("/decide", json=body, headers=key)
+        assert answer.status_code == 200, answer.text
+        answers.append(answer.json())
+        return bool(answers[-1]["stored"])
+
+    until(stored)
+    return answers[-1]
 
 
 def writers(pid: int) -> list[psutil.Process]:
     """The processes that write stores for this one."""
     children = psutil.Process(pid).children()
-    return [child for child in children if any("sqlite_writer" in word for word in child.cmdline())]
+    return [child for child in children if any("sqlite_process" in word for word in child.cmdline())]
 
 
 async def written(writer: Writer, changes: Sequence[Change]) -> None:
     """Write, wait until that has ended, and raise what it failed by."""
     ended = asyncio.get_running_loop().create_future()
     writer.write(changes, ended.set_result)
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(PATIENCE_S):
         if (error := await ended) is not None:
             raise error
 

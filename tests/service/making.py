@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.mission import Mission
-from service.settings import Settings
-from service.view import View
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.mission.mission import Mission
 from shared.scenario import SCENARIOS
 from shared.wire import MissionSpec, SensorColumns, UavState
 
@@ -45,7 +45,6 @@ def uav(
     return UavState(uav_id=uav_id, position=list(position), sensors=sensors)
 
 
-def attended(mission: Mission, state: UavState, step: int = 0) -> View:
-    view = View.of(mission, state, step)
-    view.attend(mission)
+def attended(mission: Mission, state: UavState, step: int = 0) -> AttendedState:
+    view = AttendedState.of(mission, state, step)
     return view

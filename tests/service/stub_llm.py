@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from functools import cache
 from typing import Any
 
@@ -14,8 +13,11 @@ from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, Response
 
 from tests.running import Handler
+from tests.waiting import Gate, until
 
 PROBE = "7301"
+# What mode `llm` asks before there is anything to decide.
+FIRST = "0,50,-90,1,100\n"
 
 
 class StubLlm:
@@ -48,12 +50,15 @@ def said(text: str, usage: dict[str, Any] | None = None, **choice: Any) -> Respo
 
 
 def wait_for(client: httpx.Client, llm: str) -> dict[str, Any]:
-    for _ in range(1200):
-        ready: dict[str, Any] = client.get("/readyz").json()
-        if ready["llm"] == llm:
-            return ready
-        time.sleep(0.05)
-    raise AssertionError(f"the LLM never became {llm}: {ready}")
+    """What the edge says of itself, once that is where its LLM stands."""
+    ready: dict[str, Any] = {}
+
+    def there() -> bool:
+        ready.update(client.get("/readyz").json())
+        return bool(ready["llm"] == llm)
+
+    until(there, lambda: f"the LLM is to be {llm}: {ready}")
+    return ready
 
 
 async def _head(reader: asyncio.StreamReader) -> dict[str, Any]:
@@ -63,16 +68,21 @@ async def _head(reader: asyncio.StreamReader) -> dict[str, Any]:
     return body
 
 
-def misbehaving(fault: Handler) -> Handler:
-    """A server that passes the probe, so that the edge trusts it, and then does what ``fault`` does."""
+def misbehaving(fault: Handler, probes: Gate | None = None) -> Handler:
+    """A server that passes the probe, so that the edge trusts it, and then does what ``fault`` does.
+
+    Where there is a gate for ``probes``, they are answered behind it.
+    """
 
     async def handler(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while True:
             body = await _head(reader)
             asked = body.get("messages", [{}])[-1].get("content", "")
-            if body and asked not in ("Say hello.", "0,50,-90,1,100\n") and "N/A" not in asked:
+            if body and asked not in ("Say hello.", FIRST) and "N/A" not in asked:
                 await fault(reader, writer)
                 return
+            if asked == "Say hello." and probes is not None:
+                await probes.passed()
             text = f"{PROBE} 0" if asked == "Say hello." else "0 0"
             answer = json.dumps({"choices": [{"message": {"content": text}}], "data": [{"id": "stub-1"}]}).encode()
             writer.write(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%s" % (len(answer), answer))

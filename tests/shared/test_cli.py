@@ -16,7 +16,7 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
     def load() -> object:
         raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)
 
-    command = SimpleNamespace(name=name, value="simulator.bound:main", load=load)
+    command = SimpleNamespace(name=name, value="simulator.commands.bound:main", load=load)
     monkeypatch.setattr(cli, "entry_points", lambda group: [command])
     monkeypatch.setattr(cli, "find_spec", lambda module: object() if module == "matplotlib" else None)
     monkeypatch.setattr(sys, "argv", ["aicvds", name, "--seed", "0"])

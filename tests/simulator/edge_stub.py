@@ -1,8 +1,7 @@
-"""An edge that answers at once, or misbehaves as told; a real server on a real port."""
+"""A stub edge that answers at once, or misbehaves by a script; a real server on a real port."""
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import threading
 import time
@@ -34,6 +33,7 @@ from shared.wire import (
     Tokens,
 )
 from tests.running import serving
+from tests.waiting import PATIENCE_S, Gate
 
 Behaviour = Literal["ok", "busy", "busy_retry_after", "garbage", "invalid", "crash", "html", "slow", "forgot", "wrong"]
 LLM = Literal["loading", "ready", "unavailable", "off"]
@@ -41,9 +41,10 @@ LLM = Literal["loading", "ready", "unavailable", "off"]
 
 @dataclass
 class EdgeStub:
-    """``script`` is how the next requests to /decide are met, one entry each; then ``otherwise``.
+    """``script`` has the behaviour for each of the next requests to /decide; afterwards it is ``otherwise``.
 
-    ``decides``, ``feedbacks`` and ``missions`` are what arrived and was understood.
+    Who is met with ``slow`` waits at the ``gate``. ``decides``, ``feedbacks`` and ``missions`` are what arrived and was
+    understood.
     """
 
     url: str = ""
@@ -51,8 +52,8 @@ class EdgeStub:
     otherwise: Behaviour = "ok"
     readiness: list[tuple[bool, LLM]] = field(default_factory=lambda: [(True, "ready")])
     model: str = "stub-1"
-    slow_s: float = 0.3
-    asked: int = 0
+    gate: Gate = field(default_factory=Gate)
+    request_count: int = 0
     polled: int = 0
     at_once: int = 0
     most_at_once: int = 0
@@ -63,55 +64,55 @@ class EdgeStub:
 
     async def decide(self, request: Request) -> Response:
         """POST /decide."""
-        self.asked += 1
+        self.request_count += 1
         self.headers.append(dict(request.headers))
         behaviour = self.script.pop(0) if self.script else self.otherwise
-        asked = DecideRequest.model_validate_json(await request.body())
-        self.decides.append(asked)
+        body = DecideRequest.model_validate_json(await request.body())
+        self.decides.append(body)
         if behaviour == "slow":
             self.at_once += 1
             self.most_at_once = max(self.most_at_once, self.at_once)
-            await asyncio.sleep(self.slow_s)
+            await self.gate.passed()
             self.at_once -= 1
-        refusal = _misbehave(behaviour, asked)
-        return refusal or Response(self._answer(asked, behaviour).model_dump_json())
+        refusal = _misbehave(behaviour, body)
+        return refusal or Response(self._answer(body, behaviour).model_dump_json())
 
-    def _answer(self, asked: DecideRequest, behaviour: Behaviour) -> DecideResponse:
-        sensors = asked.sensors.id
-        sensor = 9_999 if behaviour == "wrong" else sensors[(asked.step + asked.uav_id) % len(sensors)]
+    def _answer(self, body: DecideRequest, behaviour: Behaviour) -> DecideResponse:
+        sensors = body.sensors.id
+        sensor = 9_999 if behaviour == "wrong" else sensors[(body.step + body.uav_id) % len(sensors)]
         tokens = Tokens(
             tokenizer="stub",
             static=200,
-            experiences=10 * asked.step,
+            experiences=10 * body.step,
             state=40,
             state_uncompressed=90,
-            prompt=240 + 10 * asked.step,
-            uncompressed=290 + 10 * asked.step,
+            prompt=240 + 10 * body.step,
+            uncompressed=290 + 10 * body.step,
             saved=50,
             cached=200,
             server_prompt=250,
         )
         return DecideResponse(
             decision_id=uuid.uuid4().hex,
-            mission_id=asked.mission_id,
-            uav_id=asked.uav_id,
-            step=asked.step,
+            mission_id=body.mission_id,
+            uav_id=body.uav_id,
+            step=body.step,
             sensor_id=sensor,
             velocity=7,
-            source="llm" if asked.step else "policy",
-            reason=None if asked.step else "llm_timeout",
+            source="llm" if body.step else "policy",
+            reason=None if body.step else "llm_timeout",
             model=self.model,
             top_k=[Candidate(sensor_id=j, score=-float(j)) for j in sensors[:5]],
             tokens=tokens,
-            deadline_ms=asked.deadline_ms or 3000,
+            deadline_ms=body.deadline_ms or 3000,
             latency_ms={"llm": 1.0, "total": 2.0},
         )
 
     async def decide_batch(self, request: Request) -> Response:
         """POST /decide/batch."""
-        asked = BatchRequest.model_validate_json(await request.body())
+        body = BatchRequest.model_validate_json(await request.body())
         behaviour = self.script.pop(0) if self.script else self.otherwise
-        requests = [DecideRequest(step=asked.step, **uav.model_dump()) for uav in asked.uavs]
+        requests = [DecideRequest(step=body.step, **uav.model_dump()) for uav in body.uavs]
         answers = [self._answer(one, behaviour) for one in requests]
         return Response(BatchResponse(decisions=answers).model_dump_json())
 
@@ -174,7 +175,7 @@ class EdgeStub:
         )
 
 
-def _misbehave(behaviour: Behaviour, asked: DecideRequest) -> Response | None:
+def _misbehave(behaviour: Behaviour, body: DecideRequest) -> Response | None:
     match behaviour:
         case "busy":
             return _problem(503, "overloaded")
@@ -189,7 +190,7 @@ def _misbehave(behaviour: Behaviour, asked: DecideRequest) -> Response | None:
             return _problem(500, "the edge failed; its log says more")
         case "html":
             return Response("<h1>Bad gateway</h1>\nnginx", status_code=404)
-        case "forgot" if asked.outcome is not None:
+        case "forgot" if body.outcome is not None:
             errors = [{"field": "outcome.decision_id", "problem": "unknown"}]
             return _problem(404, "outcome.decision_id: unknown", errors=errors)
     return None
@@ -204,15 +205,15 @@ def _problem(
 
 @contextmanager
 def stub_edge() -> Iterator[EdgeStub]:
-    """A stub on a port of its own."""
+    """A stub on a free port."""
     stub = EdgeStub()
-    with serving(stub.app()) as url:
+    with serving(stub.app()) as url, stub.gate:
         stub.url = url
         yield stub
 
 
 def free_port() -> int:
-    """A port of the loopback that nobody listened on just now."""
+    """A port of the loopback that was free just now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -220,7 +221,7 @@ def free_port() -> int:
 
 @contextmanager
 def stub_edge_at(port: int) -> Iterator[EdgeStub]:
-    """A new stub, that knows no mission, on a port that another had before."""
+    """A new stub without missions on a given port, such as that of a stub before."""
     stub = EdgeStub(url=f"http://127.0.0.1:{port}")
     server = uvicorn.Server(uvicorn.Config(stub.app(), host="127.0.0.1", port=port, log_level="warning"))
     thread = threading.Thread(target=server.run, daemon=True)
@@ -233,4 +234,4 @@ def stub_edge_at(port: int) -> Iterator[EdgeStub]:
         yield stub
     finally:
         server.should_exit = True
-        thread.join(timeout=30)
+        thread.join(PATIENCE_S)

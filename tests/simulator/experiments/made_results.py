@@ -1,4 +1,4 @@
-"""Results made up for tests, with the numbers that a test asks for."""
+"""Synthetic results for tests, with given numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CURVES = ["lost_packets_per_step", "lost_packets_cumulative", "events_per_step",
 
 
 def interval(mean: float, seeds: int = 30, spread: float = 0.0) -> Interval:
-    """``seeds`` values around ``mean``, the same for the same seeds, so that pairs differ by their means alone."""
+    """``seeds`` values around ``mean`` with the same noise for the same seeds: pairs differ only in their means."""
     values = mean + spread * np.random.default_rng(0).standard_normal(seeds)
     middle = float(values.mean())
     return Interval(mean=middle, low=middle - spread, high=middle + spread, values=values.tolist())

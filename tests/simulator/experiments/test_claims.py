@@ -1,4 +1,4 @@
-"""Each of the paper's statements, borne out by one made-up result and not by another."""
+"""Each of the paper's claims, confirmed by one synthetic result and not by another."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def flown(**zeros: int) -> Result:
     return result("scheduler", schemes, curves={name: zero_from(at) for name, at in zeros.items()})
 
 
-def kept(**lost: float) -> Result:
+def by_k(**lost: float) -> Result:
     at = {name: float(name[1:]) for name in lost}
     return result("top-k", {n: {"lost_packets": v} for n, v in lost.items()}, sweep=Sweep(label="k", at=at))
 
 
 def attended(llm: float, llm_all: float) -> Result:
-    """Two schemes apart by ``llm_all - llm`` in the mean, by chance on any one seed."""
+    """Two schemes whose means differ by ``llm_all - llm``, with noise on each seed."""
     noisy = interval(llm, spread=5.0)
     without = interval(llm_all, spread=5.0).model_copy(update={"values": [llm_all + (-1) ** n for n in range(30)]})
     return result("attention", {"llm": {"lost_packets": noisy}, "llm_all": {"lost_packets": without}})
@@ -77,10 +77,10 @@ def fair(served: float, scheduled: float) -> Result:
         ("Jain's index", fair(0.87, 0.99), APART),
         ("with and without attention", attended(50.0, 50.0), REPRODUCED),
         ("with and without attention", attended(50.0, 90.0), NOT),
-        ("k=3 is worse", kept(k3=80.0, k5=50.0), REPRODUCED),
-        ("k=3 is worse", kept(k3=50.0, k5=50.0), NOT),
-        ("k above 5", kept(k5=50.0, k7=50.0, k10=60.0), REPRODUCED),
-        ("k above 5", kept(k5=50.0, k7=50.0, k10=20.0), NOT),
+        ("k=3 is worse", by_k(k3=80.0, k5=50.0), REPRODUCED),
+        ("k=3 is worse", by_k(k3=50.0, k5=50.0), NOT),
+        ("k above 5", by_k(k5=50.0, k7=50.0, k10=60.0), REPRODUCED),
+        ("k above 5", by_k(k5=50.0, k7=50.0, k10=20.0), NOT),
     ],
 )
 def test_a_statement_is_judged_by_the_numbers(stated: str, made: Result, verdict: Verdict) -> None:
@@ -93,11 +93,11 @@ def test_a_statement_is_judged_by_the_numbers(stated: str, made: Result, verdict
     ("stated", "made"),
     [
         ("with and without attention", attended(50.0, 50.0)),
-        ("k=3 is worse", kept(k3=80.0, k5=50.0)),
-        ("k above 5", kept(k5=50.0, k7=50.0)),
+        ("k=3 is worse", by_k(k3=80.0, k5=50.0)),
+        ("k above 5", by_k(k5=50.0, k7=50.0)),
     ],
 )
-def test_an_llm_no_better_than_chance_says_nothing_of_attention(stated: str, made: Result) -> None:
+def test_an_llm_no_better_than_chance_is_no_evidence_about_attention(stated: str, made: Result) -> None:
     found = finding(stated, made, losing(llm=600.0, chance=600.0))
     assert found.verdict is APART
     assert "no better than chance" in found.why
@@ -130,7 +130,7 @@ def test_only_full_runs_in_the_papers_world_are_judged(
     assert why in found.why
 
 
-def test_what_was_not_run_or_not_measured_has_no_verdict_and_says_so() -> None:
+def test_claims_without_a_run_or_a_measurement_have_no_verdict() -> None:
     assert all((f.verdict, f.why) == (None, "not run") for f in judge({}))
     assert finding("MADQN reaches zero", flown(eof=20)).why == "not measured: lost_packets_per_step of madqn"
     assert finding("loses less than EOF", flown(llm=4, eof=20)).why == "not measured: lost_packets of wqcs, madqn"

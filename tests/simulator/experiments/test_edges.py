@@ -1,4 +1,4 @@
-"""The edges that an experiment starts: what they are told, and what a flight's key says of their LLM."""
+"""The edges of an experiment: their environment, and the identity of their LLM in a flight's key."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import pytest
 from rich.console import Console
 
 from simulator.experiments.edges import Llm, edge_for, environment_for
-from simulator.experiments.schemes import ASKED, CHANCE, OFF, WORST, Backing
+from simulator.experiments.schemes import CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
 
 SERVER = "http://127.0.0.1:8080/v1"
 
 
 @pytest.fixture(autouse=True)
 def exported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a user may have exported for other purposes."""
+    """Settings that a user may have exported for other purposes."""
     for name, setting in {
         "AICVDS_TOP_K": "1",
         "AICVDS_EXPERIENCES": "0",
@@ -35,15 +35,15 @@ def settings(backing: str, llm: Llm) -> dict[str, str]:
         return {k: v for k, v in environment.items() if k.startswith("AICVDS_") and k not in own}
 
 
-def test_only_what_cannot_change_a_decision_is_inherited() -> None:
-    assert settings(ASKED, Llm()) == {"AICVDS_LLM_THREADS": "2"}
+def test_only_settings_that_cannot_change_a_decision_are_inherited() -> None:
+    assert settings(NAMED_BY_OPTION, Llm()) == {"AICVDS_LLM_THREADS": "2"}
     assert settings(OFF, Llm()) == {"AICVDS_LLM_THREADS": "2", "AICVDS_MODE": "value"}
 
 
 def test_a_server_gets_its_model_and_key() -> None:
-    asked = settings(ASKED, Llm(SERVER))
-    assert asked.pop("AICVDS_LLM_THREADS")
-    assert asked == {"AICVDS_LLM_URL": SERVER, "AICVDS_LLM_MODEL": "big", "AICVDS_LLM_API_KEY": "secret"}
+    named = settings(NAMED_BY_OPTION, Llm(SERVER))
+    assert named.pop("AICVDS_LLM_THREADS")
+    assert named == {"AICVDS_LLM_URL": SERVER, "AICVDS_LLM_MODEL": "big", "AICVDS_LLM_API_KEY": "secret"}
 
 
 def test_a_model_file_is_embedded_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,14 +63,14 @@ def test_llms_that_may_answer_differently_have_different_identities(tmp_path: Pa
     (tmp_path / "a" / "m.gguf").write_bytes(b"one")
     (tmp_path / "m.gguf").write_bytes(b"two")
     files = [Llm().identity(str(path)) for path in (tmp_path / "m.gguf", tmp_path / "a" / "m.gguf")]
-    asked = [llm.identity(ASKED) for llm in (Llm(), Llm(SERVER), Llm(edge="http://e:8000"))]
-    assert asked[0] == "embedded" and asked[1] == f"{SERVER} big"
-    assert len({*files, *asked, Llm().identity(OFF), Llm().identity(CHANCE)}) == 7
+    named = [llm.identity(NAMED_BY_OPTION) for llm in (Llm(), Llm(SERVER), Llm(edge="http://e:8000"))]
+    assert named[0] == "embedded" and named[1] == f"{SERVER} big"
+    assert len({*files, *named, Llm().identity(OFF), Llm().identity(CHANCE)}) == 7
 
 
 def test_whether_there_is_an_llm_to_ask() -> None:
-    assert Llm().there and Llm(SERVER).there and not Llm("none").there
-    assert Llm("none", edge="http://e:8000").there
+    assert Llm().available and Llm(SERVER).available and not Llm("none").available
+    assert Llm("none", edge="http://e:8000").available
 
 
 @pytest.mark.parametrize("backing", [CHANCE, WORST])

@@ -1,4 +1,4 @@
-"""From flights to a result: who is compared on what, and what is said of it."""
+"""From flights to a result: pairs, measures and notes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.findings import findings, tidy
-from simulator.experiments.flight import BoundFound, Flown
+from simulator.experiments.flight import BoundFound, FlightRecord
 from simulator.experiments.measures import MEASURES, STEP_MEASURES
-from simulator.experiments.plan import QUICK_STEPS, Drawing, Experiment, plan
+from simulator.experiments.plan import QUICK_STEPS, Experiment, FigureSpec, plan
 from simulator.experiments.result import Result
 from simulator.experiments.schemes import BOUND, llm, local
-from simulator.site import Site
-from tests.simulator.experiments.flying_tiny import TINY, decided, declared, flown, setup
+from simulator.sites.site import Site
+from tests.simulator.experiments.tiny_flights import TINY, decided, declared, flown, setup
 
 LOST = {"eof": 10, "random": 30, "llm": 20}
 
@@ -24,7 +24,7 @@ LOST = {"eof": 10, "random": 30, "llm": 20}
 def result_of(experiment: Experiment, changes: dict[str, Any] | None = None, **setup_changes: Any) -> Result:
     """The findings of flights in which a scheme loses ``LOST`` packets and as many again for each seed."""
     planned = plan(experiment, setup(**setup_changes))
-    flights: dict[str, Flown] = {}
+    flights: dict[str, FlightRecord] = {}
     for flight in planned.flights:
         name, seed = flight.scheme.name, flight.seed
         if name == BOUND.name:
@@ -48,7 +48,7 @@ def test_schemes_are_paired_to_the_reference_on_the_seeds_that_both_flew() -> No
     assert differences == pytest.approx({"random": 40.0, "llm": 15.0})
 
 
-def test_the_bound_is_no_scheme_and_everyone_is_told_apart_from_it() -> None:
+def test_the_bound_is_no_scheme_and_every_scheme_is_compared_with_it() -> None:
     result = result_of(declared(local("eof"), local("random"), BOUND))
     assert "bound" not in result.schemes and "bound" not in result.curves
     assert result.bound["lost_packets"].values == [2, 3, 4]
@@ -59,12 +59,12 @@ def test_the_bound_is_no_scheme_and_everyone_is_told_apart_from_it() -> None:
 
 def test_curves_are_per_step_and_cumulative() -> None:
     curves = ("lost_packets_per_step", "lost_packets_cumulative")
-    result = result_of(declared(local("eof"), drawings=(Drawing("c", "curves", curves, "Curves."),)))
+    result = result_of(declared(local("eof"), figures=(FigureSpec("c", "curves", curves, "Curves."),)))
     assert result.curves["eof"]["lost_packets_per_step"].mean == [0, 20, 0]
     assert result.curves["eof"]["lost_packets_cumulative"].mean == [0, 20, 20]
 
 
-def test_a_caption_says_seeds_interval_and_command() -> None:
+def test_a_caption_has_seeds_interval_and_command() -> None:
     [figure] = result_of(declared(local("eof"), llm()), llm=setup().llm.__class__()).figures
     assert "3 seeds (2 for those that ask an LLM)" in figure.caption
     assert "95% bootstrap interval" in figure.caption and "`aicvds experiment tiny`" in figure.caption
@@ -77,7 +77,7 @@ def test_decisions_taken_in_the_llms_place_are_not_passed_off_as_its_own() -> No
     assert not any("not the LLM's" in note for note in own.notes)
 
 
-def test_a_measure_that_some_seed_lacks_is_left_out_and_said_so() -> None:
+def test_a_measure_that_some_seed_lacks_is_omitted_with_a_note() -> None:
     planned = plan(declared(local("eof")), setup())
     flights = {
         p.key: flown([decided(0, 0, failed=p.seed == 1)], seed=p.seed, failures=[0], overflows=[0], lost_packets=[0])
@@ -88,7 +88,7 @@ def test_a_measure_that_some_seed_lacks_is_left_out_and_said_so() -> None:
     assert any("it has none on 1 of 3 seeds" in note for note in result.notes)
 
 
-def test_sites_are_told_apart_in_the_measures_names() -> None:
+def test_the_measures_names_have_the_site() -> None:
     sites = {"paper": Site(TINY), "stress": Site(TINY.model_copy(update={"name": "stress", "link_share": 0.35}))}
     result = result_of(declared(where="everywhere"), sites=sites)
     assert {"lost_packets@paper", "lost_packets@stress"} <= set(result.schemes["eof"])
@@ -104,7 +104,7 @@ def test_the_table_has_a_line_a_scheme_seed_and_measure() -> None:
     assert {"experiment": "tiny", "scheme": "bound", "seed": "2", "measure": "lost_packets", "value": "4"} in rows
 
 
-def test_flights_of_two_commits_are_told() -> None:
+def test_flights_of_two_commits_have_a_note() -> None:
     planned = plan(declared(local("eof")), setup())
     flights = {
         p.key: flown([decided(0, 0)], seed=p.seed, commit=f"c{p.seed}", failures=[0], overflows=[0], lost_packets=[0])
@@ -116,14 +116,14 @@ def test_flights_of_two_commits_are_told() -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS.values(), ids=list(EXPERIMENTS))
 @pytest.mark.parametrize("pace", ["full", "quick"])
-def test_what_an_experiment_declares_is_there(experiment: Experiment, pace: str) -> None:
+def test_the_names_that_experiments_declare_exist(experiment: Experiment, pace: str) -> None:
     names = {scheme.name for scheme in experiment.schemes(setup(pace=pace))}
     whole = {scheme.name for scheme in experiment.schemes(setup())}
     assert names <= whole
     assert experiment.reference is None or experiment.reference in names
     assert {name for pair in experiment.pairs for name in pair} <= whole
     assert set(experiment.measures) <= MEASURES.keys() and set(experiment.paired_measures) <= set(experiment.measures)
-    for drawing in experiment.drawings:
+    for drawing in experiment.figures:
         known = STEP_MEASURES.keys() if drawing.kind == "curves" else set(experiment.measures)
         assert set(drawing.measures) <= known, drawing.name
     assert experiment.sweep is None or whole == experiment.sweep.at.keys()

@@ -1,4 +1,4 @@
-"""Flights: flown once, kept whole, shared between experiments, flown again when their file is broken."""
+"""Stored flights: flown once, stored whole, shared between experiments, flown again after a broken file."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from shared.scenario import Scenario
 from simulator.experiments.flight import FlightStore, flight_key
 from simulator.experiments.plan import weights_of
 from simulator.experiments.schemes import BOUND, OFF, Scheme, at_full_speed, llm, local, over_edge
-from simulator.policies import policy_named
-from simulator.rollout import rollout
-from simulator.site import Site
-from tests.simulator.experiments.flying_tiny import TINY, declared, flown, run_in
+from simulator.flying.rollout import rollout
+from simulator.policies.registry import policy_named
+from simulator.sites.site import Site
+from tests.simulator.experiments.tiny_flights import TINY, declared, flown, run_in
 
 
 def flights_in(out: Path) -> dict[str, int]:
-    """Every flight's file, and when it was written."""
+    """The time of modification of every flight's file."""
     return {path.name: path.stat().st_mtime_ns for path in (out / "flights").glob("*.json.gz")}
 
 
-def test_a_flight_comes_back_as_it_was_kept(tmp_path: Path) -> None:
+def test_a_stored_flight_is_loaded_unchanged(tmp_path: Path) -> None:
     store, flight = FlightStore(tmp_path), flown(failures=[1, 2, 0], lost_packets=[0, 3, 9])
     assert store.load("key") is None
     store.save("key", flight)
@@ -39,13 +39,13 @@ def test_a_broken_file_is_no_flight(tmp_path: Path, content: bytes) -> None:
     assert store.load("key") is None
 
 
-def test_what_a_scheme_is_called_does_not_make_another_flight() -> None:
+def test_a_schemes_name_is_no_part_of_the_key() -> None:
     site = Site(TINY)
     renamed = llm().model_copy(update={"name": "k5", "label": "k = 5"})
     assert flight_key(llm(), "embedded", site, 0) == flight_key(renamed, "embedded", site, 0)
 
 
-def test_what_decides_where_and_when_makes_another_flight() -> None:
+def test_decider_site_and_seed_are_part_of_the_key() -> None:
     traced = Site(TINY, np.zeros((3, 10), dtype=np.int64))
     keys = {
         flight_key(llm(), "embedded", Site(TINY), 0),
@@ -61,7 +61,7 @@ def test_what_decides_where_and_when_makes_another_flight() -> None:
     assert len(keys) == 9
 
 
-def test_a_kept_flight_is_the_rollout_of_its_policy(tmp_path: Path) -> None:
+def test_a_stored_flight_is_the_rollout_of_its_policy(tmp_path: Path) -> None:
     [result] = run_in(tmp_path).make([declared()])
     tallies = [rollout(Site(TINY).world(), policy_named("eof"), seed) for seed in range(3)]
     assert result.schemes["eof"]["lost_packets"].values == [sum(t.lost_packets for t in ts) for ts in tallies]
@@ -97,7 +97,7 @@ def test_the_same_flights_give_the_same_files(tmp_path: Path) -> None:
     assert [(tmp_path / name).read_bytes() for name in files] == before
 
 
-def test_two_processes_give_what_one_gives(tmp_path: Path) -> None:
+def test_two_processes_give_the_flights_of_one(tmp_path: Path) -> None:
     alone = run_in(tmp_path / "one").make([declared()])
     pair = run_in(tmp_path / "two")
     pair.workers = 2
@@ -126,7 +126,7 @@ def test_full_speed_changes_the_velocity_alone(tmp_path: Path) -> None:
     assert [d.sensor for d in own.decisions[:3]] == [d.sensor for d in full.decisions[:3]]
 
 
-def test_a_scheme_that_asks_no_llm_says_so() -> None:
+def test_schemes_without_an_llm_are_recognised() -> None:
     schemes: list[tuple[Scheme, bool]] = [
         (llm(), True),
         (over_edge("x", "", mode="value", backing=OFF), False),

@@ -1,4 +1,4 @@
-"""The formulas against draws."""
+"""The formulas of Jain's index compared with random draws."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simulator.experiments.jain import expected_by_chance, of_proportional_visits, reached_by_chance
-from simulator.record import jain_index
+from simulator.records.statistics import jain_index
 
 RNG = np.random.default_rng(7)
 
@@ -19,7 +19,7 @@ def drawn(visits: int, sensors: int, at_once: int, times: int = 4_000) -> np.nda
 
 
 @pytest.mark.parametrize(("visits", "sensors", "at_once"), [(90, 10, 1), (90, 10, 3), (40, 5, 2)])
-def test_the_index_by_chance_is_what_drawing_gives(visits: int, sensors: int, at_once: int) -> None:
+def test_the_index_by_chance_matches_draws(visits: int, sensors: int, at_once: int) -> None:
     found = drawn(visits, sensors, at_once)
     assert expected_by_chance(visits, sensors, at_once) == pytest.approx(found.mean(), abs=0.002)
 
@@ -29,7 +29,7 @@ def test_in_the_papers_world_chance_alone_gives_091() -> None:
 
 
 @pytest.mark.parametrize("at_once", [1, 3])
-def test_how_often_chance_is_as_even_as_the_paper_is_what_drawing_gives(at_once: int) -> None:
+def test_the_probability_of_the_papers_index_matches_draws(at_once: int) -> None:
     often = (drawn(90, 10, at_once) >= 0.98).mean()
     assert reached_by_chance(0.98, 90, 10, at_once) == pytest.approx(often, abs=0.006)
 

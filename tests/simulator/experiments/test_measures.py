@@ -1,12 +1,12 @@
-"""What is measured of a flight, against values worked out by hand."""
+"""The measures of a flight, compared with values computed by hand."""
 
 from __future__ import annotations
 
 import pytest
 
-from simulator.experiments.flight import Counted
-from simulator.experiments.measures import MEASURES, STEP_MEASURES, ages, policys_instead
-from tests.simulator.experiments.flying_tiny import decided, flown
+from simulator.experiments.flight import TokenCounts
+from simulator.experiments.measures import MEASURES, STEP_MEASURES, ages, substituted_decisions
+from tests.simulator.experiments.tiny_flights import decided, flown
 
 
 def test_losses_are_counted_per_step_and_cumulative() -> None:
@@ -35,8 +35,8 @@ def test_jain_counts_served_visits_or_scheduled_ones() -> None:
 
 
 def test_tokens_are_means_over_decisions_and_savings_over_totals() -> None:
-    counts = [Counted(prompt=90, uncompressed=130, state=10, state_uncompressed=50, cached=5)] * 2
-    counts.append(Counted(prompt=120, uncompressed=140, state=40, state_uncompressed=50))
+    counts = [TokenCounts(prompt=90, uncompressed=130, state=10, state_uncompressed=50, cached=5)] * 2
+    counts.append(TokenCounts(prompt=120, uncompressed=140, state=40, state_uncompressed=50))
     flight = flown([decided(step, 0, tokens=count) for step, count in enumerate(counts)])
     assert MEASURES["state_tokens"].of(flight) == 20
     assert MEASURES["state_saved_pct"].of(flight) == pytest.approx(60)
@@ -55,7 +55,7 @@ def test_round_trips_and_their_shares() -> None:
     assert MEASURES["rtt_p50"].of(flown([decided(0, 0)])) is None
 
 
-def test_decisions_in_the_llms_place_are_told_from_those_nobody_was_to_make() -> None:
+def test_substituted_decisions_exclude_those_without_a_candidate() -> None:
     reasons = ["llm_timeout", "answer_sensor", "no_candidate", "edge_unreachable", None]
     flight = flown([decided(0, 0, reason=reason) for reason in reasons])
-    assert policys_instead(flight) == 3
+    assert substituted_decisions(flight) == 3

@@ -1,4 +1,4 @@
-"""What an operator of an experiment says and agrees to, and how obedience is measured."""
+"""The notes and answers of an experiment's operator, and the measures of obedience."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from collections.abc import Callable
 import httpx
 import pytest
 
-from service.order_examples import EXAMPLES
-from service.orders import admissible
+from service.guidance.order_examples import EXAMPLES
+from service.guidance.order_grammar import admissible
 from shared.guidance import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire import MissionSpec
 from simulator.client import EdgeClient
 from simulator.experiments.edges import EdgeAt
+from simulator.experiments.execution import fly_with_edge
 from simulator.experiments.flight import flight_key
-from simulator.experiments.flying import fly_over
 from simulator.experiments.measures import MEASURES
 from simulator.experiments.obedience import EXPERIMENT
-from simulator.experiments.operators import Operator, Told
+from simulator.experiments.operators import Intent, Operator
 from simulator.experiments.plan import plan
 from simulator.experiments.schemes import OFF, over_edge
-from simulator.site import Site
+from simulator.sites.site import Site
 from tests.running import serving
+from tests.service.guidance.test_operator_guidance import Scribe
 from tests.service.stub_llm import wait_for
-from tests.service.test_guidance import Scribe
-from tests.simulator.experiments.flying_tiny import TINY, decided, declared, flown, setup
+from tests.simulator.experiments.tiny_flights import TINY, decided, declared, flown, setup
 
 Edge = Callable[..., httpx.Client]
 
 MEANT = Guidance(sensors=[SensorWish(sensor_id=1, visit_every=2)], max_velocity=6)
 NOTE = "Sensor 1 every 2 steps, at most 6 m/s."
-NOTES = (Told(note=NOTE, meant=MEANT), Told(note="Slowly.", meant=NO_GUIDANCE))
+NOTES = (Intent(note=NOTE, meant=MEANT), Intent(note="Slowly.", meant=NO_GUIDANCE))
 ORDERS = "visit sensor 1 every 2 steps, fly at most 6 m/s"
 
 
@@ -60,29 +60,29 @@ def test_velocities_and_confirmations_are_shares() -> None:
         ("structure", "do as you please", "confirmed"),
     ],
 )
-def test_an_operator_confirms_only_what_he_means(edge: Edge, says: str, orders: str, status: str) -> None:
+def test_an_operator_confirms_only_the_intended_guidance(edge: Edge, says: str, orders: str, status: str) -> None:
     operator = Operator.model_validate({"says": says, "notes": NOTES})
     with serving(Scribe(orders).app) as llm:
         client = edge(mode="llm", llm_url=f"{llm}/v1")
         wait_for(client, "ready")
-        with EdgeClient(str(client.base_url), timeout_s=30) as own:
+        with EdgeClient(str(client.base_url), timeout_s=120) as own:
             own.put_mission("test", MissionSpec(note=operator.note(0)))
             assert operator.answer(own, "test", 0) == status
             understood = own.guidance("test").guidance
     assert (understood == MEANT) == (status == "confirmed")
 
 
-def test_a_flight_knows_what_was_asked_of_it_and_obeys(edge: Edge) -> None:
+def test_a_flight_records_its_guidance_and_obeys(edge: Edge) -> None:
     operator = Operator(says="structure", notes=NOTES)
-    scheme = over_edge("told", "told", mode="value", backing=OFF, operator=operator)
+    scheme = over_edge("intent", "intent", mode="value", backing=OFF, operator=operator)
     [planned] = [p for p in plan(declared(scheme), setup(seeds=1)).flights]
     at = EdgeAt(str(edge().base_url), None, lambda: None)
-    flight = fly_over(at, planned)
+    flight = fly_with_edge(at, planned)
     assert (flight.meant, flight.guidance) == (MEANT, "confirmed")
     assert max(d.velocity for d in flight.decisions) <= 6
 
 
-def test_what_an_operator_says_makes_it_another_flight() -> None:
+def test_an_operators_note_is_part_of_a_flights_key() -> None:
     schemes = [
         over_edge("a", "a", mode="value", backing=OFF, operator=operator)
         for operator in (None, Operator(says="note", notes=NOTES), Operator(says="structure", notes=NOTES))
@@ -95,7 +95,7 @@ def test_every_way_of_telling_is_compared_and_no_note_is_a_worked_example() -> N
     assert {"llm_note", "guided_agrees", "guided_structure", "value_structure", "policy_structure"} <= schemes.keys()
     operator = schemes["guided_agrees"].decides.operator  # type: ignore[union-attr]
     assert operator is not None
-    for told in operator.notes:
-        assert told.note not in dict(EXAMPLES)
-        wanted = {wish.visit_every for wish in told.meant.sensors}
-        assert any(f"every {n} steps" in order for n in wanted for order in admissible(told.note))
+    for intent in operator.notes:
+        assert intent.note not in dict(EXAMPLES)
+        wanted = {wish.visit_every for wish in intent.meant.sensors}
+        assert any(f"every {n} steps" in order for n in wanted for order in admissible(intent.note))

@@ -1,21 +1,21 @@
-"""How long the rest will take: by kind of flight, from what was measured."""
+"""The estimate of the remaining time, by kind of flight, from measured durations."""
 
 from __future__ import annotations
 
 import pytest
 
-from simulator.experiments.pace import Pace, told
+from simulator.experiments.pace import Pace, duration_text
 from simulator.experiments.plan import Planned, plan
 from simulator.experiments.schemes import llm, local, value
-from simulator.site import Site
-from tests.simulator.experiments.flying_tiny import TINY, declared, setup
+from simulator.sites.site import Site
+from tests.simulator.experiments.tiny_flights import TINY, declared, setup
 
 
 def flights() -> list[Planned]:
     return plan(declared(local("eof"), value()), setup()).flights
 
 
-def test_what_was_measured_replaces_the_guess() -> None:
+def test_measured_durations_replace_the_estimate() -> None:
     pace, (measured, *rest) = Pace(), flights()
     pace.took(measured, 9.0)
     same = [flight for flight in rest if flight.scheme.name == "eof"]
@@ -36,5 +36,5 @@ def test_longer_missions_take_longer() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "0 s"), (89, "89 s"), (600, "10 min"), (12_000, "3 h 20 min")])
-def test_durations_are_told_as_people_say_them(seconds: float, words: str) -> None:
-    assert told(seconds) == words
+def test_durations_in_words(seconds: float, words: str) -> None:
+    assert duration_text(seconds) == words

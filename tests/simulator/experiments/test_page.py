@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from simulator.errors import UsageError
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.page import (
     Swap,
@@ -13,13 +14,12 @@ from simulator.experiments.page import (
     main,
     packets_and_events,
     results_in,
+    seeds_text,
     swap,
-    told_seeds,
     write_page,
 )
 from simulator.experiments.result import Paired, Result
 from simulator.experiments.tables import cell
-from simulator.record import BadUse
 from tests.simulator.experiments.made_results import CURVES, figure, interval, result, zero_from
 
 LATER = datetime(2026, 5, 6, tzinfo=UTC)
@@ -42,7 +42,7 @@ def scheduler() -> Result:
     )
 
 
-def kept(runs: Path, *results: Result) -> Path:
+def stored(runs: Path, *results: Result) -> Path:
     for number, found in enumerate(results):
         folder = runs / f"{found.experiment}-{number}"
         folder.mkdir(parents=True)
@@ -63,7 +63,7 @@ def section(text: str, name: str) -> str:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of one full run of the scheduler experiment; its folder had a figure of an older run."""
-    runs = kept(tmp_path_factory.mktemp("runs"), scheduler())
+    runs = stored(tmp_path_factory.mktemp("runs"), scheduler())
     stale = runs / "docs" / "figures" / "scheduler" / "old.svg"
     stale.parent.mkdir(parents=True)
     stale.write_text("<svg/>")
@@ -71,7 +71,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs / "docs" / "results.md"
 
 
-def test_what_was_run_stands_with_figure_numbers_and_where_they_are_from(written: Path) -> None:
+def test_an_experiment_with_a_result_has_figures_numbers_and_origin(written: Path) -> None:
     shown = section(written.read_text(), "scheduler")
     for part in (
         "aicvds experiment scheduler --llm none", "0 to 29 (30)", "2026-01-02", "version 0.1.0", "commit 0123456789",
@@ -91,7 +91,7 @@ def test_the_figures_that_it_shows_are_there_and_no_others(written: Path) -> Non
     assert all(path.read_text().endswith("</svg>\n") for path in shown)
 
 
-def test_what_was_not_run_says_how_to_run_it(written: Path) -> None:
+def test_an_experiment_without_a_result_has_the_command_to_run_it(written: Path) -> None:
     for name in EXPERIMENTS.keys() - {"scheduler"}:
         assert f"Not run. `aicvds experiment {name}` makes it." in section(written.read_text(), name)
 
@@ -106,7 +106,7 @@ def test_the_papers_statements_have_our_numbers_and_a_verdict_each(written: Path
 
 
 def test_a_quick_run_is_marked_and_gets_no_verdict(tmp_path: Path) -> None:
-    text = page(kept(tmp_path, scheduler().model_copy(update={"quick": True, "figures": []})))
+    text = page(stored(tmp_path, scheduler().model_copy(update={"quick": True, "figures": []})))
     assert "**quick run**" in section(text, "scheduler")
     assert not re.search(r"\*\*(reproduced|not reproduced|not comparable)\*\*", text)
     assert "0 are reproduced" in text
@@ -115,10 +115,10 @@ def test_a_quick_run_is_marked_and_gets_no_verdict(tmp_path: Path) -> None:
 def test_a_full_run_counts_before_a_quick_one_and_the_latest_of_full_ones(tmp_path: Path) -> None:
     quick = scheduler().model_copy(update={"quick": True, "created_at": LATER})
     later = scheduler().model_copy(update={"created_at": LATER})
-    assert results_in(kept(tmp_path, later, scheduler(), quick))["scheduler"] == later
+    assert results_in(stored(tmp_path, later, scheduler(), quick))["scheduler"] == later
 
 
-def test_what_098_is_worth_is_told_by_what_was_measured(tmp_path: Path) -> None:
+def test_the_meaning_of_098_follows_from_measured_values(tmp_path: Path) -> None:
     fairness = result(
         "fairness",
         {
@@ -127,7 +127,7 @@ def test_what_098_is_worth_is_told_by_what_was_measured(tmp_path: Path) -> None:
             "round_robin": {"jain": 0.899, "jain_scheduled": 1.0, "lost_packets": 465.0},
         },
     )
-    text = page(kept(tmp_path, fairness))
+    text = page(stored(tmp_path, fairness))
     assert "= 0.909, to the second order **0.911**" in text
     assert "never choose the same sensor, as here, E[X] = J - 3 and chance gives **0.929**" in text
     assert "a random fleet's have 0.933 here" in text
@@ -136,7 +136,7 @@ def test_what_098_is_worth_is_told_by_what_was_measured(tmp_path: Path) -> None:
     assert "EOF (176), whose index is 0.855" in text
 
 
-def test_two_schemes_that_swap_ranks_are_found_and_told(tmp_path: Path) -> None:
+def test_two_schemes_that_swap_ranks_are_found(tmp_path: Path) -> None:
     lost = {"llm": (180.0, 20.0), "eof": (30.0, 50.0), "wqcs": (240.0, 60.0)}
     made = result(
         "scheduler",
@@ -146,7 +146,7 @@ def test_two_schemes_that_swap_ranks_are_found_and_told(tmp_path: Path) -> None:
     )
     assert swap(late_and_whole(made)) == Swap("AIC-VDS", "EOF", (0.0, 10.0), (180.0, 30.0))
     assert swap(packets_and_events(made)) == Swap("EOF", "AIC-VDS", (30.0, 180.0), (50.0, 20.0))
-    text = " ".join(page(kept(tmp_path, made)).split())
+    text = " ".join(page(stored(tmp_path, made)).split())
     assert "in the last third of the mission AIC-VDS loses fewer packets than EOF (0.0 to 10.0)" in text
     assert "EOF loses fewer packets than AIC-VDS (30.0 to 180) in more events (50.0 to 20.0)" in text
 
@@ -165,42 +165,42 @@ def test_means_of_fewer_worlds_are_not_put_beside_the_others(tmp_path: Path) -> 
     )
     assert list(late_and_whole(made)) == []
     assert "guided" not in packets_and_events(made) and "EOF" in packets_and_events(made)
-    text = " ".join(page(kept(tmp_path, made)).split())
+    text = " ".join(page(stored(tmp_path, made)).split())
     assert "the most even is EOF (0.800, 30.0 packets lost); the fewest packets are lost by EOF (30.0)" in text
 
 
-def test_schemes_that_rank_alike_are_not_said_to_swap() -> None:
+def test_schemes_with_equal_ranks_do_not_swap() -> None:
     assert swap({"llm": (1.0, 2.0), "eof": (2.0, 3.0)}) is None
     assert swap(late_and_whole(None)) is None
 
 
 def test_a_folder_without_results_or_with_a_broken_one_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadUse, match=r"has no results\.json; make some with: aicvds experiment all --out"):
+    with pytest.raises(UsageError, match=r"has no results\.json; make some with: aicvds experiment all --out"):
         write_page(tmp_path, tmp_path / "results.md")
     broken = tmp_path / "tokens" / "results.json"
     broken.parent.mkdir()
     broken.write_text('{"experiment": "tokens"}')
-    with pytest.raises(BadUse, match=r"tokens/results\.json: title: Field required; run that experiment again"):
+    with pytest.raises(UsageError, match=r"tokens/results\.json: title: Field required; run that experiment again"):
         write_page(tmp_path, tmp_path / "results.md")
 
 
 def test_an_experiment_that_the_catalogue_lacks_is_shown_too(tmp_path: Path) -> None:
-    assert "Not run" not in section(page(kept(tmp_path, result("training", {"madqn": {"return": 3.0}}))), "training")
+    assert "Not run" not in section(page(stored(tmp_path, result("training", {"madqn": {"return": 3.0}}))), "training")
 
 
-def test_numbers_are_told_to_what_they_can_bear() -> None:
+def test_numbers_have_as_many_digits_as_their_precision_allows() -> None:
     assert cell(None) == "–"
     assert cell(interval(1234.5)) == "1,234"
     assert cell(interval(0.98), 3) == "0.980"
     assert cell(interval(10.0, spread=2.0)).count(".") == 3
-    assert told_seeds([0, 1, 2]) == "0 to 2 (3)"
-    assert told_seeds([4, 7]) == "4, 7 (2)"
+    assert seeds_text([0, 1, 2]) == "0 to 2 (3)"
+    assert seeds_text([4, 7]) == "4, 7 (2)"
 
 
-def test_the_command_writes_the_page_or_says_what_is_missing(
+def test_the_command_writes_the_page_or_names_the_missing_results(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    runs = kept(tmp_path / "runs", scheduler().model_copy(update={"figures": []}))
+    runs = stored(tmp_path / "runs", scheduler().model_copy(update={"figures": []}))
     assert main(["--runs", str(runs), "--out", str(tmp_path / "docs" / "results.md")]) == 0
     assert (tmp_path / "docs" / "results.md").read_text().startswith("<!-- Made by `aicvds experiment page`")
     assert main(["--runs", str(tmp_path / "none"), "--out", str(tmp_path / "results.md")]) == 2

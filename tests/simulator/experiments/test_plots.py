@@ -7,9 +7,9 @@ from xml.etree import ElementTree
 import pytest
 from PIL import Image
 
-from simulator.drawing import DOUBLE_IN, SINGLE_IN
 from simulator.experiments.plots import BOUND_LABEL, draw, label_of, styles
 from simulator.experiments.result import Result, Sweep
+from simulator.reporting.figure_style import DOUBLE_IN, SINGLE_IN
 from tests.simulator.experiments.made_results import CURVES, figure, interval, result, zero_from
 
 SCHEMES = [
@@ -39,11 +39,11 @@ def made(count: int = 16, seeds: int = 30, growth: float = 1.5) -> Result:
 
 
 def swept(seeds: int = 30) -> Result:
-    kept = {f"k{k}": float(k) for k in (1, 3, 5, 10)}
-    measures = {name: {"lost_packets": interval(100 / k, seeds, 1.0 if seeds > 1 else 0)} for name, k in kept.items()}
+    top_ks = {f"k{k}": float(k) for k in (1, 3, 5, 10)}
+    measures = {name: {"lost_packets": interval(100 / k, seeds, 1.0 if seeds > 1 else 0)} for name, k in top_ks.items()}
     return result(
         "top-k", {**measures, "eof": {"lost_packets": 80.0}}, seeds=list(range(seeds)),
-        bound={"lost_packets": interval(1.5)}, sweep=Sweep(label="sensors kept, k", at=kept),
+        bound={"lost_packets": interval(1.5)}, sweep=Sweep(label="sensors kept, k", at=top_ks),
     )  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def words(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    ("drawn", "told"),
+    ("drawn", "labels"),
     [
         (made().model_copy(update={"figures": [figure("curves", *CURVES)]}), {"AIC-VDS, mode llm", "step", "random"}),
         (made(2, 1).model_copy(update={"figures": [figure("curves", CURVES[1])]}), {"AIC-VDS, mode llm"}),
@@ -62,10 +62,10 @@ def words(path: Path) -> set[str]:
         (swept(1).model_copy(update={"figures": [figure("sweep", "lost_packets")]}), {"sensors kept, k"}),
     ],
 )
-def test_every_kind_of_figure_says_what_it_shows(drawn: Result, told: set[str], tmp_path: Path) -> None:
+def test_every_kind_of_figure_has_labels(drawn: Result, labels: set[str], tmp_path: Path) -> None:
     paths = draw(drawn, tmp_path)
     assert [path.name for path in paths] == ["drawn.png", "drawn.svg", "drawn.pdf"]
-    assert told | {BOUND_LABEL} <= words(tmp_path / "drawn.svg")
+    assert labels | {BOUND_LABEL} <= words(tmp_path / "drawn.svg")
     assert (tmp_path / "drawn.pdf").read_bytes().startswith(b"%PDF")
 
 
@@ -100,7 +100,7 @@ def test_numbers_that_are_none_leave_the_rest_to_be_drawn(tmp_path: Path) -> Non
     assert "nan" not in text.lower()
 
 
-def test_a_figure_of_what_nobody_measured_is_left_out(tmp_path: Path) -> None:
+def test_a_figure_without_measurements_is_omitted(tmp_path: Path) -> None:
     drawn = made(2).model_copy(update={"figures": [figure("bars", "rtt_p50", name="no"), figure("bars", "jain")]})
     assert {path.stem for path in draw(drawn, tmp_path, ("svg",))} == {"drawn"}
 
@@ -116,5 +116,5 @@ def test_no_two_schemes_look_alike_and_known_ones_look_the_same_everywhere() -> 
     assert styles(made(1))["llm"] == many["llm"]
 
 
-def test_a_scheme_that_flew_fewer_seeds_says_so() -> None:
+def test_the_label_of_a_scheme_with_fewer_seeds_has_their_number() -> None:
     assert label_of(made().model_copy(update={"seeds_of": {"mpc": [0, 1]}}), "mpc").endswith("(2 seeds)")

@@ -1,4 +1,4 @@
-"""The servers that stand in for an LLM: only what is allowed, the same to the same question."""
+"""The servers in place of an LLM: allowed answers only, equal for equal requests."""
 
 from __future__ import annotations
 
@@ -44,6 +44,6 @@ def test_the_worst_is_the_emptiest_queue_at_its_fastest() -> None:
     with answering(worst) as url:
         answer = httpx.post(f"{url}/chat/completions", json=body("A1,0,3", LETTERS)).json()
         assert answer["choices"][0]["message"]["content"] == "F"
-        # An edge asks for a pair first, to see that the grammar is obeyed.
+        # An edge first requests a pair, as its probe of the grammar.
         assert httpx.post(f"{url}/chat/completions", json=body()).status_code == 200
         assert httpx.post(f"{url}/chat/completions", json=body(grammar=None)).status_code == 400

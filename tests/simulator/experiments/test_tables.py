@@ -35,7 +35,7 @@ def in_two_scenarios(llm_decided_pct: float) -> Result:
     )  # fmt: skip
 
 
-def test_what_was_measured_in_several_scenarios_has_a_table_a_measure_and_a_column_a_scenario() -> None:
+def test_measures_of_several_scenarios_have_a_table_each_and_a_column_a_scenario() -> None:
     assert measure_tables(in_two_scenarios(90.0)) == [
         Table(
             "lost packets",
@@ -50,7 +50,7 @@ def test_what_was_measured_in_several_scenarios_has_a_table_a_measure_and_a_colu
     ]
 
 
-def test_a_measure_that_is_the_same_everywhere_is_told_in_one_line() -> None:
+def test_a_measure_with_equal_values_has_one_line() -> None:
     [_, decided] = measure_tables(in_two_scenarios(0.0))
     assert decided == Table("decided by the LLM, %: 0.0 for every scheme in every scenario", [], [])
 

@@ -1,4 +1,4 @@
-"""The TorchRL environment: what its specs promise, and the worlds behind it."""
+"""The TorchRL environment: its specs, and the worlds behind it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the actors see: the same in training and in a mission, and nothing hidden."""
+"""The actors' input: equal in training and in a mission, and without hidden state."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 from shared.scenario import SCENARIOS, Scenario
 from simulator.marl.observation import View, stacked, taken_by, view, width, without
-from simulator.vector import VectorWorld
 from simulator.world import Observation, PipelineWorld
+from simulator.world.batch import VectorWorld
 
 PAPER = SCENARIOS["paper"]
 ROUTES = Scenario(
@@ -29,7 +29,7 @@ def flown(scenario: Scenario, steps: int = 6, seed: int = 0) -> tuple[PipelineWo
 
 
 @pytest.mark.parametrize("scenario", [PAPER, SCENARIOS["stress"], ROUTES], ids=lambda scenario: scenario.name)
-def test_a_mission_sees_to_the_bit_what_training_saw(scenario: Scenario) -> None:
+def test_a_missions_features_equal_those_of_training_to_the_bit(scenario: Scenario) -> None:
     batch = VectorWorld(scenario)
     seen: Any = batch.reset(range(3))
     singles = [PipelineWorld(scenario) for _ in range(3)]
@@ -53,7 +53,7 @@ def test_a_mission_sees_to_the_bit_what_training_saw(scenario: Scenario) -> None
         ]
 
 
-def test_what_is_out_of_range_does_not_show() -> None:
+def test_features_are_independent_of_sensors_out_of_range() -> None:
     world, observations = flown(PAPER)
     unheard = observations["uav_0"]["last_heard"] < world.state()[0] * 30
     assert unheard.any()

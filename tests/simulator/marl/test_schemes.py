@@ -10,11 +10,11 @@ import torch
 from torch import nn
 
 from shared.scenario import SCENARIOS, Scenario
+from simulator.flying.rollout import rollout
 from simulator.marl import madqn, mappo
 from simulator.marl.evaluate import lost_packets
 from simulator.marl.training import Learner
-from simulator.policies import policy_named
-from simulator.rollout import rollout
+from simulator.policies.registry import policy_named
 from simulator.world import PipelineWorld
 
 PAPER = SCENARIOS["paper"]

@@ -1,4 +1,4 @@
-"""A training: repeatable, resumable, and what it leaves."""
+"""A training: reproducible, resumable, and its files."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from shared.scenario import Scenario
-from simulator.explore import FIRST_TRAINING_SEED
+from simulator.errors import UsageError
 from simulator.marl import checkpoint, madqn, mappo
 from simulator.marl.curve import Point, plot, read_csv, write_csv
 from simulator.marl.plan import STATE, Plan
 from simulator.marl.training import _HELD_OUT, Learner, Round, Training
-from simulator.record import BadUse
+from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 SMALL = Scenario(name="small", sensors=4, uavs=2, steps=6)
 MAKE: dict[str, Callable[[Scenario, int, int], Learner]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
@@ -27,7 +27,7 @@ WORLDS = {"madqn": madqn.WORLDS, "mappo": mappo.WORLDS}
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Missions few enough to learn from at once."""
+    """A plan with few missions, and learning from the start."""
     monkeypatch.setattr(madqn, "WARM_UP", 150)
 
 
@@ -106,21 +106,21 @@ def test_training_worlds_are_no_evaluation_seeds_and_no_held_out_ones() -> None:
 def test_resuming_with_other_options_is_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     begun(plan_of("madqn"), tmp_path).save()
     plan = replace(plan_of("madqn"), **change)
-    with pytest.raises(BadUse, match=message):
+    with pytest.raises(UsageError, match=message):
         begun(plan, tmp_path).resume()
 
 
 def test_resuming_from_nothing_or_from_rubbish_is_refused(tmp_path: Path) -> None:
     training = begun(plan_of("madqn"), tmp_path)
-    with pytest.raises(BadUse, match="--resume: there is no state.pt in .*; start without --resume"):
+    with pytest.raises(UsageError, match="--resume: there is no state.pt in .*; start without --resume"):
         training.resume()
     (tmp_path / STATE).write_bytes(b"rubbish")
-    with pytest.raises(BadUse, match="--resume: .*state.pt is no checkpoint of `aicvds train`"):
+    with pytest.raises(UsageError, match="--resume: .*state.pt is no checkpoint of `aicvds train`"):
         training.resume()
 
 
 def test_episodes_that_make_no_whole_rounds_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadUse, match="--episodes 25 is not a multiple of 10"):
+    with pytest.raises(UsageError, match="--episodes 25 is not a multiple of 10"):
         begun(Plan("madqn", SMALL, 25, 0, 1), tmp_path)
 
 

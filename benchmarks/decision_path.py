@@ -1,0 +1,257 @@
+"""The way of one `POST /decide` through the code: the files and functions that it enters, and its changes of file.
+
+    python benchmarks/decision_path.py
+    python benchmarks/decision_path.py --modes guided --list
+
+Runs `aicvds serve` in a process of its own for each mode and round, in its main thread, with a SQLite store, a planner,
+and an LLM that answers at once from a thread of the same process. After four decisions two requests of UAV 0 are
+counted: the README's four sensors, first without an outcome, then with that of an earlier decision.
+
+How it is counted, by `sys.setprofile`, from sending the request to having the answer: every `call` event of a Python
+function in the packages `service` and `shared`; a coroutine that goes on is one more. A file counts once it is entered.
+A function is known by its file and qualified name; lambdas and comprehensions are left out. A change of file is a call
+on the event loop's thread in another file than the call before it there; going back to a caller is none. The other
+threads (plan search, critic) are counted apart, the process that writes SQLite not at all. Learning from the outcome is
+part of the way, and so are the bounds on heads, the loading and the client of the LLM. How often a coroutine goes on
+depends a little on timing: each mode is measured several times, and the median is told. Prints a table, writes JSON.
+
+Commit 601e8f2, mode guided, with an outcome: 69 files (55 service, 14 shared), 281 functions, 330 changes of file;
+without: 66, 251, 310. Mode llm: 60 files (48, 12), 204 functions, 187 changes; without: 57, 176, 165. A count of the
+same commit made by other means gave 64 files (50, 14), 261 functions and 304 changes for guided, 54 files and 204
+functions for llm: it left out a few files at the edge of the way.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import httpx
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+PACKAGES = ("service", "shared")
+# The first word of a process that counts; its mode follows.
+COUNTED = "counted"
+SENSORS: dict[str, list[Any]] = {
+    "id": [0, 1, 2, 3],
+    "x": [420, 650, 300, 900],
+    "y": [380, 520, 700, 100],
+    "queue": [52, 17, 33, None],
+    "battery": [49, 50, 47.5, None],
+    "channel_gain": [-83.1, -96.0, -109.2, None],
+}
+
+
+@dataclass(frozen=True)
+class DecisionPath:
+    """Count the way of one decision."""
+
+    modes: tuple[str, ...] = ("guided", "llm")
+    """Of the missions."""
+    rounds: int = 3
+    """Processes started for each mode."""
+    show: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="list")] = False
+    """Show the event loop's calls in order, each file's under it; of the last round."""
+    out: Path = Path("runs/decision_path.json")
+    """Where to write."""
+
+
+@dataclass
+class Calls:
+    """The calls while ``on``, as (file, function): the event loop's in order, and the other threads'."""
+
+    loop: list[tuple[str, str]] = field(default_factory=list)
+    beside: list[tuple[str, str]] = field(default_factory=list)
+    on: bool = False
+
+    def __post_init__(self) -> None:
+        self._roots = {}
+        for package in PACKAGES:
+            spec = find_spec(package)
+            assert spec is not None and spec.submodule_search_locations is not None
+            self._roots[package] = f"{Path(spec.submodule_search_locations[0]).resolve()}/"
+        self._main = threading.main_thread().ident
+
+    def heard(self, frame: FrameType, event: str, _: object) -> None:
+        """For ``sys.setprofile``."""
+        if not self.on or event != "call":
+            return
+        name = frame.f_code.co_filename
+        for package, root in self._roots.items():
+            if name.startswith(root):
+                calls = self.loop if threading.get_ident() == self._main else self.beside
+                calls.append((f"{package}/{name.removeprefix(root)}", frame.f_code.co_qualname))
+
+
+def counts(calls: Calls) -> dict[str, Any]:
+    """What is told of them."""
+    files = {file for file, _ in calls.loop}
+    named = {(file, name) for file, name in calls.loop if not name.endswith(">")}
+    return {
+        "files": len(files),
+        **{package: sum(file.startswith(f"{package}/") for file in files) for package in PACKAGES},
+        "functions": len(named),
+        "calls": len(calls.loop),
+        "changes of file": sum(one[0] != other[0] for one, other in zip(calls.loop, calls.loop[1:], strict=False)),
+        "files beside": len({file for file, _ in calls.beside}),
+        "functions beside": len({(file, name) for file, name in calls.beside if not name.endswith(">")}),
+    }
+
+
+class _Llm(BaseHTTPRequestHandler):
+    """Names the first that its grammar allows."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        self._answer({"data": [{"id": "instant"}]})
+
+    def do_POST(self) -> None:
+        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        groups = re.findall(r'"(\w+)"(?: \| "\w+")*', body.get("grammar", ""))
+        self._answer({"choices": [{"message": {"role": "assistant", "content": " ".join(groups) or "0 0"}}]})
+
+    def _answer(self, body: dict[str, Any]) -> None:
+        content = json.dumps(body).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+def count(mode: str) -> None:
+    """Serve in this thread, ask from another; prints the calls as JSON and ends the process."""
+    llm = ThreadingHTTPServer(("127.0.0.1", 0), _Llm)
+    threading.Thread(target=llm.serve_forever, daemon=True).start()
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    for name in [name for name in os.environ if name.startswith("AICVDS_")]:
+        del os.environ[name]
+    folder = tempfile.mkdtemp()
+    settings = {"MODE": mode, "STORE": f"{folder}/m.db", "LLM_URL": f"http://127.0.0.1:{llm.server_port}/v1"}
+    settings |= {"PLANNER_MS": "60000", "DEADLINE_MS": "60000", "LOG_LEVEL": "warning"}
+    os.environ |= {f"AICVDS_{name}": value for name, value in settings.items()}
+    calls = Calls()
+    threading.Thread(target=_ask, args=(port, calls), daemon=True).start()
+    (serve,) = entry_points(group="aicvds.commands", name="serve")
+    main = serve.load()
+    threading.setprofile(calls.heard)
+    sys.setprofile(calls.heard)
+    main(["--port", str(port)])
+
+
+def _ask(port: int, calls: Calls) -> None:
+    code = 1
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=90) as client:
+            _await_llm(client)
+            for step, uav in ((0, 0), (0, 1), (0, 2), (1, 0)):
+                answer = _decide(client, step, uav, None)
+            body = {"decision_id": answer["decision_id"], "cost": 0.2, "failed": False}
+            counted = []
+            for step, outcome in ((2, None), (3, body)):
+                # What is done after an answer is done.
+                time.sleep(0.5)
+                calls.loop, calls.beside, calls.on = [], [], True
+                answer = _decide(client, step, 0, outcome)
+                calls.on = False
+                assert answer["source"] in ("llm", "guided"), answer
+                counted.append({"loop": calls.loop, "beside": calls.beside})
+        print(json.dumps(counted), flush=True)
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def _await_llm(client: httpx.Client) -> None:
+    for _ in range(1200):
+        try:
+            if client.get("/readyz").json()["llm"] == "ready":
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.05)
+    raise RuntimeError("the edge is not ready")
+
+
+def _decide(client: httpx.Client, step: int, uav: int, outcome: dict[str, Any] | None) -> dict[str, Any]:
+    heard = [None if queue is None else step for queue in SENSORS["queue"]]
+    body: dict[str, Any] = {
+        "step": step,
+        "uav_id": uav,
+        "position": [500, 450],
+        "progress_m": 100.0 * step,
+        "sensors": {**SENSORS, "last_seen": heard},
+    }
+    answer = client.post("/decide", json=body if outcome is None else {**body, "outcome": outcome})
+    answer.raise_for_status()
+    decision: dict[str, Any] = answer.json()
+    return decision
+
+
+def measured(mode: str, rounds: int) -> Iterator[list[Calls]]:
+    """One a round, each of a process of its own."""
+    for _ in range(rounds):
+        command = [sys.executable, __file__, COUNTED, mode]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=300)
+        told = json.loads(done.stdout)
+        yield [Calls([tuple(call) for call in one["loop"]], [tuple(call) for call in one["beside"]]) for one in told]
+
+
+def show_list(calls: Calls, console: Console) -> None:
+    """The calls in order."""
+    last = ""
+    for file, name in calls.loop:
+        if file != last:
+            console.print(file, style="bold", highlight=False)
+        console.print(f"  {name}", markup=False, highlight=False)
+        last = file
+
+
+def main(options: DecisionPath) -> None:
+    """Measure, print, write."""
+    console = Console()
+    found: dict[str, dict[str, Any]] = {}
+    table = Table("", title="One POST /decide")
+    for mode in options.modes:
+        rounds = list(measured(mode, options.rounds))
+        for place, way in enumerate((mode, f"{mode}, outcome")):
+            each = [counts(calls[place]) for calls in rounds]
+            found[way] = {name: statistics.median_low(one[name] for one in each) for name in each[0]}
+            found[way]["sequence"] = [f"{file}:{name}" for file, name in rounds[-1][place].loop]
+            table.add_column(way)
+            if options.show:
+                show_list(rounds[-1][place], console)
+    for name in [name for name in next(iter(found.values())) if name != "sequence"]:
+        table.add_row(name, *(str(found[mode][name]) for mode in found))
+    console.print(table)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == [COUNTED]:
+        count(sys.argv[2])
+    else:
+        main(tyro.cli(DecisionPath, description=__doc__))

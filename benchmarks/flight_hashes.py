@@ -1,0 +1,193 @@
+"""What a seed flies: one SHA-256 a flight, to prove that a change of the code changes no decision and no loss.
+
+    python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/before.json
+    python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/after.json --against runs/before.json
+
+Starts `aicvds serve` with no LLM and a store of its own, and flies every scenario in modes `value`, `policy` and
+`guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order flown, each decision's
+step, UAV, sensor, velocity, source, reason and failure, its cost and the packets that its UAV lost, as
+`decisions.jsonl` has them.
+
+A flight repeats to the bit where no wall clock decides. The planner's search has two limits: the solver's deterministic
+time, and AICVDS_PLANNER_MS of wall clock, which is set to its highest here; the deadline is a minute. Requests come one
+after another, so each outcome is learned before the next decision. The radio of `lossy_uplink` draws its losses from
+the seed; its jitter is only waited for, and left out here. A flight in which a clock decided all the same is an error.
+Another version of OR-Tools may plan otherwise; another processor rounds otherwise, which seldom shows in a decision.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import tyro
+
+from simulator.cli.options import chosen_site
+from simulator.client import EdgeClient
+from simulator.client.lossy_transport import LossyTransport
+
+# The only names from inside: who flies a world, and the radio that loses requests.
+from simulator.flying.flight import Flight, fly
+from simulator.flying.pilots import EdgePilot, LocalPilot
+from simulator.sites.site import Site
+
+SCENARIOS = ("paper", "pipeline", "stress", "dense", "lossy_uplink")
+MODES = ("value", "policy", "guided")
+ON_BOARD = ("eof", "wqcs", "mpc")
+FIELDS = ("step", "uav_id", "sensor_id", "velocity", "source", "reason", "failed", "cost", "lost_packets")
+DEADLINE_MS = 60_000
+# Reasons that a clock gave.
+LATE = {"critic_timeout", "llm_timeout", "llm_busy", "edge_refused", "edge_protocol"}
+
+
+@dataclass(frozen=True)
+class Hashes:
+    """Fly, hash, and compare."""
+
+    seeds: tuple[int, ...] = (0, 1)
+    """Of the worlds."""
+    steps: int | None = None
+    """Waypoints of a flight; the scenario's unless given."""
+    only: str = ""
+    """A regular expression: fly only those whose names it finds, such as `^paper (value|eof)`."""
+    out: Path = Path("runs/flight_hashes.json")
+    """Where to write."""
+    against: Path | None = None
+    """What was written before: flights that are in both are compared, and the exit code is 1 where one differs."""
+
+
+class Course(NamedTuple):
+    """A flight's name: scenario, who decides, and for an edge the uplink."""
+
+    scenario: str
+    decides: str
+    uplink: str = ""
+
+    def __str__(self) -> str:
+        return " ".join(part for part in self if part)
+
+
+def courses() -> list[Course]:
+    """All of them; what is quick comes first."""
+    on_board = [Course(scenario, policy) for policy in ON_BOARD for scenario in SCENARIOS]
+    over_edge = [Course(scenario, mode, "full") for mode in MODES for scenario in SCENARIOS]
+    reduced = [Course("paper", mode, uplink) for mode in MODES for uplink in ("delta", "pruned")]
+    return [*on_board, *over_edge, *reduced]
+
+
+def main(options: Hashes) -> int:
+    """The exit code."""
+    chosen = [course for course in courses() if re.search(options.only, str(course))]
+    before = json.loads(options.against.read_text())["flights"] if options.against else {}
+    flights: dict[str, dict[str, Any]] = {}
+    differ = []
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with serving() as url:
+        for seed in options.seeds:
+            for course in chosen:
+                began = time.monotonic()
+                flight = flown(course, seed, options.steps, url)
+                name = f"{course}, {flight.steps_flown} steps, seed {seed}"
+                flights[name] = told(flight, name)
+                took = time.monotonic() - began
+                same = flights[name] == before.get(name, flights[name])
+                if not same:
+                    differ.append(name)
+                verdict = "" if name not in before else " same" if same else " DIFFERS"
+                print(f"{flights[name]['sha256'][:16]} {name}: {took:.1f} s{verdict}", flush=True)
+                options.out.write_text(json.dumps({"flights": flights}, indent=1) + "\n")
+    compared = len(flights.keys() & before.keys())
+    if options.against:
+        print(f"{len(differ)} of {compared} flights differ", *differ, sep="\n  ")
+    return 1 if differ or (options.against and not compared) else 0
+
+
+def told(flight: Flight, name: str) -> dict[str, Any]:
+    """A flight's hash, and sums that say where to look when it differs; raises where a clock decided."""
+    lines = [json.loads(decision.model_dump_json()) for decision in flight.decisions]
+    if late := {line["reason"] for line in lines} & LATE:
+        raise RuntimeError(f"{name}: decided by a clock, so nothing is proven: {', '.join(sorted(late))}")
+    rows = [[line[field] for field in FIELDS] for line in lines]
+    return {
+        "sha256": hashlib.sha256(json.dumps(rows).encode()).hexdigest(),
+        "decisions": len(rows),
+        "lost_packets": sum(tally.lost_packets for tally in flight.tally),
+        "velocities": sum(line["velocity"] for line in lines),
+    }
+
+
+def flown(course: Course, seed: int, steps: int | None, url: str) -> Flight:
+    """One flight, on board or over the edge."""
+    site = chosen_site(course.scenario, None, steps)
+    if not course.uplink:
+        return fly(site, LocalPilot(course.decides, site.scenario, seed), seed)
+    return _over(url, course, site, seed)
+
+
+def _over(url: str, course: Course, site: Site, seed: int) -> Flight:
+    scenario, mission_id = site.scenario, f"hash-{course.scenario}-{seed}"
+    radio = LossyTransport(httpx.HTTPTransport(), drop=scenario.uplink_drop, jitter_ms=0.0, seed=seed)
+    timeout_s = DEADLINE_MS / 1e3 + 5.0
+    uplink: Any = course.uplink
+    mode: Any = course.decides
+    with (
+        EdgeClient(url, timeout_s=timeout_s) as ground,
+        EdgeClient(url, timeout_s=timeout_s, seed=seed, transport=radio, uplink=uplink) as air,
+    ):
+        pilot = EdgePilot(air, mission_id, scenario, seed, mode=mode, deadline_ms=DEADLINE_MS, probe=ground)
+        ground.put_mission(mission_id, pilot.spec)
+        flight = fly(site, pilot, seed)
+        ground.delete_mission(mission_id)
+    if not scenario.uplink_drop and any(decision.source == "onboard" for decision in flight.decisions):
+        raise RuntimeError(f"{course}: the edge did not decide: {pilot.last_error}")
+    return flight
+
+
+@contextmanager
+def serving() -> Iterator[str]:
+    """An edge as a process of its own, with nothing inherited that changes a decision; yields its URL."""
+    # An answer waits for the store, and so for what is learned from the outcome that came with its request: with no
+    # store the next request may overtake that on a busy machine.
+    folder = tempfile.mkdtemp()
+    settings = {"MODE": "value", "STORE": f"{folder}/m.db", "PLANNER_MS": "60000", "LOG_LEVEL": "warning"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "shared.cli", "serve", "--port", "0"],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=_environment(settings),
+    )
+    try:
+        assert process.stderr is not None
+        line = process.stderr.readline()
+        found = re.search(r"running on (http://[\d.:]+)", line)
+        if found is None:
+            raise RuntimeError(f"the edge did not start: {line}{process.stderr.read()}")
+        with EdgeClient(found[1], timeout_s=60.0) as client:
+            client.wait_ready(120.0)
+        yield found[1]
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+        shutil.rmtree(folder)
+
+
+def _environment(settings: Mapping[str, str]) -> dict[str, str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("AICVDS_") or k == "AICVDS_CACHE_DIR"}
+    return kept | {f"AICVDS_{name}": value for name, value in settings.items()}
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Hashes, description=__doc__)))

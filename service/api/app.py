@@ -1,0 +1,90 @@
+"""The application: wiring, lifespan and middleware. Importing this module has no side effects."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import TypedDict
+
+import torch
+from fastapi import FastAPI
+
+from service.api import live_routes as live_routes
+from service.api import problem_details
+from service.api.api_keys import ApiKeys
+from service.api.authentication import KeyAuthentication
+from service.api.concurrency_limit import ConcurrencyLimit
+from service.api.openapi import schema_of
+from service.api.request_body import RequestBody
+from service.api.routes import router
+from service.config.settings import Settings
+from service.edge.engine import Engine
+from service.llm.server_pool import ServerPool
+from service.observability.metrics import Metrics
+from service.observability.tracing import Traced, Traces, provider_from_environment
+from service.prompting.token_accounting import TokenCounter
+from service.prompting.warm_up import warm_up
+from service.server.security_headers import SecurityHeaders
+from service.storage.store import Store
+
+
+class State(TypedDict):
+    """What every request finds in ``request.state``."""
+
+    engine: Engine
+    llm: ServerPool
+    metrics: Metrics
+
+
+def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
+    """One edge service; its LLM begins to load when the application starts.
+
+    Args:
+        store: where missions outlive the process, closed when the application ends; None: nowhere.
+
+    Raises:
+        BadKeys: the file of keys that the settings name cannot be used.
+    """
+
+    traces = Traces(provider_from_environment(version("aic-vds")), settings)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[State]:
+        # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
+        torch.set_num_threads(1)
+        metrics = Metrics()
+        llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
+        counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
+        engine = Engine(settings, llm, counter, metrics, traces, store)
+        app.state.engine = engine
+        llm.start()
+        try:
+            yield {"engine": engine, "llm": llm, "metrics": metrics}
+        finally:
+            may_close = await engine.close()
+            await llm.close()
+            if may_close and store is not None:
+                store.close()
+            await asyncio.to_thread(traces.close)
+
+    app = FastAPI(
+        title="AIC-VDS edge",
+        version=version("aic-vds"),
+        summary="Which sensor to collect from, and how fast to fly",
+        lifespan=lifespan,
+    )
+    app.include_router(router)
+    app.include_router(live_routes.router)
+    app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
+    app.add_middleware(RequestBody, limit=settings.max_body_bytes)
+    app.add_middleware(ConcurrencyLimit, most=settings.max_requests)
+    if settings.keys is not None:
+        app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))
+    app.add_middleware(SecurityHeaders)
+    if traces.provider is not None:
+        app.add_middleware(Traced)
+    problem_details.install(app)
+    app.openapi = lambda: schema_of(app)  # type: ignore[method-assign]
+    return app

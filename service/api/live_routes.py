@@ -1,0 +1,143 @@
+"""``GET /``, the page, and what it reads: the missions there are, one mission's events, and a decision's prompt."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from contextlib import aclosing
+from pathlib import Path
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import FileResponse, StreamingResponse
+from fastapi.staticfiles import StaticFiles
+from starlette.responses import Response
+from starlette.types import Message, Scope, Send
+
+from service import live
+from service.api.authentication import STILL_KNOWN
+from service.api.problem_details import documented
+from service.api.routes import TheEngine
+from service.errors import NotFound
+from service.live.broadcaster import Broadcaster
+from shared.missions import DecisionPrompt, MissionLine, MissionList
+from shared.wire import DecisionId, MissionId, Reason
+
+log = logging.getLogger(__name__)
+
+router = APIRouter()
+
+STATIC = Path(live.__file__).parent / "static"
+# Nothing but the edge's own files; no inline scripts or styles, nothing framed, nothing sent elsewhere.
+_CAREFUL = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'; object-src 'none'",
+    # Asked for again every time, and answered with 304 where nothing changed.
+    "Cache-Control": "no-cache",
+}
+_MOST_LISTED = 200
+_STILL_KNOWN_S = 1.0
+_UNASKED: frozenset[Reason] = frozenset(
+    ("mode_value", "mode_policy", "no_candidate", "llm_loading", "llm_unavailable", "llm_busy")
+)
+
+
+class Assets(StaticFiles):
+    """The page's scripts and styles."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        response = await super().get_response(path, scope)
+        response.headers.update(_CAREFUL)
+        return response
+
+
+class EventStream(StreamingResponse):
+    """Server-sent events to one listener; ends where it stops reading, or its key is known no more."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, live: Broadcaster, events: AsyncGenerator[bytes], still_known: Callable[[], bool]) -> None:
+        self._events = self._while_known(events, still_known)
+        super().__init__(self._events)
+        self._live = live
+
+    async def stream_response(self, send: Send) -> None:
+        async def in_time(message: Message) -> None:
+            async with self._live.sending():
+                await send(message)
+
+        try:
+            # Closed at once, whatever ends it: nothing is made for a page that is gone.
+            async with aclosing(self._events):
+                await super().stream_response(in_time)
+        except TimeoutError:
+            log.info("a page that stopped reading is left")
+
+    async def _while_known(
+        self, events: AsyncGenerator[bytes], still_known: Callable[[], bool]
+    ) -> AsyncGenerator[bytes]:
+        asked = time.monotonic()
+        async with aclosing(events):
+            async for event in events:
+                if time.monotonic() - asked > _STILL_KNOWN_S:
+                    if not still_known():
+                        return
+                    asked = time.monotonic()
+                yield event
+
+
+async def _placed(engine: TheEngine) -> AsyncIterator[None]:
+    """A place among those who watch, until the answer has ended."""
+    with engine.live.place():
+        yield
+
+
+@router.get("/", include_in_schema=False)
+async def page() -> FileResponse:
+    """The page; what it shows it asks for."""
+    return FileResponse(STATIC / "index.html", headers=_CAREFUL)
+
+
+@router.get("/missions", tags=["missions"])
+async def list_missions(engine: TheEngine) -> MissionList:
+    """The missions that there are: the one that decided last first, those that are only in the store last."""
+    missions = engine.missions
+    loaded = {mission.mission_id: mission for mission in missions.loaded}
+    lately = [name for name in engine.live.history.newest_first() if name in loaded]
+    names = list(dict.fromkeys((*lately, *reversed(loaded), *missions.stored)))
+    lines = []
+    for name in names[:_MOST_LISTED]:
+        mission = loaded.get(name)
+        if mission is None:
+            lines.append(MissionLine(mission_id=name))
+        else:
+            lines.append(MissionLine(mission_id=name, mode=mission.mode, decisions=mission.decisions))
+    return MissionList(missions=lines, more=max(0, len(names) - _MOST_LISTED), newest=lately[0] if lately else None)
+
+
+# Not in the schema: it does not end, and describes itself by its first event.
+@router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_placed)])
+async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
+    """A mission as it flies: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
+
+    As :mod:`service.live.snapshots` makes them. Comments come while nothing happens; who falls behind gets a snapshot.
+    """
+    mission = await engine.missions.get(mission_id)
+    still_known: Callable[[], bool] = request.scope.get(STILL_KNOWN, lambda: True)
+    return EventStream(engine.live, engine.live.events(mission), still_known)
+
+
+@router.get("/missions/{mission_id}/decisions/{decision_id}/prompt", responses=documented(404, 422), tags=["decisions"])
+async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: TheEngine) -> DecisionPrompt:
+    """The prompt by which a decision was made; only those of the newest decisions are kept, and not over a restart."""
+    kept = engine.live.history.find(mission_id, decision_id)
+    if kept is None or kept.prompt is None:
+        raise NotFound("decision_id", f"the prompt of decision {decision_id} is not kept, or no longer")
+    prompt = kept.prompt
+    return DecisionPrompt(
+        decision_id=decision_id,
+        asked=kept.answer.reason not in _UNASKED,
+        static=prompt.static,
+        experiences=prompt.experiences,
+        state=prompt.state,
+    )

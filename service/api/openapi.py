@@ -1,0 +1,55 @@
+"""The OpenAPI document: FastAPI's, with problem documents for errors and an example of every request and answer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.api.authentication import is_open, scope_of
+from service.api.openapi_examples import ANSWERS, REQUESTS, problem
+from service.api.problem_details import CONTENT_TYPE, documented
+from shared.wire import Problem
+
+JSON = "application/json"
+
+_KEYS = "Asked for where the edge was given keys (AICVDS_KEYS)."
+
+
+def schema_of(app: FastAPI) -> dict[str, Any]:
+    """The app's OpenAPI document; made once."""
+    if app.openapi_schema is None:
+        schema = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+        schemas = schema["components"]["schemas"]
+        schemas["Problem"] = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
+        for path, methods in schema["paths"].items():
+            for method, operation in methods.items():
+                _guard(operation, method.upper(), path)
+                _exemplify(operation, (method, path))
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _guard(operation: dict[str, Any], method: str, path: str) -> None:
+    """What ``KeyAuthentication`` asks for, where the edge has keys, and answers without."""
+    if is_open(method, path):
+        return
+    operation["security"] = [{"key": []}, {}]
+    statuses = (401, 403, 429) if scope_of(method, path) else (401, 429)
+    told = operation["responses"] | {str(s): response for s, response in documented(*statuses).items()}
+    operation["responses"] = dict(sorted(told.items()))
+
+
+def _exemplify(operation: dict[str, Any], route: tuple[str, str]) -> None:
+    if route in REQUESTS:
+        operation["requestBody"]["content"][JSON]["examples"] = REQUESTS[route]
+    for status, response in operation["responses"].items():
+        content = response.get("content", {})
+        if JSON in content and route in ANSWERS:
+            content[JSON]["example"] = ANSWERS[route]
+        if CONTENT_TYPE in content:
+            content[CONTENT_TYPE]["example"] = problem(int(status))

@@ -1,0 +1,81 @@
+"""Errors as RFC 9457 problem documents that name the field at fault."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from starlette.exceptions import HTTPException
+
+from service.errors import Refused, Unavailable
+from shared.wire import Problem
+
+log = logging.getLogger(__name__)
+
+# How pydantic names the branches of a union, which are no fields.
+_UNION_TAGS = ("constrained-", "function-")
+
+CONTENT_TYPE = "application/problem+json"
+# A field that there is has a shorter name, wherever it stands; what is sent in the place of one is not sent back.
+_MOST_NAME = 80
+# When to ask again what cannot be served now.
+_RETRY_S = 1
+
+
+def problem_response(
+    status: int, detail: str, errors: Sequence[dict[str, str]] = (), kind: str = "about:blank"
+) -> Response:
+    """An ``application/problem+json`` response of the type ``kind``; never echoes what was sent."""
+    body = Problem(type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
+    return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
+
+
+def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries for the problems that a route can answer."""
+    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
+    return {s: {"description": HTTPStatus(s).phrase, "content": {CONTENT_TYPE: schema}} for s in statuses}
+
+
+def install(app: FastAPI) -> None:
+    """Turn every error of the app into a problem document."""
+
+    @app.exception_handler(Refused)
+    async def refused(_: Request, error: Refused) -> Response:
+        faults = [{"field": error.field, "problem": error.detail}]
+        response = problem_response(error.status, str(error), faults, error.type)
+        if isinstance(error, Unavailable):
+            response.headers["Retry-After"] = str(_RETRY_S)
+        return response
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(_: Request, error: RequestValidationError) -> Response:
+        # The deepest first: of a union's branches, the one that came nearest.
+        faults = sorted(error.errors()[:20], key=lambda e: -len(e["loc"]))
+        errors = [{"field": _path(e["loc"]), "problem": e["msg"]} for e in faults]
+        return problem_response(422, f"{errors[0]['field']}: {errors[0]['problem']}", errors)
+
+    @app.exception_handler(HTTPException)
+    async def http(_: Request, error: HTTPException) -> Response:
+        faults = [{"field": "body", "problem": str(error.detail)}] if error.status_code == 400 else []
+        response = problem_response(error.status_code, str(error.detail), faults)
+        response.headers.update(error.headers or {})
+        return response
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> Response:
+        log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+        return problem_response(500, "the edge failed; its log says more")
+
+
+def _path(location: Sequence[int | str]) -> str:
+    location = [p for p in location if not (isinstance(p, str) and p.startswith(_UNION_TAGS))]
+    parts = list(location[1:]) if location and location[0] in ("body", "path", "query", "header") else list(location)
+    # A JSON syntax error has the byte offset for a location.
+    if not parts or (len(parts) == 1 and isinstance(parts[0], int)):
+        return "body"
+    return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in parts).removeprefix(".")[:_MOST_NAME]

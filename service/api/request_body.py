@@ -1,0 +1,144 @@
+"""Bodies of requests: bounded in time, and in size before and after they are unpacked."""
+
+from __future__ import annotations
+
+import asyncio
+import zlib
+from collections.abc import Callable
+
+import zstandard
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.api.problem_details import problem_response
+
+# Meanwhile a body keeps the place of a decision.
+_BODY_S = 10.0
+
+
+class _TooLarge(Exception):
+    """The body, or what it unpacks to, exceeds the limit."""
+
+
+class _Damaged(Exception):
+    """The body is not in the encoding that it claims."""
+
+
+class RequestBody:
+    """Pure ASGI middleware: reads the body up to ``limit`` bytes and undoes ``Content-Encoding: gzip | zstd``.
+
+    Answers 413 past the limit, 408 to what has not come within 10 s, 415 for another encoding, 400 for a damaged one,
+    each as a problem document.
+    """
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self.app = app
+        self.limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] not in ("POST", "PUT", "PATCH"):
+            await self.app(scope, receive, send)
+            return
+        headers = {name.lower(): value for name, value in scope["headers"]}
+        encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
+        if encoding not in _DECODERS:
+            response = problem_response(415, f"Content-Encoding {encoding[:40]!r}: use gzip, zstd or none")
+            response.headers["Accept-Encoding"] = "gzip, zstd"
+            await response(scope, receive, send)
+            return
+        try:
+            async with asyncio.timeout(_BODY_S):
+                body = await self._read(receive, headers.get(b"content-length", b""))
+            if body is None:
+                return
+            body = _DECODERS[encoding](body, self.limit)
+        except (_TooLarge, TimeoutError, _Damaged) as fault:
+            await self._refusal(fault)(scope, receive, send)
+            return
+        scope["headers"] = [(n, v) for n, v in scope["headers"] if n.lower() not in _REWRITTEN]
+        scope["headers"].append((b"content-length", str(len(body)).encode()))
+        await self.app(scope, _replay(body, receive), send)
+
+    def _refusal(self, fault: Exception) -> Response:
+        """The problem; the connection ends where the rest of the body may still come."""
+        match fault:
+            case TimeoutError():
+                status, told = 408, f"not here within {_BODY_S:g} s"
+            case _Damaged():
+                status, told = 400, str(fault)
+            case _:
+                status, told = 413, f"larger than {self.limit} bytes"
+        response = problem_response(status, f"body: {told}", [{"field": "body", "problem": told}])
+        if status != 400:
+            response.headers["Connection"] = "close"
+        return response
+
+    async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
+        """The body; None where the client hung up before its end."""
+        if content_length.isdigit() and int(content_length) > self.limit:
+            raise _TooLarge
+        body = bytearray()
+        while True:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return None
+            body += message.get("body", b"")
+            if len(body) > self.limit:
+                raise _TooLarge
+            if not message.get("more_body", False):
+                return bytes(body)
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replayed() -> Message:
+        return pending.pop() if pending else await receive()
+
+    return replayed
+
+
+def _gunzip(body: bytes, limit: int) -> bytes:
+    decoder = zlib.decompressobj(wbits=31)
+    try:
+        plain = decoder.decompress(body, limit + 1)
+    except zlib.error:
+        raise _Damaged("not valid gzip") from None
+    if len(plain) > limit:
+        raise _TooLarge
+    if not decoder.eof:
+        raise _Damaged("gzip ends too early")
+    if decoder.unused_data:
+        raise _Damaged("something follows the gzip member")
+    return plain
+
+
+def _unzstd(body: bytes, limit: int) -> bytes:
+    """The stream reader bounds what is unpacked but hides a missing end, the object sees the end but has no bound."""
+    decompressor = zstandard.ZstdDecompressor(max_window_size=2**23)
+    try:
+        with decompressor.stream_reader(body) as reader:
+            if len(reader.read(limit + 1)) > limit:
+                raise _TooLarge
+        decoder = decompressor.decompressobj()
+        plain = decoder.decompress(body)
+    except zstandard.ZstdError:
+        raise _Damaged("not valid zstd") from None
+    if not decoder.eof:
+        raise _Damaged("zstd ends too early")
+    if decoder.unused_data:
+        raise _Damaged("something follows the zstd frame")
+    return plain
+
+
+def _plain(body: bytes, limit: int) -> bytes:
+    return body
+
+
+_REWRITTEN = (b"content-encoding", b"content-length", b"transfer-encoding")
+_DECODERS: dict[str, Callable[[bytes, int], bytes]] = {
+    "identity": _plain,
+    "": _plain,
+    "gzip": _gunzip,
+    "zstd": _unzstd,
+}

@@ -1,0 +1,158 @@
+"""The HTTP interface: thin routes over the engine."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Request, Response
+from prometheus_client import generate_latest
+
+from service.api import attention_weights
+from service.api.authentication import may_make_missions
+from service.api.problem_details import documented
+from service.edge.engine import Engine
+from service.llm.server_pool import ServerPool
+from service.observability.metrics import Metrics
+from shared.guidance import GuidanceAnswer, GuidanceStatus
+from shared.missions import MissionAttention, MissionStatus
+from shared.wire import (
+    BatchRequest,
+    BatchResponse,
+    DecideRequest,
+    DecideResponse,
+    FeedbackRequest,
+    FeedbackResponse,
+    MissionId,
+    MissionSpec,
+    Readiness,
+)
+
+router = APIRouter()
+
+
+async def _engine(request: Request) -> Engine:
+    engine: Engine = request.state.engine
+    return engine
+
+
+TheEngine = Annotated[Engine, Depends(_engine)]
+RequestKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        pattern=r"^[\x21-\x7e]{1,64}$",
+        description="a request that is sent again under the same key gets the same answer, after a restart too; of any "
+        "mission the newest eight a UAV are remembered",
+    ),
+]
+
+HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
+
+
+@router.post(
+    "/decide",
+    response_model=DecideResponse,
+    responses=documented(400, 404, 408, 409, 413, 415, 422, 503),
+    tags=["decisions"],
+)
+async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
+    """Which sensor to collect from, and how fast to fly the next step."""
+    engine: Engine = request.state.engine
+    answer = await engine.decide(body, may_make=may_make_missions(request), key=key)
+    took = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
+    # As text at once: FastAPI would check and convert its own model's instance again.
+    return Response(answer.model_dump_json(), media_type="application/json", headers=took)
+
+
+@router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
+async def decide_batch(
+    body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
+) -> BatchResponse:
+    """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make_missions(request), key=key))
+
+
+@router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
+async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
+    """What came of a decision. Sent twice, it is applied once; acknowledged, it is on disk."""
+    return await engine.feedback(body)
+
+
+@router.put("/missions/{mission_id}", responses=documented(400, 408, 409, 413, 415, 422, 503), tags=["missions"])
+async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
+    """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
+    mission = await engine.missions.put(mission_id, body)
+    engine.compiler.compile(mission)
+    await engine.durable("mission_id")
+    return mission.status()
+
+
+@router.get("/missions/{mission_id}", responses=documented(404, 409, 422, 503), tags=["missions"])
+async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
+    """Where a mission stands."""
+    return (await engine.missions.get(mission_id)).status()
+
+
+@router.delete("/missions/{mission_id}", status_code=204, responses=documented(404, 409, 422, 503), tags=["missions"])
+async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
+    """Forget a mission and what it learned."""
+    try:
+        await engine.missions.delete(mission_id)
+        engine.live.forget(mission_id)
+    finally:
+        # One that is gone already may not yet be gone from the disk.
+        await engine.durable("mission_id")
+
+
+@router.get(
+    "/missions/{mission_id}/attention",
+    response_model=MissionAttention,
+    responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 422, 503)},
+    tags=["missions"],
+)
+async def get_attention(mission_id: MissionId, engine: TheEngine, request: Request, held: HeldTag = None) -> Response:
+    """The attention module's weights, with an ETag: to score the sensors on board, and report only the k best."""
+    mission = await engine.missions.get(mission_id)
+    return attention_weights.told(mission, held, request.headers.get("Accept-Encoding", ""))
+
+
+@router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])
+async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
+    """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
+    return (await engine.missions.get(mission_id)).guidance.told(mission_id)
+
+
+@router.post(
+    "/missions/{mission_id}/guidance", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["missions"]
+)
+async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
+    """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
+    mission = await engine.missions.get(mission_id)
+    engine.missions.refuse_if_failing("answer")
+    mission.obey(body)
+    await engine.durable("answer")
+    return mission.guidance.told(mission_id)
+
+
+@router.get("/healthz", tags=["operation"])
+async def healthz() -> dict[str, str]:
+    """The process is alive; touches nothing else."""
+    return {"status": "ok"}
+
+
+@router.get("/readyz", tags=["operation"])
+async def readyz(request: Request) -> Readiness:
+    """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``."""
+    llm: ServerPool = request.state.llm
+    return llm.readiness()
+
+
+@router.get("/metrics", tags=["operation"], response_class=Response)
+async def metrics(request: Request) -> Response:
+    """Prometheus metrics."""
+    owned: Metrics = request.state.metrics
+    owned.tasks.set(len(asyncio.all_tasks()))
+    llm: ServerPool = request.state.llm
+    owned.record_llm(llm.statuses, llm.breakers_open)
+    return Response(generate_latest(owned.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -1,0 +1,74 @@
+"""``aicvds demonstrate``: choose worked examples for the prompt from recorded rollouts, each solved by a teacher."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+from tyro.conf import arg
+
+from shared.rollouts import read_rollouts
+
+
+@dataclass(frozen=True)
+class Demonstrate:
+    """Choose the worked examples that a prompt may show (prompt.demonstrations), and write them as JSON.
+
+    Record first:  aicvds explore --workers 2 --out runs/rollouts.jsonl.gz
+
+    Then:  aicvds demonstrate runs/rollouts.jsonl.gz --out service/checkpoints/demonstrations.json
+
+    Every recorded decision with a choice of sensors and something in reach is answered by the teacher. The one in the
+    middle of all states comes first, then each time the one farthest from those chosen: so the first few differ most.
+    """
+
+    rollouts: Annotated[tyro.conf.Positional[Path], arg(metavar="FILE")]
+    """What `aicvds explore` wrote."""
+    out: Annotated[Path, arg(metavar="FILE")]
+    """JSON file to write. The package's own is service/checkpoints/demonstrations.json."""
+    count: Annotated[int, arg(metavar="N")] = 40
+    """Decisions to choose. A mission shows 20 at most, and leaves out those whose answer it could not give."""
+    teacher: Annotated[str, arg(metavar="NAME")] = "planner"
+    """Whose answers they show: planner or clairvoyant, as `aicvds explore` recorded them, or look_ahead, one step of
+    look-ahead. A clairvoyant acts on arrivals that nobody who reads the prompt can know."""
+
+
+def main(argv: list[str]) -> int:
+    """Choose and write; returns the exit code."""
+    args = tyro.cli(Demonstrate, prog="aicvds demonstrate", args=argv)
+    # They import torch, which takes seconds; `--help` answers without it.
+    from service.prompting.demonstrations import Demonstrations
+    from service.training.demonstration_teachers import TEACHERS, farthest_first, solutions
+
+    try:
+        if args.teacher not in TEACHERS:
+            raise ValueError(f"--teacher {args.teacher}: choose one of {', '.join(TEACHERS)}")
+        if args.count < 1:
+            raise ValueError(f"--count {args.count} is not at least 1")
+        header, steps = read_rollouts(args.rollouts)
+        total = header.missions * header.scenario.steps * header.scenario.uavs
+        told = track(steps, total=total, description="Solving", console=Console(stderr=True))
+        demonstrations, states = [], []
+        for demonstration, state in solutions(header, told, TEACHERS[args.teacher]):
+            demonstrations.append(demonstration)
+            states.append(state)
+        if not states:
+            fix = "record with aicvds explore --teacher both"
+            raise ValueError(f"{args.rollouts} holds no decision of {args.teacher}: {fix}")
+        if len(states) < args.count:
+            raise ValueError(f"{args.rollouts} holds {len(states)} decisions with a choice; --count asks {args.count}")
+        chosen = [demonstrations[i] for i in farthest_first(np.stack(states), args.count)]
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        pool = Demonstrations(scenario=header.scenario, teacher=args.teacher, demonstrations=chosen)
+        args.out.write_text(pool.model_dump_json(exclude_defaults=True) + "\n", encoding="utf-8")
+    except (ValueError, OSError) as error:
+        print(f"aicvds demonstrate: {error}", file=sys.stderr)
+        return 2
+    print(f"Wrote {args.out}: {args.count} of {len(states)} decisions, {args.out.stat().st_size} bytes")
+    return 0

@@ -1,0 +1,98 @@
+"""``aicvds keys``: make, list and remove the keys that an edge asks for."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from pydantic import ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from service.api.api_keys import BadKeys, KeyFile, Scope, editing
+
+
+@dataclass(frozen=True)
+class Add:
+    """Make a key and show it: this once, the file keeps its hash alone.
+
+    Try it:  aicvds keys add fleet-1 --file keys.json --scopes decide admin
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Whose it is, for messages and for `remove`: letters, digits, _ . -"""
+    file: Path
+    """The file of keys, made if missing; AICVDS_KEYS names it to the edge, which notices changes within a second."""
+    scopes: tuple[Scope, ...] = ("decide",)
+    """decide: ask for decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both."""
+    per_minute: int = 6000
+    """Requests a minute; more are refused with 429 and Retry-After."""
+
+
+@dataclass(frozen=True)
+class List:
+    """Show whose keys there are, and what they may do."""
+
+    file: Path
+    """The file of keys."""
+
+
+@dataclass(frozen=True)
+class Remove:
+    """Take a key back: within a second nobody gets in with it."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Whose."""
+    file: Path
+    """The file of keys."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """The keys that an edge asks for, once AICVDS_KEYS names their file. Exit code: 0 done, 2 bad use."""
+
+    do: (
+        Annotated[Add, tyro.conf.subcommand("add")]
+        | Annotated[List, tyro.conf.subcommand("list")]
+        | Annotated[Remove, tyro.conf.subcommand("remove")]
+    ) = field()
+
+
+def main(argv: list[str]) -> int:
+    """Do what the command line asks for; returns the exit code."""
+    config = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
+    asked = tyro.cli(Options, prog="aicvds keys", args=argv, config=config).do
+    try:
+        return _add(asked) if isinstance(asked, Add) else _list(asked) if isinstance(asked, List) else _remove(asked)
+    except BadKeys as error:
+        print(f"aicvds keys: {error}", file=sys.stderr)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        print(f"aicvds keys: {fault['loc'][0]}: {fault['msg']}", file=sys.stderr)
+    return 2
+
+
+def _add(asked: Add) -> int:
+    with editing(asked.file) as known:
+        shown = known.add(asked.name, frozenset(asked.scopes), asked.per_minute)
+    print(f"Key {asked.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
+    print(shown)
+    return 0
+
+
+def _list(asked: List) -> int:
+    table = Table("name", "scopes", "a minute")
+    for key in KeyFile.read(asked.file).keys:
+        table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute))
+    Console().print(table)
+    return 0
+
+
+def _remove(asked: Remove) -> int:
+    with editing(asked.file) as known:
+        known.remove(asked.name)
+    print(f"Key {asked.name} is removed", file=sys.stderr)
+    return 0

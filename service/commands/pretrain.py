@@ -1,0 +1,40 @@
+"""``aicvds pretrain``: the attention and velocity modules' start, learned from recorded rollouts."""
+
+from __future__ import annotations
+
+import sys
+
+import tyro
+from rich.console import Console
+
+from service.training.options import Pretrain
+
+
+def main(argv: list[str]) -> int:
+    """Train and write; returns the exit code."""
+    args = tyro.cli(Pretrain, prog="aicvds pretrain", args=argv)
+    console = Console()
+    try:
+        _check(args)
+        # It imports torch, which takes seconds; `--help` and bad use answer without it.
+        from service.training.training_loop import pretrain
+
+        pretrain(args, console)
+    except (ValueError, OSError) as error:
+        print(f"aicvds pretrain: {error}", file=sys.stderr)
+        return 2
+    console.print(f"Wrote {args.out}", soft_wrap=True)
+    return 0
+
+
+def _check(args: Pretrain) -> None:
+    for name in ("epochs", "horizon", "batch"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name} {getattr(args, name)} is not at least 1")
+    for name in ("temperature", "learning_rate"):
+        if not getattr(args, name) > 0:
+            raise ValueError(f"--{name.replace('_', '-')} {getattr(args, name):g} is not above 0")
+    if args.ranking < 0:
+        raise ValueError(f"--ranking {args.ranking:g} is below 0")
+    if not 0 <= args.discount <= 1:
+        raise ValueError(f"--discount {args.discount:g} is not between 0 and 1")

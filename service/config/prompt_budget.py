@@ -1,0 +1,30 @@
+"""How many tokens a prompt may take, before there is one."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from shared.wire import Features
+
+# Upper bounds in the embedded model's tokens, which has one for each digit: of the static block, and of a row or an
+# experience in each format.
+_STATIC_TOKENS = 400
+_ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56}
+# The two more columns of feature preset `reach`.
+_REACH_TOKENS = 16
+
+
+def prompt_tokens(
+    row_format: Literal["csv", "json", "markdown"],
+    rows: int,
+    experiences: int,
+    features: Features = "paper",
+    demonstrations: str = "",
+) -> int:
+    """Upper bound of a prompt's length in the embedded model's tokens.
+
+    Args:
+        demonstrations: their text, whose characters are all ASCII: no tokenizer makes more tokens of it.
+    """
+    row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
+    return _STATIC_TOKENS + row * (rows + experiences) + len(demonstrations)

@@ -1,0 +1,88 @@
+"""Advisers of mode ``guided`` that need no LLM: each prefers some sensor-velocity pairs to others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import softmax
+
+from service.deciding.attended_state import AttendedState
+from service.deciding.look_ahead import look_ahead
+from service.learning.trust import PLANNER
+from shared.actions import Action
+from shared.channel import FloatArray
+
+# In units of the value regression's target, minus the cost.
+_VALUE_TEMPERATURE = 0.05
+# The probability that an adviser of one action leaves to all actions together, so that its logarithm exists.
+SMOOTHING = 0.01
+
+
+class Preference(Protocol):
+    """An adviser's preference in one state. ``action`` is its own proposal, to be among the candidates."""
+
+    @property
+    def action(self) -> Action:
+        """The sensor and the velocity that the adviser prefers to all others."""
+        ...
+
+    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
+        """How the adviser would choose among the candidates, ``(n,)``, summing to 1."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class OneAction:
+    """Nearly all probability for one action."""
+
+    action: Action
+
+    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
+        """0.99 for the action, if it is there, and the rest for all alike."""
+        probabilities = np.full(len(actions), SMOOTHING / len(actions))
+        if self.action in actions:
+            probabilities[actions.index(self.action)] += 1.0 - SMOOTHING
+        return np.asarray(probabilities / probabilities.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedValues:
+    """``softmax((s_j + u_jv - max_v u_jv) / 0.05)``: the likeliest action is the decision of mode ``value``."""
+
+    action: Action
+    values: Mapping[int, NDArray[np.float32]]
+
+    def probabilities(self, actions: Sequence[Action]) -> FloatArray:
+        """A sensor that attention did not keep scores as low as the lowest."""
+        lowest = min((float(levels.min()) for levels in self.values.values()), default=0.0)
+        scores = np.array([float(self.values[s][v]) if s in self.values else lowest for s, v in actions])
+        return np.asarray(softmax(scores / _VALUE_TEMPERATURE))
+
+
+def _by_plan(state: AttendedState) -> Preference | None:
+    """The receding-horizon plan's action, where there is a plan of this step."""
+    planner = state.mission.planner
+    planned = None if planner is None else planner.action(state.uav_id, state.reserved)
+    return None if planned is None else OneAction(planned)
+
+
+def _by_value(state: AttendedState) -> Preference:
+    """The learned values."""
+    return LearnedValues(state.best_by_value(), state.values())
+
+
+def _by_look_ahead(state: AttendedState) -> Preference:
+    """The LLM-free policy's action."""
+    return OneAction(look_ahead(state.state, state.reach, state.reserved, state.guidance))
+
+
+# By their names in the trust, the response and the metrics, in the order of the response.
+ADVISERS: dict[str, Callable[[AttendedState], Preference | None]] = {
+    PLANNER: _by_plan,
+    "value": _by_value,
+    "policy": _by_look_ahead,
+}

@@ -1,0 +1,185 @@
+"""What the edge knows as one UAV decides: its augmented state, and the sensors that attention keeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from service.guidance.step_guidance import StepGuidance
+from service.learning.attention import top_k
+from service.learning.sample import Sample
+from service.mission.events import Pending
+from service.mission.mission import Mission
+from service.observability.stopwatch import Stopwatch
+from service.prompting.row_formats import cells
+from shared.actions import Action
+from shared.features import State, augment
+from shared.reach import Reach
+from shared.wire import Candidate, UavState
+
+
+@dataclass(frozen=True)
+class AttendedState:
+    """One UAV's state at one step of its mission, J sensors in the request's order.
+
+    Attributes:
+        reserved: IDs of the sensors that other UAVs have in this step.
+        guidance: what the operator's guidance asks of this step, if it asks for anything.
+        admissible: rows of the state that may be chosen, n of them.
+        features: shape ``(n, d)``, the attention module's input.
+        contexts: shape ``(n, d')``, its output ``z_j``.
+        rows: rows of the state that attention keeps, best first; without attention all that are admissible.
+        candidates: the same sensors with their scores ``s_j``.
+    """
+
+    mission: Mission
+    uav_id: int
+    step: int
+    state: State
+    reserved: frozenset[int]
+    guidance: StepGuidance | None
+    admissible: list[int]
+    features: NDArray[np.float32]
+    contexts: Tensor
+    rows: list[int]
+    candidates: list[Candidate]
+    _velocity_values: dict[int, Tensor] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, mission: Mission, uav: UavState, step: int, watch: Stopwatch | None = None) -> Self:
+        """Augment a UAV's report with what its mission knows, and keep the mission's top k of the sensors.
+
+        Args:
+            watch: takes the times of the stages ``augment`` and ``attend``.
+        """
+        watch = watch or Stopwatch()
+        reserved, obeyed, scenario = mission.reserved(step, uav.uav_id), mission.guidance.obeyed, mission.scenario
+        state = augment(
+            uav,
+            step,
+            scenario,
+            visits=mission.visits,
+            rates=mission.rates,
+            reserved=reserved,
+            preset=mission.features,
+            belief=mission.belief if mission.decides_from == "fleet" else None,
+        )
+        guidance = None
+        if obeyed:
+            reach = state.reach_ahead(uav.uav_id, scenario)
+            guidance = StepGuidance.of(obeyed, state, reach, step, mission.visits, scenario)
+        watch.lap("augment")
+        admissible: list[int] = np.flatnonzero(state.admissible).tolist()
+        features = state.features(scenario)
+        kept, scores, contexts = _attend(mission, features, admissible, guidance)
+        rows = [admissible[i] for i in kept]
+        candidates = [
+            Candidate(sensor_id=sensor, score=round(scores[i], 6))
+            for sensor, i in zip(state.ids[rows].tolist(), kept, strict=True)
+        ]
+        watch.lap("attend")
+        return cls(
+            mission=mission,
+            uav_id=uav.uav_id,
+            step=step,
+            state=state,
+            reserved=reserved,
+            guidance=guidance,
+            admissible=admissible,
+            features=features,
+            contexts=contexts,
+            rows=rows,
+            candidates=candidates,
+        )
+
+    @cached_property
+    def reach(self) -> Reach:
+        """The UAV's reach after the next step, whatever the mission's features are."""
+        return self.state.reach_ahead(self.uav_id, self.mission.scenario)
+
+    @property
+    def kept_ids(self) -> list[int]:
+        """IDs of the sensors that attention keeps, best first."""
+        return [candidate.sensor_id for candidate in self.candidates]
+
+    def shown(self) -> list[int]:
+        """``rows`` in the order of the prompt: as they are, or shuffled by the mission's seed, the step and the UAV."""
+        spec = self.mission.spec
+        if spec.prompt.order == "score":
+            return self.rows
+        shuffle = np.random.default_rng([spec.seed, self.step, self.uav_id])
+        return [self.rows[i] for i in shuffle.permutation(len(self.rows))]
+
+    def similar_experiences(self) -> list[str]:
+        """Past decisions most like the rows kept, for the prompt's last block, as the mission's selection has it."""
+        if not self.rows:
+            return []
+        return self.mission.memory.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
+
+    def best_by_value(self) -> Action:
+        """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
+        row = self.rows[0]
+        level = int(self._values_of_velocities(row).argmax())
+        if self.guidance is not None:
+            level = self.guidance.nearest(row, level)
+        return Action(int(self.state.ids[row]), level)
+
+    def values(self) -> dict[int, NDArray[np.float32]]:
+        """The learned values of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v, (V,)."""
+        found = {}
+        for row, candidate in zip(self.rows, self.candidates, strict=True):
+            levels = self._values_of_velocities(row).numpy()
+            found[candidate.sensor_id] = candidate.score + levels - levels.max()
+        return found
+
+    def pending(self, decision_id: str, action: Action) -> Pending:
+        """The decision, with what its outcome will be learned from."""
+        sensor_id, velocity = action
+        rows = np.flatnonzero(self.state.ids == sensor_id)
+        row = int(rows[0]) if len(rows) else None
+        sample = None
+        if row is not None and row in self.admissible:
+            sample = Sample(
+                features=self.features,
+                chosen=self.admissible.index(row),
+                approach=self.state.approach(row, self.mission.scenario),
+                velocity=velocity,
+            )
+        return Pending(
+            decision_id=decision_id,
+            uav_id=self.uav_id,
+            step=self.step,
+            sensor_id=sensor_id,
+            velocity=velocity,
+            seen=self.mission.template.unknown(sensor_id) if row is None else cells(self.state, [row])[0],
+            sample=sample,
+        )
+
+    def _values_of_velocities(self, row: int) -> Tensor:
+        """``u_jv`` of the sensor in that row, ``(V,)``; once a state, for two advisers ask."""
+        if row not in self._velocity_values:
+            context = self.contexts[self.admissible.index(row)]
+            approach = self.state.approach(row, self.mission.scenario)
+            self._velocity_values[row] = self.mission.learner.velocities(context, approach)
+        return self._velocity_values[row]
+
+
+def _attend(
+    mission: Mission, features: NDArray[np.float32], admissible: list[int], guidance: StepGuidance | None
+) -> tuple[list[int], list[float], Tensor]:
+    """Places in ``admissible`` of the sensors to keep, best first, the scores of all ``(n,)``, and their contexts."""
+    if not admissible:
+        return [], [], torch.empty(0)
+    scores, contexts = mission.learner.score(features)
+    if guidance is not None:
+        # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
+        added = guidance.worth[:, admissible].max(axis=0) / mission.scenario.queue_capacity
+        scores = scores + torch.from_numpy(added.astype(np.float32))
+    kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(admissible)))
+    return kept, scores.tolist(), contexts

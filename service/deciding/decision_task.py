@@ -1,0 +1,88 @@
+"""One UAV's decision to be made, and the choice that is made for it."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+
+from service.deciding.deadline import Deadline
+from service.deciding.llm_query import LlmAdvice
+from service.learning.trust import Advice
+from service.llm.completion import Completion
+from service.mission.mission import Mission
+from service.observability.stopwatch import Stopwatch
+from shared.actions import Action
+from shared.wire import Guided, Reason, Source, UavState
+
+_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
+# Kept back of a deadline for the check, the answer and the way through the event loop.
+RESERVE_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionTask:
+    """One UAV's decision at one step.
+
+    Attributes:
+        attempt: the number of this request among the UAV's at this step.
+        deadline_ms: as the response tells it, from the beginning of ``watch``.
+        deadline: for the LLM and the plan; the reserve is kept back.
+        evaluation_deadline: for the rollout evaluator, which may take time that the other UAVs of a batch can spare.
+        plan: the fleet's plan in the making, if there is one.
+        advice: of the LLM, where it was asked for the whole batch at once.
+    """
+
+    mission: Mission
+    uav: UavState
+    step: int
+    attempt: int
+    deadline_ms: int
+    deadline: Deadline
+    evaluation_deadline: Deadline
+    watch: Stopwatch
+    plan: asyncio.Task[None] | None
+    advice: LlmAdvice | None = None
+
+    async def await_plan(self) -> None:
+        """Wait for the plan until the deadline; a later plan serves the fleet's next decisions."""
+        if self.plan is not None:
+            await asyncio.wait({self.plan}, timeout=self.deadline.left())
+        self.watch.lap("plan")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """An action, with the reason where the LLM had no part in it.
+
+    Attributes:
+        report: of mode ``guided``: the response's part about trust and candidates.
+        advice: of mode ``guided``: what trust learns from.
+        evaluated_late: the rollout evaluator missed its deadline.
+    """
+
+    action: Action
+    reason: Reason | None
+    completion: Completion | None = None
+    model: str | None = None
+    report: Guided | None = None
+    advice: Advice | None = None
+    evaluated_late: bool = False
+
+    @property
+    def source(self) -> Source:
+        """The decider's name in the response."""
+        return "guided" if self.report and self.reason is None else _SOURCES.get(self.reason, "policy")
+
+
+@dataclass(frozen=True, slots=True)
+class Fallback:
+    """A mode has no choice of its own, for this reason; the LLM-free policy decides."""
+
+    reason: Reason
+    completion: Completion | None = None
+    model: str | None = None
+    evaluated_late: bool = False
+
+    def to(self, action: Action) -> Choice:
+        """The LLM-free policy's action, for this reason."""
+        return Choice(action, self.reason, self.completion, self.model, evaluated_late=self.evaluated_late)

@@ -1,0 +1,198 @@
+"""Queries to the LLM, within a deadline: about one UAV's decision, or about all UAVs of a step at once."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Coroutine, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from service.deciding.attended_state import AttendedState
+from service.deciding.deadline import Deadline
+from service.deciding.deliberation import candidates_of, template_of
+from service.llm.answer_format import NoDecision
+from service.llm.calibration import LabelReader
+from service.llm.completion import Completion
+from service.llm.server_pool import ServerPool
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.prompting.candidates import CandidateSet
+from service.prompting.prompt import Prompt
+from shared.actions import Action
+from shared.channel import FloatArray
+from shared.wire import Reason
+
+log = logging.getLogger(__name__)
+
+# The most that a query may take after SIGTERM, so that every UAV is answered before the process is killed.
+_CLOSING_S = 4.0
+# Queries about a whole fleet that may be late in a row before the LLM is asked about one UAV at a time.
+_LATE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class LlmAdvice:
+    """The LLM's preference among one UAV's candidates in mode ``guided``.
+
+    Attributes:
+        prompt: of a query about several UAVs, this UAV's share of it; the first UAV's share has the static block and
+            the experiences too, and the whole query's ``completion``.
+        probabilities: by action; None where the LLM gave none, for the ``reason``.
+        calibrated: whether the LLM's bias towards labels is known.
+        model: the LLM's name, if it is known.
+    """
+
+    prompt: Prompt
+    probabilities: dict[Action, float] | None
+    reason: Reason | None
+    completion: Completion | None
+    calibrated: bool
+    model: str | None
+
+    def over(self, actions: Sequence[Action]) -> FloatArray | None:
+        """The probabilities of these actions, ``(n,)``; None where the LLM gave none for any of them.
+
+        The probability of a velocity that is not among them goes to the sensor's nearest: the operator may have
+        forbidden it since.
+        """
+        found = np.zeros(len(actions))
+        for (sensor, velocity), probability in (self.probabilities or {}).items():
+            same = [i for i, action in enumerate(actions) if action.sensor_id == sensor]
+            if same:
+                found[min(same, key=lambda i: abs(actions[i].velocity - velocity))] += probability
+        return found / found.sum() if found.sum() > 0.0 else None
+
+
+class LlmQueries:
+    """Asks one LLM for every mission of a service, a bounded number of decisions at a time."""
+
+    def __init__(self, llm: ServerPool, metrics: Metrics, limit: int) -> None:
+        self._llm = llm
+        self._limit = limit
+        self._metrics = metrics
+        self._labels = LabelReader(llm)
+        self._late = 0
+        self._waiting: set[asyncio.Timeout] = set()
+        self._closing = False
+
+    def hurry(self) -> None:
+        """The service is closing: a query that waits for the LLM gets a few seconds more."""
+        self._closing = True
+        ends = asyncio.get_running_loop().time() + _CLOSING_S
+        for limit in self._waiting:
+            # A limit that has just expired cannot be changed.
+            if not limit.expired():
+                limit.reschedule(min(limit.when() or ends, ends))
+
+    async def close(self) -> None:
+        """Give up the queries in the background."""
+        await self._labels.close()
+
+    async def ask_for_pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: Deadline) -> Completion:
+        """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``."""
+        return await self._within(self._llm.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
+
+    async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
+        """Mode ``guided``: the LLM's preference among one UAV's candidates."""
+        if not mission.promptable:
+            return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
+        template = template_of(mission)
+        labels = [list(candidates.labels)]
+        completion, by_label, reason = await self._query(mission, prompt.static, prompt.user, labels, deadline)
+        calibrated, model = self._calibrated(completion, prompt.static, labels), self._model(completion)
+        if by_label is None:
+            return LlmAdvice(prompt, None, reason, completion, calibrated, model)
+        self._labels.calibrate(model, prompt.static, template.content_free(), [template.labels])
+        return LlmAdvice(prompt, by_action(candidates, by_label[0]), None, completion, calibrated, model)
+
+    def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
+        """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
+        able = self._llm.status == "ready" and uavs <= self._llm.most_together
+        return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
+
+    async def ask_for_fleet(
+        self, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
+    ) -> dict[int, LlmAdvice]:
+        """Mode ``guided``: the LLM's preferences for several UAVs, by UAV, in one query.
+
+        Where the query fails before the deadline, the result is empty, and the LLM is asked about so many UAVs no more
+        until it is probed again; after two timeouts in a row neither.
+        """
+        template = template_of(mission)
+        asked = {state.uav_id: (state, candidates_of(state)) for state in states if state.rows}
+        if not asked:
+            return {}
+        similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())
+        prompts = template.together(
+            {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
+            mission.experiences,
+            list(similar),
+        )
+        static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())
+        labels = [list(candidates.labels) for _, candidates in asked.values()]
+        completion, by_label, reason = await self._query(mission, static, user, labels, deadline)
+        self._note_lateness(len(asked), reason)
+        if reason is not None and reason != "llm_timeout":
+            return {}
+        calibrated, model = self._calibrated(completion, static, labels), self._model(completion)
+        if by_label is not None:
+            self._labels.calibrate(model, static, template.content_free(list(asked)), [template.labels] * len(asked))
+        advice = {}
+        for index, (uav, (_, candidates)) in enumerate(asked.items()):
+            probabilities = None if by_label is None else by_action(candidates, by_label[index])
+            whole = None if index else completion
+            advice[uav] = LlmAdvice(prompts[uav], probabilities, reason, whole, calibrated, model)
+        return advice
+
+    def _note_lateness(self, uavs: int, reason: Reason | None) -> None:
+        """Ask about fewer UAVs at once where the LLM failed, or is late again."""
+        self._late = self._late + 1 if reason == "llm_timeout" else 0
+        if reason is not None and (self._late == 0 or self._late >= _LATE):
+            log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
+            self._llm.most_together = uavs - 1
+            self._late = 0
+
+    async def _query(
+        self, mission: Mission, static: str, user: str, labels: Sequence[Sequence[str]], deadline: Deadline
+    ) -> tuple[Completion | None, list[dict[str, float]] | None, Reason | None]:
+        """The completion and the probabilities of each UAV's labels, or the reason why there are none."""
+        completion, by_label, reason = None, None, None
+        try:
+            completion = await self._within(self._labels.ask(static, user, labels), deadline)
+            by_label = self._labels.read(completion, static, labels)
+        except NoDecision as error:
+            log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
+            reason = error.reason
+        self._metrics.llm_requests.labels(reason or "ok").inc()
+        return completion, by_label, reason
+
+    def _model(self, completion: Completion | None) -> str | None:
+        """The LLM that answered, or would have."""
+        return self._llm.model if completion is None else completion.model
+
+    def _calibrated(self, completion: Completion | None, static: str, labels: Sequence[Sequence[str]]) -> bool:
+        known = self._labels.bias(self._model(completion), static, len(labels)) is not None
+        return known and completion is not None and bool(completion.places)
+
+    async def _within(self, query: Coroutine[Any, Any, Completion], deadline: Deadline) -> Completion:
+        if len(self._waiting) >= self._limit:
+            query.close()
+            raise NoDecision("llm_busy", f"{self._limit} decisions wait for it already")
+        limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))
+        try:
+            async with limit:
+                self._waiting.add(limit)
+                return await query
+        except TimeoutError:
+            raise NoDecision("llm_timeout", "no answer within the deadline") from None
+        finally:
+            self._waiting.discard(limit)
+
+
+def by_action(candidates: CandidateSet, by_label: dict[str, float]) -> dict[Action, float]:
+    """Probabilities of the candidates' labels as those of their actions."""
+    return dict(zip(candidates.actions, candidates.spread(by_label).tolist(), strict=True))

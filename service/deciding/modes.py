@@ -1,0 +1,159 @@
+"""The modes of decision: what each asks, and how it chooses. A mission's mode is one of these objects."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+from service.deciding.attended_state import AttendedState
+from service.deciding.decision_task import Choice, DecisionTask, Fallback
+from service.deciding.deliberation import Deliberation
+from service.deciding.llm_query import LlmQueries
+from service.deciding.verifier import verify
+from service.llm.answer_format import NoDecision, check_answer
+from service.llm.completion import Completion
+from service.prompting.prompt import Prompt
+from shared.actions import Action
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A prompt, whether an LLM gets it or not; in mode ``guided`` with the deliberation that it belongs to."""
+
+    prompt: Prompt
+    deliberation: Deliberation | None = None
+
+
+class Mode(Protocol):
+    """One mode of decision.
+
+    Attributes:
+        plan_share: the share of the time left that the planner may take; None where the mode needs no plan.
+        plan_first: whether the plan is one of the mode's advisers, so that the state is taken after it.
+    """
+
+    plan_share: ClassVar[float | None]
+    plan_first: ClassVar[bool]
+
+    def question(self, state: AttendedState, task: DecisionTask) -> Question:
+        """The prompt for this state."""
+        ...
+
+    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
+        """The mode's choice, or why it has none."""
+        ...
+
+
+class Policy:
+    """No LLM and no learned values: the plan decides, or look-ahead where there is no plan."""
+
+    plan_share: ClassVar[float | None] = 1.0
+    plan_first: ClassVar[bool] = False
+
+    def question(self, state: AttendedState, task: DecisionTask) -> Question:
+        """The template's prompt, by which tokens are accounted for in every mode."""
+        mission = state.mission
+        similar = state.similar_experiences()
+        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences, similar))
+
+    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
+        """Always the LLM-free policy's."""
+        return Fallback("mode_policy")
+
+
+class Value(Policy):
+    """The learned values decide."""
+
+    plan_share: ClassVar[float | None] = None
+
+    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
+        """The best-scored sensor at its best velocity."""
+        if not state.rows:
+            return Fallback("no_candidate")
+        return Choice(state.best_by_value(), "mode_value")
+
+
+class Llm(Policy):
+    """The paper's mode: the LLM's answer is the decision, once it has passed every check."""
+
+    def __init__(self, queries: LlmQueries) -> None:
+        self._queries = queries
+
+    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
+        """The LLM's sensor and velocity."""
+        if not state.rows:
+            return Fallback("no_candidate")
+        if not state.mission.promptable:
+            return Fallback("llm_unavailable")
+        completion: Completion | None = None
+        levels = state.mission.scenario.max_velocity + 1
+        try:
+            try:
+                completion = await self._queries.ask_for_pair(question.prompt, state.kept_ids, levels, task.deadline)
+            finally:
+                task.watch.lap("llm")
+            answer = Action(*check_answer(completion.text, state.kept_ids, levels))
+            if not state.mission.guidance.obeyed.allows(answer.velocity):
+                raise NoDecision("answer_velocity", f"the operator forbids {answer.velocity} m/s")
+            verify(state, answer)
+        except NoDecision as error:
+            log.debug("mission %s: %s: %s", state.mission.mission_id, error.reason, error)
+            return Fallback(error.reason, completion, completion.model if completion else None)
+        return Choice(answer, None, completion, completion.model)
+
+
+class Guided(Policy):
+    """The LLM's preference is weighed with the other advisers' and with the rollout evaluator's losses."""
+
+    plan_share: ClassVar[float | None] = 0.5
+    plan_first: ClassVar[bool] = True
+
+    def __init__(self, queries: LlmQueries, evaluating: Executor) -> None:
+        self._queries = queries
+        self._evaluating = evaluating
+
+    def question(self, state: AttendedState, task: DecisionTask) -> Question:
+        """The candidates' prompt, or this UAV's share of the batch's where the LLM was asked already."""
+        if not state.rows:
+            return super().question(state, task)
+        deliberation = Deliberation.of(state)
+        return Question(task.advice.prompt if task.advice else deliberation.prompt, deliberation)
+
+    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
+        """The best candidate by advice and expected loss; the evaluator works while the LLM is asked.
+
+        Without the LLM's advice the others decide: source ``policy``, with the reason. Without the evaluation the
+        LLM-free policy decides.
+        """
+        deliberation, advice, mission = question.deliberation, task.advice, state.mission
+        if deliberation is None:
+            return Fallback("no_candidate")
+        evaluation = asyncio.get_running_loop().run_in_executor(self._evaluating, deliberation.evaluate)
+        try:
+            if advice is None:
+                candidates, prompt = deliberation.candidates, deliberation.prompt
+                advice = await self._queries.ask(mission, candidates, prompt, task.deadline)
+                task.watch.lap("llm")
+            await asyncio.wait({evaluation}, timeout=task.evaluation_deadline.left())
+            judgement = evaluation.result() if evaluation.done() else None
+        finally:
+            # An evaluation that still waits for a thread does not begin.
+            evaluation.cancel()
+        task.watch.lap("judge")
+        if judgement is None:
+            reason = advice.reason or "critic_timeout"
+            return Fallback(reason, advice.completion, advice.model, evaluated_late=True)
+        reserved = mission.reserved(state.step, state.uav_id)
+        llm = advice.over(deliberation.candidates.actions)
+        trust = mission.trust_in(advice.model)
+        verdict = deliberation.conclude(trust, judgement, llm, calibrated=advice.calibrated, reserved=reserved)
+        if verdict is None:
+            return Fallback("answer_reserved", advice.completion, advice.model)
+        # Other UAVs may have every sensor that the LLM named by now.
+        missing = advice.reason or ("answer_reserved" if llm is None else None)
+        return Choice(verdict.action, missing, advice.completion, advice.model, verdict.report, verdict.advice)

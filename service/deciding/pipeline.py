@@ -1,0 +1,128 @@
+"""How one decision is made: augment, attend, prompt, choose, enforce, commit."""
+
+from __future__ import annotations
+
+import asyncio
+import uuid
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+from service.config.cores import usable_cores
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.deadline import Deadline
+from service.deciding.decision_task import RESERVE_S, Choice, DecisionTask, Fallback
+from service.deciding.llm_query import LlmQueries
+from service.deciding.look_ahead import look_ahead
+from service.deciding.modes import Guided, Llm, Mode, Policy, Value
+from service.mission.events import AdviserReport
+from service.mission.mission import Mission
+from service.prompting.prompt import Prompt
+from service.prompting.token_accounting import TokenCounter
+from shared.actions import Action
+from shared.wire import Mode as ModeName
+from shared.wire import Tokens
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """A decision that its mission has recorded.
+
+    Attributes:
+        tokens: of the prompt, before the server's own count is known.
+        latency_ms: by stage, and in total.
+    """
+
+    decision_id: str
+    task: DecisionTask
+    state: AttendedState
+    prompt: Prompt
+    tokens: Tokens
+    choice: Choice
+    latency_ms: dict[str, float]
+
+
+class Pipeline:
+    """Decides for one UAV at a time, in the mode of its mission, and begins the fleets' plans."""
+
+    def __init__(self, settings: Settings, queries: LlmQueries, counter: TokenCounter) -> None:
+        self._counter = counter
+        self._planner_s = settings.planner_ms / 1e3
+        self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
+        self._evaluating = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="evaluator")
+        self._plans: set[asyncio.Task[None]] = set()
+        self._modes: dict[ModeName, Mode] = {
+            "guided": Guided(queries, self._evaluating),
+            "llm": Llm(queries),
+            "value": Value(),
+            "policy": Policy(),
+        }
+
+    async def decide_one(self, task: DecisionTask) -> Decided:
+        """Decide for one UAV, and record the decision in its mission; raises as :meth:`Mission.commit`."""
+        mode = self._modes[task.mission.mode]
+        if mode.plan_first:
+            await task.await_plan()
+        state = AttendedState.of(task.mission, task.uav, task.step, task.watch)
+        question = mode.question(state, task)
+        tokens = self._counter.account(question.prompt)
+        task.watch.lap("prompt")
+        choice = await mode.choose(state, question, task)
+        if isinstance(choice, Fallback):
+            if not mode.plan_first:
+                await task.await_plan()
+            choice = choice.to(_without_llm(state))
+        return _commit(task, state, question.prompt, tokens, _enforce(task.mission, choice))
+
+    def begin_plan(
+        self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline
+    ) -> asyncio.Task[None] | None:
+        """Begin to plan for UAVs of this step, where their mission's mode may need a plan."""
+        share = self._modes[mission.mode].plan_share
+        if mission.planner is None or share is None:
+            return None
+        # In mode `guided` the LLM, which comes after the plan, has as much time as the planner.
+        seconds = min(self._planner_s, deadline.earlier_by(RESERVE_S).left() * share)
+        taken = mission.reserved(step, uavs[0])
+        task = asyncio.create_task(mission.planner.plan(uavs, taken, seconds, self._planning))
+        self._plans.add(task)
+        task.add_done_callback(self._plans.discard)
+        return task
+
+    async def close(self) -> None:
+        """Finish the plan and the evaluation that run, and drop the queued ones."""
+        for threads in (self._planning, self._evaluating):
+            await asyncio.to_thread(threads.shutdown, cancel_futures=True)
+
+
+def _without_llm(state: AttendedState) -> Action:
+    """The plan's action, or one step of look-ahead where there is no plan."""
+    mission = state.mission
+    reserved = mission.reserved(state.step, state.uav_id)
+    planned = mission.planner.action(state.uav_id, reserved) if mission.planner is not None else None
+    if planned is not None:
+        return planned
+    sensor, velocity = look_ahead(state.state, state.reach, reserved, state.guidance)
+    if sensor in reserved:
+        # Other UAVs have every sensor reported. A sensor that was not reported is worth a try, a reserved one is not.
+        sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
+    return Action(sensor, velocity)
+
+
+def _enforce(mission: Mission, choice: Choice) -> Choice:
+    """The choice at a velocity that the operator's guidance allows, which may have been confirmed meanwhile."""
+    levels = mission.scenario.max_velocity + 1
+    velocity = mission.guidance.obeyed.nearest(choice.action.velocity, levels)
+    return replace(choice, action=Action(choice.action.sensor_id, velocity))
+
+
+def _commit(task: DecisionTask, state: AttendedState, prompt: Prompt, tokens: Tokens, choice: Choice) -> Decided:
+    """Record the decision in its mission."""
+    decision_id = uuid.uuid4().hex
+    report = None if choice.advice is None else AdviserReport(choice.model or "", choice.advice)
+    pending = state.pending(decision_id, choice.action)
+    task.watch.lap("check")
+    task.mission.commit(pending, task.attempt, report)
+    task.mission.bases.hold(task.uav, task.step, decision_id)
+    return Decided(decision_id, task, state, prompt, tokens, choice, task.watch.total())

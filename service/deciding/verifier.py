@@ -1,0 +1,36 @@
+"""Hard rules for an LLM's answer, whatever it says and whoever made it say so.
+
+They need no judgement: a sensor that is out of the UAV's reach after the step, or whose battery is known to be flat,
+brings nothing, and one that another UAV has meanwhile fails. An answer that breaks a rule is overridden by the
+LLM-free policy's, with the rule as the reason. In mode ``guided`` no answer decides alone: the rollout evaluator weighs
+it there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.deciding.attended_state import AttendedState
+from service.llm.answer_format import NoDecision
+from shared.actions import Action
+from shared.channel import link_holds
+
+
+def verify(state: AttendedState, answer: Action) -> None:
+    """Raises :class:`NoDecision` where the answer breaks a rule.
+
+    A sensor out of reach breaks none while nothing that is admissible is in reach at any velocity.
+    """
+    mission, (sensor, velocity) = state.mission, answer
+    if sensor in mission.reserved(state.step, state.uav_id):
+        raise NoDecision("answer_reserved", f"another UAV has sensor {sensor} meanwhile")
+    if mission.spec.verify == "off":
+        return
+    if mission.belief.battery[sensor] <= 0:
+        raise NoDecision("rule_battery", f"the battery of sensor {sensor} is flat")
+    distance = state.reach.distance
+    row = int(np.flatnonzero(state.state.ids == sensor)[0])
+    if link_holds(distance[velocity, row], mission.scenario):
+        return
+    if link_holds(distance[:, state.state.admissible], mission.scenario).any():
+        raise NoDecision("rule_reach", f"sensor {sensor} is out of reach after a step at {velocity} m/s")

@@ -1,0 +1,91 @@
+"""A fleet's decisions at one step: one plan, one query to the LLM where it can serve all, and a share of time each."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from service.deciding.attended_state import AttendedState
+from service.deciding.deadline import Deadline
+from service.deciding.decision_task import RESERVE_S, DecisionTask
+from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.deciding.pipeline import Decided, Pipeline
+from service.mission.mission import Mission
+from service.observability.stopwatch import Stopwatch
+from shared.wire import BatchRequest
+
+# Of a batch's time, the most that a query about all of its UAVs may take, and the least that is worth a query: the rest
+# is for weighing the candidates of one UAV after another, with a factor of two to be safe.
+_QUERY_MOST, _QUERY_LEAST = 0.75, 0.25
+# Seconds that a decision takes beside the LLM and the plan, until they are known, and the length of their average.
+_OWN_S, _OWN_MEMORY = 0.03, 20
+
+
+class BatchDecider:
+    """Decides for the UAVs of a batch in their order; it knows how long a decision takes beside its waits."""
+
+    def __init__(self, pipeline: Pipeline, queries: LlmQueries) -> None:
+        self._pipeline = pipeline
+        self._queries = queries
+        self._own_s = _OWN_S
+
+    def note(self, decided: Decided) -> None:
+        """Learn from a decision how long one takes beside the LLM and the plan."""
+        waited_ms = decided.latency_ms.get("llm", 0.0) + decided.latency_ms.get("plan", 0.0)
+        self._own_s += ((decided.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
+
+    async def decide(
+        self, mission: Mission, request: BatchRequest, watch: Stopwatch, deadline: Deadline
+    ) -> list[Decided]:
+        """The decisions for every UAV of a request whose outcomes are applied.
+
+        One plan serves all UAVs until one of them gets another action than the plan's; the rest is planned again. Each
+        UAV has an equal share of the time that is left.
+        """
+        step, uavs = request.step, [uav.uav_id for uav in request.uavs]
+        # Every report is known before the first decision. The number of an attempt is taken before the LLM is asked: a
+        # batch that is sent again meanwhile is the later attempt.
+        attempts = {uav.uav_id: mission.observe(uav, step) for uav in request.uavs}
+        plan: asyncio.Task[None] | None = None
+        advice: dict[int, LlmAdvice] = {}
+        query_s = self._query_s(deadline.at - watch.started, len(uavs))
+        if query_s is not None and self._queries.may_ask_for_fleet(mission, len(uavs)):
+            plan = self._pipeline.begin_plan(mission, uavs, step, deadline)
+            states = [AttendedState.of(mission, uav, step, watch) for uav in request.uavs]
+            advice = await self._queries.ask_for_fleet(mission, states, Deadline(watch.started + query_s))
+            watch.lap("llm")
+        decisions: list[Decided] = []
+        for index, uav in enumerate(request.uavs):
+            own = Stopwatch() if index else watch
+            now, later = time.perf_counter(), len(uavs) - index - 1
+            share_s = (deadline.at - now) / (later + 1)
+            plan = plan or self._pipeline.begin_plan(mission, uavs[index:], step, Deadline(now + share_s))
+            deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
+            mine = Deadline.after(deadline_ms, own.started).earlier_by(RESERVE_S)
+            # The evaluator may take more than its UAV's share, as long as the later UAVs have what they need.
+            evaluation = max(mine, deadline.earlier_by(RESERVE_S + self._own_s * later))
+            task = DecisionTask(
+                mission,
+                uav,
+                step,
+                attempts[uav.uav_id],
+                deadline_ms,
+                mine,
+                evaluation,
+                own,
+                plan,
+                advice.get(uav.uav_id),
+            )
+            decided = await self._pipeline.decide_one(task)
+            self.note(decided)
+            if mission.planner is None or mission.planner.action(uav.uav_id) != decided.choice.action:
+                plan = None
+            decisions.append(decided)
+            # Requests of other fleets go on between two UAVs.
+            await asyncio.sleep(0)
+        return decisions
+
+    def _query_s(self, total_s: float, uavs: int) -> float | None:
+        """Seconds that the LLM may take for all UAVs at once; None where too few are left."""
+        seconds = min(_QUERY_MOST * total_s, total_s - 2 * uavs * self._own_s)
+        return seconds if seconds >= _QUERY_LEAST * total_s else None

@@ -1,0 +1,243 @@
+"""One edge: it resolves a request's mission, has it decided, makes the answer durable, and reports it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+
+from pydantic import TypeAdapter
+
+from service.config.settings import Settings
+from service.deciding.deadline import Deadline
+from service.deciding.decision_task import RESERVE_S, DecisionTask
+from service.deciding.llm_query import LlmQueries
+from service.deciding.pipeline import Decided, Pipeline
+from service.edge.batch import BatchDecider
+from service.edge.feedback import Feedback
+from service.edge.mission_registry import MissionRegistry
+from service.errors import Unavailable
+from service.guidance.note_compiler import NoteCompiler
+from service.learning.trust import LLM
+from service.live.broadcaster import Broadcaster
+from service.llm.server_pool import ServerPool
+from service.mission.mission import Mission
+from service.observability import logs
+from service.observability.metrics import Metrics
+from service.observability.stopwatch import Stopwatch
+from service.observability.tracing import Traces
+from service.prompting.token_accounting import TokenCounter, with_usage
+from service.storage.journal import Journal, NullJournal
+from service.storage.store import Store
+from shared.wire import (
+    BatchRequest,
+    DecideRequest,
+    DecideResponse,
+    FeedbackRequest,
+    FeedbackResponse,
+)
+
+# The longest that an answer waits for the disk; a later answer goes out and says that it is not stored.
+_STORE_S = 1.0
+# Seconds for the last checkpoints, and for the last commit, when the service ends.
+_LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 2.5
+_ANSWERS = TypeAdapter(list[DecideResponse])
+
+
+class Engine:
+    """Decides for every mission of one service, and learns from the outcomes."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        llm: ServerPool,
+        counter: TokenCounter,
+        metrics: Metrics,
+        traces: Traces,
+        store: Store | None,
+    ) -> None:
+        self._settings = settings
+        self._metrics = metrics
+        self._traces = traces
+        self.live = Broadcaster()
+        self.compiler = NoteCompiler(llm)
+        self.queries = LlmQueries(llm, metrics, settings.llm_concurrency)
+        self.pipeline = Pipeline(settings, self.queries, counter)
+        self._batches = BatchDecider(self.pipeline, self.queries)
+        self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
+        self._feedback = Feedback(metrics, self.journal, self.live)
+        self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile)
+
+    def hurry(self) -> None:
+        """The service is closing: queries to the LLM end within seconds, and pages get no more updates."""
+        self.queries.hurry()
+        self.live.close()
+
+    async def close(self) -> bool:
+        """Finish what is under way, learn from every outcome, and write the last checkpoints.
+
+        Returns:
+            whether the store may be closed: False while a write that was given up still waits for it.
+        """
+        self.live.close()
+        await self.compiler.close()
+        await self.queries.close()
+        self._feedback.finish()
+        await self.pipeline.close()
+        self.missions.close()
+        await self._feedback.close(self.missions.loaded, _LAST_CHECKPOINTS_S)
+        return await self.journal.close(_LAST_COMMIT_S)
+
+    async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
+        """One UAV's decision, within its deadline whatever the LLM does.
+
+        Args:
+            may_make: whether a mission that does not exist yet may be made.
+            key: an idempotency key; a request that comes again under it gets the same answer.
+
+        Raises:
+            Refused: the request does not fit its mission.
+            NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.checked`.
+        """
+        watch, deadline = self._start(request)
+        within_s = deadline.earlier_by(RESERVE_S).left()
+        mission, report = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+
+        async def make() -> list[Decided]:
+            return [await self._decide_one(mission, report, watch, deadline)]
+
+        return (await self._respond(mission, request, key, make, deadline))[0]
+
+    async def decide_batch(
+        self, request: BatchRequest, *, may_make: bool = True, key: str | None = None
+    ) -> list[DecideResponse]:
+        """A fleet's decisions at one step in the order of its UAVs; arguments and errors as for :meth:`decide`."""
+        watch, deadline = self._start(request)
+        within_s = deadline.earlier_by(RESERVE_S).left()
+        mission, reports = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+
+        async def make() -> list[Decided]:
+            # Every outcome, before the first decision: none is forgotten while the UAVs wait for the LLM.
+            for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
+                self._feedback.take(mission, outcome)
+            return await self._batches.decide(mission, reports, watch, deadline)
+
+        return await self._respond(mission, request, key, make, deadline)
+
+    async def feedback(self, request: FeedbackRequest) -> FeedbackResponse:
+        """Apply an outcome once; an acknowledged outcome is on disk.
+
+        Raises:
+            NotFound: an unknown mission or decision.
+            Conflict: another outcome of the decision is applied already.
+            Unavailable: the store fails, or is slow; the client is to send the outcome again.
+        """
+        mission = await self.missions.get(request.mission_id)
+        self.missions.refuse_if_failing("decision_id")
+        result = self._feedback.apply(mission, request)
+        try:
+            await self.durable("decision_id")
+        finally:
+            self._checkpoint_later(mission)
+        return FeedbackResponse(decision_id=request.decision_id, result=result)
+
+    async def durable(self, field: str) -> None:
+        """Wait until every event so far is on disk; raises ``Unavailable`` where that takes too long."""
+        if not await self.journal.stored(_STORE_S):
+            raise Unavailable(field, "not on disk yet: send it again to be sure")
+
+    def _start(self, request: DecideRequest | BatchRequest) -> tuple[Stopwatch, Deadline]:
+        watch = Stopwatch()
+        logs.bind(request.mission_id, request.step)
+        return watch, Deadline.after(request.deadline_ms or self._settings.deadline_ms, watch.started)
+
+    async def _decide_one(
+        self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
+    ) -> Decided:
+        if request.outcome is not None:
+            self._feedback.take(mission, request.outcome)
+        attempt = mission.observe(request, request.step)
+        plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, deadline)
+        deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, deadline.earlier_by(RESERVE_S)
+        task = DecisionTask(mission, request, request.step, attempt, deadline_ms, mine, mine, watch, plan)
+        decided = await self.pipeline.decide_one(task)
+        self._batches.note(decided)
+        return decided
+
+    async def _respond(
+        self,
+        mission: Mission,
+        request: DecideRequest | BatchRequest,
+        key: str | None,
+        make: Callable[[], Awaitable[list[Decided]]],
+        deadline: Deadline,
+    ) -> list[DecideResponse]:
+        """The answers under the idempotency key, made unless there are some, once they are on disk or late for it."""
+        decisions: list[Decided] = []
+        answers: list[DecideResponse] = []
+
+        async def made() -> str:
+            decisions.extend(await make())
+            answers.extend(self._answer(decided) for decided in decisions)
+            # The journal records the answer under its key in the same commit as the decision.
+            return "" if key is None else _ANSWERS.dump_json(answers).decode()
+
+        if key is None:
+            await made()
+        else:
+            text = await mission.repeats.once(key, request.model_dump_json(), made, mission.record)
+            answers = answers or _ANSWERS.validate_json(text)
+        began = time.perf_counter()
+        stored = await self.journal.stored(min(_STORE_S, deadline.left()))
+        self._checkpoint_later(mission)
+        waited_ms = round((time.perf_counter() - began) * 1e3, 3)
+        answers = [_stored(answer, stored, waited_ms) for answer in answers]
+        for decided, answer in zip(decisions, answers, strict=False):
+            self._report(decided, answer)
+        return answers
+
+    def _answer(self, decided: Decided) -> DecideResponse:
+        """The wire's form of a decision."""
+        task, choice = decided.task, decided.choice
+        return DecideResponse(
+            decision_id=decided.decision_id,
+            mission_id=task.mission.mission_id,
+            uav_id=task.uav.uav_id,
+            step=task.step,
+            sensor_id=choice.action.sensor_id,
+            velocity=choice.action.velocity,
+            source=choice.source,
+            reason=choice.reason,
+            model=None if choice.reason else choice.model,
+            top_k=decided.state.candidates,
+            guided=choice.report,
+            tokens=with_usage(decided.tokens, choice.completion, self._settings),
+            deadline_ms=task.deadline_ms,
+            latency_ms=decided.latency_ms,
+        )
+
+    def _report(self, decided: Decided, answer: DecideResponse) -> None:
+        """Tell metrics, traces, the log and the mission page of an answer; nothing else tells them of a decision."""
+        task, choice = decided.task, decided.choice
+        self._metrics.record_decision(answer)
+        self._metrics.overflow_risk.observe(decided.state.state.overflow_risk)
+        if task.mission.mode == "llm" and choice.reason != "no_candidate":
+            self._metrics.llm_requests.labels(choice.reason or "ok").inc()
+        if choice.evaluated_late:
+            self._metrics.critic_timeouts.inc()
+        if choice.report is not None:
+            self._metrics.llm_trust.observe(choice.report.trust[LLM])
+        self._traces.decided(answer)
+        logs.decided(answer)
+        self.live.decided(task.uav, decided.prompt, answer)
+
+    def _checkpoint_later(self, mission: Mission) -> None:
+        """Where a checkpoint is due, write it once the event loop has sent the answer."""
+        asyncio.get_running_loop().call_soon(self._feedback.checkpoint, mission)
+
+
+def _stored(answer: DecideResponse, stored: bool, waited_ms: float) -> DecideResponse:
+    """The answer with the time that it waited for the disk, and whether it is there."""
+    total = round(answer.latency_ms["total"] + waited_ms, 3)
+    latency = {**answer.latency_ms, "store": waited_ms, "total": total}
+    return answer.model_copy(update={"stored": stored, "latency_ms": latency})

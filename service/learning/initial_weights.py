@@ -1,0 +1,58 @@
+"""Where the modules start: a checkpoint that ships with the package, or random weights."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from service.learning.modules import Modules
+from service.learning.parameters import Weights
+from shared.wire import Features, Init
+
+# Only preset `paper` has weights for each velocity level.
+_LEVEL_TENSORS = ("velocity.out.weight", "velocity.out.bias")
+
+
+def initial_modules(init: Init, preset: Features, levels: int, seed: int) -> Modules:
+    """Modules of a feature preset for velocities 0..levels - 1, pretrained or random by seed.
+
+    The checkpoints know 0..14 m/s; a scenario with a lower limit takes the levels that it has.
+    """
+    modules = Modules(preset, levels, seed)
+    if init == "pretrained":
+        weights = _packaged(preset)
+        if preset == "paper":
+            weights = {k: v[:levels] if k in _LEVEL_TENSORS else v for k, v in weights.items()}
+        modules.load_state_dict(weights)
+    return modules
+
+
+def initial_weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
+    """Those of :func:`initial_modules`; pretrained, the same for every mission."""
+    return (
+        _pretrained(preset, levels) if init == "pretrained" else initial_modules(init, preset, levels, seed).weights()
+    )
+
+
+@cache
+def _pretrained(preset: Features, levels: int) -> Weights:
+    return initial_modules("pretrained", preset, levels, seed=0).weights()
+
+
+def save(modules: Modules, path: Path) -> None:
+    """Write a checkpoint that names its feature preset."""
+    torch.save({"features": modules.preset, "weights": modules.state_dict()}, path)
+
+
+@cache
+def _packaged(preset: Features) -> dict[str, Tensor]:
+    with files("service").joinpath("checkpoints", f"{preset}.pt").open("rb") as file:
+        checkpoint = torch.load(file, weights_only=True)
+    if checkpoint["features"] != preset:
+        raise ValueError(f"checkpoints/{preset}.pt holds modules of the feature preset {checkpoint['features']}")
+    weights: dict[str, Tensor] = checkpoint["weights"]
+    return weights

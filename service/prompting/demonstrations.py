@@ -1,0 +1,105 @@
+"""Worked examples for the static block: decisions of training worlds, each as a teacher solved it.
+
+They are kept as what the edge knew, not as text, so that one file serves every prompt format, feature preset and k:
+a mission shows each as it would show its own rows. ``aicvds demonstrate`` makes the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from service.learning.attention import top_k
+from service.learning.parameters import Weights
+from service.prompting.row_formats import Cells, cells
+from shared.features import State, augment
+from shared.scenario import Scenario
+from shared.wire import Features, MissionSpec, SensorId, Step, UavState, Wire
+
+PACKAGED = "demonstrations.json"
+
+
+class Demonstration(Wire):
+    """One decision: what the UAV reported, what its mission knew, and the teacher's answer.
+
+    ``visits`` is the step of each sensor's last visit, -1 for never; ``rates`` packets a step; both by sensor ID.
+    """
+
+    uav: UavState
+    step: Step
+    visits: list[int]
+    rates: list[float]
+    reserved: list[SensorId]
+    sensor_id: SensorId
+    velocity: int
+
+    def state(self, scenario: Scenario, preset: Features) -> State:
+        """The augmented state, as it was."""
+        return augment(
+            self.uav,
+            self.step,
+            scenario,
+            visits=np.array(self.visits, dtype=np.int64),
+            rates=np.array(self.rates),
+            reserved=self.reserved,
+            preset=preset,
+        )
+
+
+class Demonstrations(Wire):
+    """The file: the world of every demonstration, who solved them, and the most telling first."""
+
+    scenario: Scenario
+    teacher: str
+    demonstrations: list[Demonstration]
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """A demonstration as a prompt shows it."""
+
+    rows: Sequence[Cells]
+    sensor_id: int
+    velocity: int
+
+
+def solved(spec: MissionSpec, features: Features, scenario: Scenario, weights: Weights, k: int | None) -> list[Solved]:
+    """As many demonstrations as the mission wants, with the rows that it would have offered, in its order.
+
+    One whose answer the mission could not give is left out: a sensor that its modules do not keep among the k, or a
+    velocity past its limit. So there are fewer where k is small or the modules are random.
+
+    Args:
+        spec: the mission's.
+        features: what its modules see.
+        scenario: its world.
+        weights: its modules'.
+        k: rows of each that these keep; None keeps every admissible one, in the request's order.
+    """
+    found: list[Solved] = []
+    if spec.prompt.demonstrations == 0:
+        return found
+    pool = packaged()
+    for number, demonstration in enumerate(pool.demonstrations):
+        state = demonstration.state(pool.scenario, features)
+        rows = np.flatnonzero(state.admissible)
+        if k is not None:
+            rows = rows[top_k(weights.score(state.features(pool.scenario))[0], k)]
+        if spec.prompt.order == "shuffled":
+            rows = np.random.default_rng([spec.seed, number]).permutation(rows)
+        if demonstration.sensor_id in state.ids[rows] and demonstration.velocity <= scenario.max_velocity:
+            shown = cells(state, rows)
+            found.append(Solved(shown, demonstration.sensor_id, demonstration.velocity))
+        if len(found) == spec.prompt.demonstrations:
+            break
+    return found
+
+
+@cache
+def packaged() -> Demonstrations:
+    """The demonstrations that ship with the package."""
+    return Demonstrations.model_validate_json(files("service").joinpath("checkpoints", PACKAGED).read_bytes())

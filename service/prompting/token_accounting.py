@@ -1,0 +1,64 @@
+"""Token accounting: how long each block of a prompt is, offline, and what it costs."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from service.config.settings import Settings
+from service.llm.completion import Completion
+from service.prompting.prompt import Prompt
+from service.prompting.tokenizer import ENCODING, encoding
+from shared.wire import Tokens
+
+
+class TokenCounter:
+    """Counts tokens with tiktoken's ``o200k_base`` (GPT-4o-mini's), from a vocabulary on disk."""
+
+    name = ENCODING
+
+    def __init__(self, cache_dir: Path) -> None:
+        self._encoding = encoding(cache_dir)
+        # The static block and the experiences come back decision after decision; the state never does.
+        self.count_repeated = lru_cache(maxsize=256)(self.count)
+
+    def count(self, text: str) -> int:
+        """Tokens of a text; special tokens are counted as plain text."""
+        return len(self._encoding.encode_ordinary(text))
+
+    def account(self, prompt: Prompt) -> Tokens:
+        """How long a prompt is, block by block, and how long it would be with nothing pruned."""
+        static = self.count_repeated(prompt.static)
+        experiences = sum(self.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
+        state = self.count(prompt.state)
+        state_uncompressed = prompt.uncompressed.tokens(self.count_repeated)
+        return Tokens(
+            tokenizer=self.name,
+            static=static,
+            experiences=experiences,
+            state=state,
+            state_uncompressed=state_uncompressed,
+            prompt=static + experiences + state,
+            uncompressed=static + experiences + state_uncompressed,
+            saved=state_uncompressed - state,
+        )
+
+
+def with_usage(tokens: Tokens, completion: Completion | None, settings: Settings) -> Tokens:
+    """The account with what the server said of one call, and its price."""
+    if completion is None or completion.prompt_tokens is None:
+        return tokens
+    cached = completion.cached_tokens or 0
+    usage = {
+        "server_prompt": completion.prompt_tokens,
+        "cached": completion.cached_tokens,
+        "completion": completion.completion_tokens,
+        "cost_usd": price_usd(settings, completion.prompt_tokens, cached, completion.completion_tokens or 0),
+    }
+    return tokens.model_copy(update=usage)
+
+
+def price_usd(settings: Settings, prompt: int, cached: int, completion: int) -> float:
+    """US dollars for one call: fresh and cached prompt tokens, and completion tokens."""
+    fresh = (prompt - cached) * settings.price_input
+    return (fresh + cached * settings.price_cached + completion * settings.price_output) / 1e6

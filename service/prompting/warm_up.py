@@ -1,0 +1,19 @@
+"""The first question to an LLM server, under the static block that a mission has unless its maker says otherwise."""
+
+from __future__ import annotations
+
+from service.config.settings import Settings
+from service.llm.request_bodies import WarmUp
+from service.prompting.guided_prompt import GuidedTemplate
+from service.prompting.prompt import Template
+from shared.scenario import SCENARIOS
+
+
+def warm_up(settings: Settings) -> WarmUp:
+    """The question in the service's mode."""
+    paper = SCENARIOS["paper"]
+    if settings.mode == "guided":
+        guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
+        return WarmUp(guided.static, guided.content_free()[0], guided.labels)
+    template = Template(paper, experiences=settings.experiences)
+    return WarmUp(template.static, "0,50,-90,1,100\n", None)

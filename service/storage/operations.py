@@ -1,0 +1,46 @@
+"""What changes a store, and the SQL for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.mission.events import Event
+from service.mission.resolved_spec import ResolvedSpec
+from shared.wire import MissionSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A mission begins."""
+
+    mission_id: str
+    asked_for: MissionSpec
+    spec: ResolvedSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """The event number ``seq`` of a mission, from 1."""
+
+    mission_id: str
+    seq: int
+    event: Event
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A mission's whole state after event ``seq``, packed."""
+
+    mission_id: str
+    seq: int
+    state: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Deleted:
+    """A mission is over."""
+
+    mission_id: str
+
+
+Change = Made | Entry | Checkpoint | Deleted

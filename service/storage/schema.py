@@ -1,0 +1,40 @@
+"""The store's tables; the migrations bring a database to them."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+# The newest of service/storage/migrations/versions.
+SCHEMA = "0002"
+
+metadata = sa.MetaData()
+missions = sa.Table(
+    "missions",
+    metadata,
+    sa.Column("mission_id", sa.String(64), primary_key=True),
+    # As it was asked for, and in full, so that a mission is what it was whatever the settings become.
+    sa.Column("asked_for", sa.Text, nullable=False),
+    sa.Column("spec", sa.Text, nullable=False),
+)
+checkpoints = sa.Table(
+    "checkpoints",
+    metadata,
+    sa.Column("mission_id", sa.String(64), primary_key=True),
+    sa.Column("seq", sa.BigInteger, nullable=False),
+    sa.Column("state", sa.LargeBinary, nullable=False),
+)
+journal = sa.Table(
+    "journal",
+    metadata,
+    sa.Column("mission_id", sa.String(64), primary_key=True),
+    sa.Column("seq", sa.BigInteger, primary_key=True),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("body", sa.LargeBinary, nullable=False),
+    sqlite_with_rowid=False,
+)
+terms = sa.Table(
+    "terms",
+    metadata,
+    sa.Column("term", sa.Integer, primary_key=True),
+    sa.Column("began", sa.DateTime, nullable=False, server_default=sa.func.now()),
+)

@@ -1,0 +1,171 @@
+"""Where missions outlive the process: SQLite in WAL mode, or PostgreSQL, by SQLAlchemy; the schema by alembic.
+
+One edge uses a store at a time. A mission is its spec, its last checkpoint, and the events since: what a checkpoint
+holds is deleted from the journal in the same transaction that brings it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from service.mission.events import Event
+from service.mission.resolved_spec import ResolvedSpec
+from service.storage.event_codec import decode
+from service.storage.locks import AdvisoryLock, FileLock, StoreUnusable
+from service.storage.process_writer import ProcessWriter
+from service.storage.schema import SCHEMA, checkpoints, journal, missions, terms
+from service.storage.serialization import unpack
+from service.storage.sql_statements import Statements
+from service.storage.sqlite_process import BUSY_MS, PRAGMAS
+from service.storage.thread_writer import ThreadWriter
+from service.storage.writer import Writer
+from shared.wire import MissionSpec
+
+# The longest that PostgreSQL is waited for: to connect, for a statement, and for a network that says nothing.
+_CONNECT_S = 5
+_STATEMENT_MS = 5000
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMission:
+    """A mission as the store has it: its last checkpoint, and the events since; ``seq`` is the newest's."""
+
+    asked_for: MissionSpec
+    spec: ResolvedSpec
+    seq: int
+    state: dict[str, Any] | None
+    events: list[Event]
+
+
+class Store:
+    """One database; its methods may be called from any thread.
+
+    Args:
+        url: a path of a SQLite file, or a URL as SQLAlchemy has them.
+
+    Raises:
+        StoreUnusable: it cannot be reached, is damaged or of a newer version, or another edge uses it.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._hold: FileLock | AdvisoryLock | None = None
+        try:
+            self._engine = _engine(url)
+            if self._engine.url.database and self._engine.dialect.name == "sqlite":
+                self._hold = FileLock(self._engine.url.database)
+            else:
+                self._hold = AdvisoryLock(self._engine, terms)
+            self._migrate()
+            if isinstance(self._hold, AdvisoryLock):
+                self._hold.begin_term()
+        except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
+            self.close()
+            raise StoreUnusable(cause(error)) from None
+        except StoreUnusable:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Let another edge have it."""
+        if self._hold is not None:
+            self._hold.close()
+            self._hold = None
+        if hasattr(self, "_engine"):
+            self._engine.dispose()
+
+    def missions(self) -> list[str]:
+        """The IDs of all missions."""
+        with self._engine.connect() as db:
+            return list(db.scalars(sa.select(missions.c.mission_id)))
+
+    def load(self, mission_id: str) -> StoredMission | None:
+        """A mission as it was last written, or None; raises ``ValueError`` where what is there cannot be read."""
+        with self._engine.connect() as db:
+            found = db.execute(sa.select(missions).where(missions.c.mission_id == mission_id)).first()
+            if found is None:
+                return None
+            last = db.execute(sa.select(checkpoints).where(checkpoints.c.mission_id == mission_id)).first()
+            since = 0 if last is None else last.seq
+            wanted = (journal.c.mission_id == mission_id) & (journal.c.seq > since)
+            rows = db.execute(sa.select(journal).where(wanted).order_by(journal.c.seq)).all()
+        numbers = [row.seq for row in rows]
+        if numbers != list(range(since + 1, since + 1 + len(rows))):
+            raise ValueError(f"mission {mission_id}: events are missing after {since}")
+        return StoredMission(
+            asked_for=MissionSpec.model_validate_json(found.asked_for),
+            spec=ResolvedSpec.model_validate_json(found.spec),
+            seq=since + len(rows),
+            state=None if last is None else unpack(last.state),
+            events=[decode(row.kind, row.body) for row in rows],
+        )
+
+    def writer(self) -> Writer:
+        """Who writes to it, beside the event loop; to be closed before the store is."""
+        assert self._hold is not None
+        statements = Statements(self._engine.dialect)
+        if isinstance(self._hold, FileLock):
+            return ProcessWriter(statements, self._hold.file, self._hold.descriptor)
+        return ThreadWriter(statements, self._hold.transaction)
+
+    def _migrate(self) -> None:
+        """Bring the schema up to date; alembic, slow to import, only where it is not."""
+        with self._engine.connect() as db:
+            known = sa.inspect(db).has_table("alembic_version")
+            version = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
+        if version == SCHEMA:
+            return
+        if version is not None and version > SCHEMA:
+            raise StoreUnusable(f"it was made by a newer version of this program (schema {version}, not {SCHEMA})")
+        from alembic import command
+        from alembic.config import Config
+
+        config = Config()
+        config.set_main_option("script_location", str(Path(__file__).with_name("migrations")))
+        config.set_main_option("path_separator", "os")
+        with self._engine.begin() as db:
+            config.attributes["connection"] = db
+            command.upgrade(config, "head")
+
+
+def _engine(url: str) -> sa.Engine:
+    if "://" not in url:
+        Path(url).expanduser().parent.mkdir(parents=True, exist_ok=True)
+        url = f"sqlite:///{Path(url).expanduser()}"
+    try:
+        parsed = sa.make_url(url)
+    except (sa.exc.ArgumentError, ValueError):
+        # What cannot be told apart may be part of a password.
+        raise ValueError("is no address: write @, : and / in a password as %40, %3A and %2F") from None
+    if "@" in (parsed.host or ""):
+        raise ValueError("names a host with an @: write @ in a password as %40")
+    if parsed.drivername in ("postgresql", "postgres"):
+        parsed = parsed.set(drivername="postgresql+psycopg")
+    if parsed.get_backend_name() == "sqlite":
+        if not parsed.database or parsed.database == ":memory:":
+            raise ValueError("a SQLite store is a file; for no store at all say none")
+        engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_MS / 1e3})
+        sa.event.listen(engine, "connect", _prepare)
+        return engine
+    if parsed.get_backend_name() != "postgresql":
+        raise ValueError(f"{parsed.get_backend_name()} is not known: use a SQLite file or postgresql://")
+    limits = {
+        "connect_timeout": _CONNECT_S,
+        "tcp_user_timeout": _STATEMENT_MS,
+        "options": f"-c lock_timeout={BUSY_MS} -c statement_timeout={_STATEMENT_MS}",
+    }
+    return sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
+
+
+def _prepare(connection: Any, _: object) -> None:
+    for pragma in PRAGMAS:
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def cause(error: Exception) -> str:
+    """An error in one line, without the statement and its parameters; drivers name no password."""
+    origin = getattr(error, "orig", None) or error
+    return str(origin).strip().splitlines()[0] if str(origin).strip() else type(origin).__name__

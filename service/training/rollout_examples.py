@@ -1,0 +1,183 @@
+"""What the modules are pretrained on: recorded rollouts, seen again through the edge's own features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from service.config.settings import Settings
+from service.deciding.attended_state import AttendedState
+from service.deciding.look_ahead import look_ahead
+from service.learning.sample import Sample
+from service.mission.mission import Mission
+from service.training.reward import Reward, Speed
+from shared.actions import Action
+from shared.features import State
+from shared.reach import Reach, distances_ahead
+from shared.rollouts import Header, Reference, RolloutStep
+from shared.scenario import Scenario
+from shared.wire import Belief, Features, MissionSpec, Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """A teacher's decision, as the modules would have seen it.
+
+    ``reaches`` is false where its sensor cannot send it a packet after the step: the sensor then means nothing.
+    ``best_velocity`` is that of one step of look-ahead for the sensor (see :attr:`Reach.best`).
+    """
+
+    teacher: str
+    sample: Sample
+    reaches: bool
+    best_velocity: int
+
+    def ranked(self, speed: Speed) -> Sample:
+        """The decision to be ranked first, with the teacher's velocity or the best by look-ahead."""
+        return self.sample if speed == "teacher" else replace(self.sample, velocity=self.best_velocity)
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A decision as the modules saw it, the reward that followed (minus the cost), and the teacher's.
+
+    ``taught`` is None where the teacher's sensor was masked. Where none was recorded, the look-ahead policy teaches.
+    """
+
+    sample: Sample
+    reward: float
+    taught: Taught | None
+
+
+def replay(
+    header: Header,
+    steps: Iterable[RolloutStep],
+    reward: Reward,
+    features: Features = "paper",
+    belief: Belief | None = None,
+) -> Iterator[list[Example]]:
+    """Each mission's examples, by the same visiting records, arrival rates and features as online.
+
+    Args:
+        belief: what the features are made from; by default what missions with these features decide from by default.
+    """
+    settings = Settings(mode="value")
+    known: Belief = belief or ("reported" if features == "paper" else "fleet")
+    spec = MissionSpec(scenario=header.scenario, features=features, belief=known, planner="off", init="random")
+    for mission_id, group in groupby(steps, key=lambda step: step.request.mission_id):
+        logged = list(group)
+        by_uav: dict[int, list[RolloutStep]] = {}
+        for step in logged:
+            by_uav.setdefault(step.request.uav_id, []).append(step)
+        rewards = {uav: iter(reward.of(own, header.scenario)) for uav, own in by_uav.items()}
+        mission = Mission(mission_id, spec, settings)
+        examples = []
+        for number, step in enumerate(logged):
+            decision_id = f"{number:032x}"
+            mission.observe(step.request, step.request.step)
+            view = AttendedState.of(mission, step.request, step.request.step)
+            taught = _taught(mission, view, step.reference)
+            mission.commit(view.pending(decision_id, Action(step.sensor_id, step.velocity)))
+            sample = mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
+            worth = next(rewards[step.request.uav_id])
+            if sample is not None and worth is not None:
+                examples.append(Example(sample, worth, taught))
+        yield examples
+
+
+def _taught(mission: Mission, view: AttendedState, reference: Reference | None) -> Taught | None:
+    if reference is None:
+        sensor_id, velocity = look_ahead(view.state, view.reach, view.reserved)
+        teacher = "look_ahead"
+    else:
+        sensor_id, velocity, teacher = reference.sensor_id, reference.velocity, reference.teacher
+    sample = view.pending("reference", Action(sensor_id, velocity)).sample
+    if sample is None:
+        return None
+    reach = _reach(view.state, view.uav_id, sensor_id, mission.scenario)
+    return Taught(teacher, sample, bool(reach.packets[velocity, 0] >= 1), best_velocity=int(reach.best[0]))
+
+
+def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
+    """Of that sensor alone, in any feature preset."""
+    row = np.flatnonzero(state.ids == sensor_id)[:1]
+    distance = distances_ahead(uav, state.position, state.progress_m, state.places[row], scenario)
+    return Reach.of(distance, state.queue[row], state.urgency[row], scenario)
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """B decisions: the row chosen ``(B,)``, its approach ``(B, ...)`` and the velocity level ``(B,)``."""
+
+    chosen: Tensor
+    approach: Tensor
+    velocity: Tensor
+
+    @classmethod
+    def of(cls, samples: Sequence[Sample]) -> Self:
+        """Samples one after another."""
+        return cls(
+            chosen=torch.tensor([sample.chosen for sample in samples]),
+            approach=torch.from_numpy(np.stack([sample.approach for sample in samples])),
+            velocity=torch.tensor([sample.velocity for sample in samples]),
+        )
+
+    def __getitem__(self, rows: Tensor) -> Choices:
+        return Choices(self.chosen[rows], self.approach[rows], self.velocity[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """B examples in one: ``features`` ``(B, n, d)`` of as many sensors as the widest has, padded with zeros.
+
+    ``admissible`` ``(B, n)`` tells sensors from padding, ``reward`` ``(B,)``, ``taught`` ``(B,)`` whether there is a
+    teacher's choice and ``reaches`` ``(B,)`` whether its sensor means something; where there is no choice, ``teacher``
+    repeats ``logged``.
+    """
+
+    features: Tensor
+    admissible: Tensor
+    reward: Tensor
+    logged: Choices
+    teacher: Choices
+    taught: Tensor
+    reaches: Tensor
+
+    @classmethod
+    def of(cls, examples: Sequence[Example], speed: Speed = "look_ahead") -> Self:
+        """Examples one after another, at least one; ``speed`` tells which velocity is the teacher's choice."""
+        padded = torch.nn.utils.rnn.pad_sequence(
+            [torch.from_numpy(example.sample.features) for example in examples], batch_first=True
+        )
+        sizes = torch.tensor([len(example.sample.features) for example in examples])
+        return cls(
+            features=padded,
+            admissible=torch.arange(padded.shape[1]) < sizes[:, None],
+            reward=torch.tensor([example.reward for example in examples], dtype=torch.float32),
+            logged=Choices.of([example.sample for example in examples]),
+            teacher=Choices.of(
+                [example.taught.ranked(speed) if example.taught else example.sample for example in examples]
+            ),
+            taught=torch.tensor([example.taught is not None for example in examples]),
+            reaches=torch.tensor([example.taught is not None and example.taught.reaches for example in examples]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+    def __getitem__(self, rows: Tensor) -> Batch:
+        return Batch(
+            self.features[rows],
+            self.admissible[rows],
+            self.reward[rows],
+            self.logged[rows],
+            self.teacher[rows],
+            self.taught[rows],
+            self.reaches[rows],
+        )

@@ -1,0 +1,116 @@
+"""Training of the attention and velocity modules on recorded rollouts, as ``aicvds pretrain`` describes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import torch
+from rich.console import Console
+from rich.progress import Progress, track
+from rich.table import Table
+from torch import Tensor
+from torch.nn import functional
+
+from service.learning.initial_weights import initial_weights, save
+from service.learning.modules import Modules
+from service.training.options import Pretrain
+from service.training.reward import Reward
+from service.training.rollout_examples import Batch, Choices, Example, replay
+from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
+from shared.rollouts import read_rollouts
+
+
+def pretrain(args: Pretrain, console: Console) -> None:
+    """Train, print how good it is, and write the checkpoint.
+
+    Raises:
+        OSError: the rollouts cannot be read, or the checkpoint cannot be written.
+        ValueError: the rollouts are not what they should be, or too few.
+    """
+    # More threads sum in another order, and are no faster with modules this small.
+    torch.set_num_threads(1)
+    header, steps = read_rollouts(args.rollouts)
+    reward = Reward(args.target, args.horizon, args.discount)
+    replayed = replay(header, steps, reward, args.features, args.belief)
+    missions = list(track(replayed, "Replaying the rollouts", header.missions, console=console))
+    # Every eleventh: of teachers that take turns, each has its share.
+    held_out = set(range(10, len(missions), 11)) or {len(missions) - 1}
+    train = [example for n, mission in enumerate(missions) if n not in held_out for example in mission]
+    test = [example for n in sorted(held_out) for example in missions[n]]
+    if not train or not test:
+        raise ValueError(f"{args.rollouts} holds {len(missions)} missions; at least 2 are needed")
+    levels = header.scenario.max_velocity + 1
+    modules = fit(Batch.of(train, args.speed), Batch.of(test, args.speed), levels, args, console)
+    console.print(_report(modules, test, args, levels))
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    save(modules, args.out)
+
+
+def _report(modules: Modules, test: Sequence[Example], args: Pretrain, levels: int) -> Table:
+    """Each teacher's held-out references against these modules, the shipped ones and random ones."""
+    ranked = {"random": Modules(args.features, levels, args.seed).weights()}
+    # There may be none yet, or of another shape: then this command makes the first.
+    with suppress(OSError, RuntimeError):
+        ranked["shipped"] = initial_weights("pretrained", args.features, levels, args.seed)
+    ranked["trained"] = modules.weights()
+    table = Table("held-out missions", *ranked, title=f"Features {args.features}, target {args.target}")
+    for teacher, taught in references(test).items():
+        for k in (1, 3, 5):
+            table.add_row(
+                f"{teacher}'s sensor in the top {k}", *(f"{recall(m, taught, k):.3f}" for m in ranked.values())
+            )
+        equal = (f"{velocity_agreement(m, taught):.3f}" for m in ranked.values())
+        table.add_row(f"{teacher}'s velocity", *equal)
+        off = (f"{velocity_error(m, taught):.1f} m/s" for m in ranked.values())
+        table.add_row(f"mean difference from {teacher}'s velocity", *off)
+    return table
+
+
+def losses(modules: Modules, batch: Batch, temperature: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Mean value regression, and mean cross-entropy that ranks the teacher's sensor, and a velocity for it, first.
+
+    ``(s_j - r)^2 + (u_v - r)^2`` of what was done; ``-ln softmax(s / temperature)_j* - ln softmax(u / temperature)_v*``
+    of the reference j*, v*: the first (ListNet's top-one probability, Cao et al., ICML 2007, with one relevant sensor)
+    only where j* can send something.
+    """
+    scores, z = modules.attention(batch.features, batch.admissible)
+    everyone = torch.arange(len(batch))
+
+    def values(choices: Choices) -> Tensor:
+        u: Tensor = modules.velocity(z[everyone, choices.chosen], choices.approach)
+        return u
+
+    predicted = scores[everyone, batch.logged.chosen], values(batch.logged)[everyone, batch.logged.velocity]
+    regression = sum(((guess - batch.reward) ** 2).mean() for guess in predicted)
+    logits = scores.masked_fill(~batch.admissible, -torch.inf) / temperature
+    sensor = functional.cross_entropy(logits, batch.teacher.chosen, reduction="none")
+    velocity = functional.cross_entropy(values(batch.teacher) / temperature, batch.teacher.velocity, reduction="none")
+    return torch.as_tensor(regression), (sensor * batch.reaches + velocity * batch.taught).mean()
+
+
+def fit(train: Batch, test: Batch, levels: int, args: Pretrain, console: Console) -> Modules:
+    """Minibatch Adam with a cosine schedule; prints the held-out loss after every epoch."""
+    modules = Modules(args.features, levels, args.seed)
+    adam = torch.optim.Adam(modules.parameters(), lr=args.learning_rate)
+    batches = -(-len(train) // args.batch)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, args.epochs * batches, args.learning_rate / 10)
+    shuffle = torch.Generator().manual_seed(args.seed)
+    weight = args.ranking if args.target == "return" else 0.0
+    mean = train.reward.mean()
+    console.print(f"{len(train)} decisions, mean reward {mean:.3f}, {int(train.taught.sum())} taught")
+    console.print(f"held out {len(test)}, loss of the mean alone {2 * ((test.reward - mean) ** 2).mean():.4f}")
+    with Progress(console=console) as progress:
+        task = progress.add_task("Training", total=args.epochs * batches)
+        for epoch in range(1, args.epochs + 1):
+            for rows in torch.split(torch.randperm(len(train), generator=shuffle), args.batch):
+                adam.zero_grad()
+                regression, ranking = losses(modules, train[rows], args.temperature)
+                (regression + weight * ranking).backward()  # type: ignore[no-untyped-call]
+                adam.step()
+                schedule.step()
+                progress.advance(task)
+            with torch.inference_mode():
+                regression, ranking = losses(modules, test, args.temperature)
+            console.print(f"epoch {epoch}: held-out loss {regression:.4f}, of ranking {ranking:.4f}")
+    return modules

@@ -1,0 +1,86 @@
+"""``aicvds demo``: an edge, its LLM and a whole mission on this machine, in one command."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from simulator.cli.options import check_between, check_seed, check_wait, chosen_site
+from simulator.cli.running import command_main
+from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
+from simulator.flying.run import Job, conduct, new_mission_id
+from simulator.records.run_folder import fresh_folder, refuse_old_result
+
+EDGE_LOG = "edge.log"
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Start an edge on this machine, fly a mission against it, and compare with EOF and WQCS.
+
+    The edge loads its LLM (the embedded one, or that of the AICVDS_LLM_* variables), decides for three UAVs at thirty
+    waypoints each, and stops. Written to --out: report.html (open it in a browser), summary.json, decisions.jsonl and
+    edge.log. The results of an earlier demo there are overwritten.
+
+    Try it:  aicvds demo --out runs/demo
+
+    Exit code: 0 flown, 1 the edge did not start or answer, 2 bad use, 130 interrupted.
+    """
+
+    out: Path = Path("runs/demo")
+    """Folder to write to, made if missing."""
+    seed: int = 0
+    """Seed of the world, 0 to 4294967295; the same seed gives the same world."""
+    scenario: str | None = None
+    """A ready-made world: paper (the default), pipeline, stress, dense or lossy_uplink; `aicvds simulate --help`
+    describes them."""
+    world: Path | None = None
+    """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` describes its files."""
+    port: int = 0
+    """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
+    wait_s: float = 300.0
+    """Seconds that the edge may take to start and to load its LLM."""
+
+
+def main(argv: list[str]) -> int:
+    """Run ``aicvds demo``; returns the exit code."""
+    command = shlex.join(["aicvds", "demo", *argv])
+    return command_main(Demo, "aicvds demo", argv, lambda options, console: demo(options, command, console))
+
+
+def demo(options: Demo, command: str, console: Console) -> int:
+    """Start the edge, fly, stop the edge; returns the exit code.
+
+    Raises:
+        UsageError: the options are unusable, or the folder cannot be written.
+        EdgeError: the edge died at start, or never became ready.
+    """
+    site = chosen_site(options.scenario, options.world)
+    check_seed(options.seed)
+    check_wait(options.wait_s)
+    check_between("--port", options.port, 0, 65_535)
+    refuse_old_result(options.out, overwrite=True)
+    port = usable_port(options.port)
+    fresh_folder(options.out)
+
+    job = Job(
+        site=site,
+        seed=options.seed,
+        mission_id=new_mission_id(site.scenario, options.seed),
+        out=options.out,
+        command=command,
+        edge=f"http://{HOST}:{port}",
+        wait_s=options.wait_s,
+    )
+    log = options.out / EDGE_LOG
+    # A store of its own, apart from that of another edge on this machine.
+    environment = {**os.environ, "AICVDS_STORE": str(options.out.resolve() / "missions.db")}
+    with edge_process(port, log, environment) as process:
+        console.print(
+            f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
+        )
+        return conduct(job, console, alive=lambda: check_alive(process, log))

@@ -1,0 +1,159 @@
+"""``aicvds experiment``: make the paper's figures and tables, and those beyond it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from simulator.cli.options import check_between, checked_edge, chosen_site
+from simulator.cli.running import command_main
+from simulator.errors import UsageError
+from simulator.experiments.catalogue import ALL, EXPERIMENTS
+from simulator.experiments.edges import Llm
+from simulator.experiments.plan import QUICK_LLM_SEEDS, QUICK_SEEDS, Experiment, Setup
+from simulator.experiments.result import Result
+
+SEEDS, LLM_SEEDS = 30, 10
+PAGE = "page"
+_ELSEWHERE = ("paper", "pipeline", "stress", "dense", "lossy_uplink")
+
+
+@dataclass(frozen=True)
+class Options:
+    __doc__ = f"""Make a figure or table of the paper, or one beyond it, over many worlds.
+
+    NAME is one of these, or `{ALL}` for every one:
+
+    {"    ".join(f"{name}: {experiment.summary}.{chr(10) * 2}" for name, experiment in EXPERIMENTS.items())}
+    A scheme's mission in a world is stored in --out's flights/ and never flown twice: experiments share it, and the
+    same command continues after Ctrl-C or a crash. The command starts the edges that it needs. Written to --out/NAME:
+    results.json (means with 95% bootstrap intervals over seeds, comparisons paired by seed), results.csv (a line a
+    scheme, seed and measure), and the figures.
+
+    Try it:  aicvds experiment scheduler --quick
+
+    Without an LLM, a minute:  aicvds experiment fairness --llm none
+
+    All results beside the paper's numbers, as a page:  aicvds experiment {PAGE} --help
+
+    Exit code: 0 made, 1 an edge or its LLM failed, 2 bad use, 130 interrupted.
+    """
+
+    name: Positional[Annotated[str, arg(metavar="NAME")]]
+    """The experiment, or all."""
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/experiments")
+    """Folder to write to, made if missing; its stored flights are used again."""
+    quick: Annotated[bool, FlagCreatePairsOff] = False
+    """Few seeds, and short missions with an LLM: a check that the figures can be made, without a valid result."""
+    seeds: Annotated[int | None, arg(metavar="N")] = None
+    """Worlds for schemes without an LLM: seeds 0 to N - 1. Default: 30, quick 5."""
+    llm_seeds: Annotated[int | None, arg(metavar="N")] = None
+    """Worlds for schemes with an LLM, a minute each. Default: 10, quick 2, at most --seeds."""
+    steps: Annotated[int | None, arg(metavar="N")] = None
+    """Waypoints of a mission. Default: the world's own (30)."""
+    llm: Annotated[str, arg(metavar="embedded|none|URL")] = "embedded"
+    """The LLM: the embedded one, none (its schemes are left out), or an OpenAI-compatible server's address such as
+    http://127.0.0.1:8080/v1 (AICVDS_LLM_MODEL and AICVDS_LLM_API_KEY apply to it)."""
+    edge: Annotated[str | None, arg(metavar="URL")] = None
+    """Use this running edge for the schemes with an LLM, with its settings, instead of starting one."""
+    model: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="FILE.gguf")] = ()
+    """For llm-models: another model to embed; repeatable."""
+    scenario: Annotated[str | None, arg(metavar="NAME")] = None
+    """The world: paper (default), pipeline, stress, dense or lossy_uplink; see `aicvds simulate --help`."""
+    world: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
+    workers: Annotated[int, arg(metavar="N")] = 1
+    """Processes for the flights without an edge."""
+
+
+def main(argv: list[str]) -> int:
+    """Run ``aicvds experiment``; returns the exit code."""
+    if argv[:1] == [PAGE]:
+        from simulator.experiments import page
+
+        return page.main(argv[1:])
+    return command_main(Options, "aicvds experiment", argv, lambda options, console: experiment(options, argv, console))
+
+
+def experiment(options: Options, argv: list[str], console: Console) -> int:
+    """Fly the missing flights, write, print; returns the exit code.
+
+    Raises:
+        UsageError: the options are unusable, or the folder cannot be written.
+        EdgeError: an edge died, or lacks an LLM that it needs.
+    """
+    chosen = _chosen(options.name)
+    setup = setup_of(options)
+    from simulator.experiments.runner import Run
+
+    run = Run(setup, options.out, _commands(options.name, argv), console, options.workers)
+    try:
+        results = run.make(chosen)
+    except KeyboardInterrupt:
+        console.print(f"interrupted; {run.flown} new flights are stored: the same command continues")
+        raise
+    for result in results:
+        show(result, console)
+    return 0
+
+
+def setup_of(options: Options) -> Setup:
+    """The setup from the options; raises ``UsageError`` for the first option out of bounds."""
+    seeds = options.seeds if options.seeds is not None else QUICK_SEEDS if options.quick else SEEDS
+    llm_seeds = options.llm_seeds if options.llm_seeds is not None else QUICK_LLM_SEEDS if options.quick else LLM_SEEDS
+    check_between("--seeds", seeds, 1, 10_000)
+    check_between("--llm-seeds", llm_seeds, 1, 10_000)
+    check_between("--workers", options.workers, 1, 64)
+    for model in options.model:
+        if not model.is_file():
+            raise UsageError(f"--model {model}: there is no such file")
+    if options.llm not in ("embedded", "none") and not options.llm.startswith(("http://", "https://")):
+        raise UsageError(f"--llm {options.llm}: choose embedded, none, or a URL such as http://127.0.0.1:8080/v1")
+    site = chosen_site(options.scenario, options.world, options.steps)
+    sites = {site.scenario.name: site}
+    if options.scenario is None:
+        sites |= {name: chosen_site(name, None, options.steps) for name in _ELSEWHERE if name not in sites}
+    pace: Literal["full", "quick"] = "quick" if options.quick else "full"
+    edge = None if options.edge is None else checked_edge(options.edge)
+    return Setup(sites, Llm(options.llm, edge), options.model, seeds, min(llm_seeds, seeds), options.steps, pace)
+
+
+def show(result: Result, console: Console) -> None:
+    """Print each scheme's values of the experiment's first three measures, and the run's notes."""
+    measures = list(dict.fromkeys(name for scheme in result.schemes.values() for name in scheme))[:3]
+    table = Table("", *(result.labels[name] for name in measures), title=f"{result.title} ({result.experiment})")
+    for name, found in result.schemes.items():
+        seeds = len(result.seeds_of.get(name, result.seeds))
+        cells = [f"{f.mean:.4g} [{f.low:.4g}, {f.high:.4g}]" if (f := found.get(m)) else "" for m in measures]
+        table.add_row(f"{result.labels[name]} ({seeds})", *cells)
+    if result.bound and "lost_packets" in measures:
+        bound = result.bound["lost_packets"]
+        cells = [
+            f"at least {bound.mean:.4g} [{bound.low:.4g}, {bound.high:.4g}]" if m == "lost_packets" else ""
+            for m in measures
+        ]
+        table.add_row("clairvoyant bound", *cells, style="italic")
+    console.print(table)
+    for note in result.notes:
+        console.print(f"- {note}", markup=False, highlight=False)
+
+
+def _chosen(name: str) -> list[Experiment]:
+    if name == ALL:
+        return list(EXPERIMENTS.values())
+    if name not in EXPERIMENTS:
+        raise UsageError(f"there is no experiment {name[:32]!r}: choose one of {', '.join(EXPERIMENTS)}, or {ALL}")
+    return [EXPERIMENTS[name]]
+
+
+def _commands(name: str, argv: list[str]) -> Callable[[Experiment], str]:
+    rest = list(argv)
+    rest.remove(name)
+    return lambda experiment: shlex.join(["aicvds", "experiment", experiment.name, *rest])

@@ -1,0 +1,112 @@
+"""``aicvds explore``: fly training worlds and record every decision, with a teacher's, for ``aicvds pretrain``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import track
+from tyro.conf import arg
+
+from shared.rollouts import Header, RolloutStep, write_rollouts
+from shared.scenario import Scenario, scenario_named
+from simulator.flying.exploration import explore
+
+# The world and the planner take seconds to import; `--help` and bad use answer without them.
+if TYPE_CHECKING:
+    from simulator.flying.teachers import TeacherName
+
+TeacherOption = Literal["both", "planner", "clairvoyant"]
+_BEHAVIOUR = "taught: mostly the reference's; untaught: half EOF or WQCS, half a random sensor; a random velocity"
+
+
+@dataclass(frozen=True)
+class Explore:
+    """Fly training worlds with exploring UAVs, and record each decision, its cost, and a teacher's reference action.
+
+    The worlds' seeds start at 1,000,000, apart from every evaluation seed. The file feeds `aicvds pretrain` and
+    `aicvds demonstrate`.
+
+      aicvds explore --workers 2 --out runs/rollouts.jsonl.gz
+
+    The teacher alternates by world between the planner (partial observations, about 4 s a world) and a clairvoyant (all
+    arrivals known, 1 to 3 s). A UAV mostly flies the teacher's actions. In up to half (planner) or a fifth
+    (clairvoyant) of a world's steps the fleet deviates, so that the records cover other states: then half of the
+    sensors are EOF's or WQCS's, half random, and velocities are random; a third of the deviations use the teacher's
+    sensor, a third its velocity. The reference is the teacher's action in the state recorded. A clairvoyant has none
+    while the fleet deviates, and plans again afterwards.
+
+    Further worlds have no teacher, and every step deviates. The same command writes the same decisions, whatever the
+    number of workers.
+    """
+
+    out: Annotated[Path, arg(metavar="FILE")]
+    """File to write, such as runs/rollouts.jsonl.gz."""
+    missions: Annotated[int, arg(metavar="N")] = 400
+    """Worlds with a teacher. They need the extra `planner`."""
+    untaught: Annotated[int, arg(metavar="N")] = 300
+    """Further worlds without a teacher."""
+    teacher: TeacherOption = "both"
+    """The teacher: the planner, a clairvoyant, or both in alternation."""
+    scenario: Annotated[str, arg(metavar="NAME")] = "paper"
+    """The worlds' scenario."""
+    workers: Annotated[int, arg(metavar="N")] = 1
+    """Processes that fly the worlds, 1 to 64."""
+
+
+def main(argv: list[str]) -> int:
+    """Run ``aicvds explore``; returns the exit code."""
+    args = tyro.cli(Explore, prog="aicvds explore", args=argv)
+    try:
+        scenario = scenario_named(args.scenario)
+        for name in ("missions", "untaught"):
+            if getattr(args, name) < 0:
+                raise ValueError(f"--{name} {getattr(args, name)} is less than 0")
+        if args.missions + args.untaught < 1:
+            raise ValueError("--missions and --untaught are 0: there is nothing to fly")
+        if not 1 <= args.workers <= 64:
+            raise ValueError(f"--workers {args.workers} is not between 1 and 64")
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        header = Header(scenario=scenario, missions=args.missions + args.untaught, behaviour=_BEHAVIOUR)
+        write_rollouts(args.out, header, _explored(scenario, args))
+    except (ValueError, OSError) as error:
+        print(f"aicvds explore: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as missing:
+        fix = "pip install 'aic-vds[planner]', or take --missions 0"
+        print(f"aicvds explore: {missing.name} is not installed: {fix}", file=sys.stderr)
+        return 2
+    print(f"Wrote {args.out}")
+    return 0
+
+
+def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
+    teachers = [teacher_of(args.teacher, mission) for mission in range(args.missions)] + [None] * args.untaught
+    fly = partial(_mission, scenario)
+    tracked = partial(track, description="Exploring", total=len(teachers), console=Console(stderr=True))
+    if args.workers == 1:
+        for steps in tracked(map(fly, enumerate(teachers))):
+            yield from steps
+        return
+    with get_context("spawn").Pool(args.workers) as pool:
+        for steps in tracked(pool.imap(fly, enumerate(teachers))):
+            yield from steps
+
+
+def _mission(scenario: Scenario, numbered: tuple[int, TeacherName | None]) -> list[RolloutStep]:
+    mission, teacher = numbered
+    return list(explore(scenario, mission, teacher))
+
+
+def teacher_of(option: TeacherOption, mission: int) -> TeacherName:
+    """The teacher of that training world; with ``both``, the planner in even ones."""
+    if option == "both":
+        return "clairvoyant" if mission % 2 else "planner"
+    return option

@@ -1,0 +1,184 @@
+"""The pilots of a fleet: a local policy, or an edge with a fallback on board."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from shared.scenario import Scenario
+from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
+from simulator.client import EdgeClient, Exchange
+from simulator.client.observation_report import decide_request
+from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from simulator.policies.policy import Policy
+from simulator.policies.registry import policy_named
+from simulator.records.decision import DecidedBy
+from simulator.world import Observation
+
+FALLBACK = "eof"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A decision: sensor, velocity in m/s, source, the reason of a fallback, and the exchange with an edge, if any."""
+
+    sensor: int
+    velocity: int
+    source: DecidedBy
+    reason: str | None = None
+    exchange: Exchange | None = None
+
+
+class Pilot(Protocol):
+    """Decides for the fleet."""
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The choice for one UAV from its observation and the sensors that earlier UAVs of this step took."""
+
+    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+        """Use the outcome of that choice."""
+
+    def land(self) -> None:
+        """Finish the mission."""
+
+
+class LocalPilot:
+    """The pilot of a local policy; every decision counts as taken on board."""
+
+    def __init__(self, name: str, scenario: Scenario, seed: int) -> None:
+        self._reason = f"policy_{name}"
+        self._policy: Policy = policy_named(name)
+        self._policy.reset(scenario, seed)
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The policy's choice."""
+        sensor, velocity = self._policy.decide(uav, observation, taken)
+        return Choice(int(sensor), int(velocity), "onboard", self._reason)
+
+    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+        """Do nothing: a local policy does not learn."""
+
+    def land(self) -> None:
+        """Do nothing: no outcome is pending."""
+
+
+class EdgePilot:
+    """The pilot that asks an edge; without a usable answer the UAV decides on board with EOF.
+
+    ``spec`` is the mission to create at the edge before the first decision. ``on_request`` is called with each request
+    before it is sent. ``answered`` counts the edge's decisions, and ``last_error`` is the text of the last failure.
+    After a step with an unreachable edge the fleet waits until the client ``probe`` finds it ready, at most
+    ``reconnect_s`` seconds in all per outage.
+    """
+
+    def __init__(
+        self,
+        client: EdgeClient,
+        mission_id: str,
+        scenario: Scenario,
+        seed: int,
+        *,
+        mode: Mode | None = None,
+        deadline_ms: int | None = None,
+        probe: EdgeClient | None = None,
+        reconnect_s: float = 0.0,
+        on_wait: Callable[[str], None] | None = None,
+    ) -> None:
+        self._client = client
+        self._probe = probe or client
+        self._reconnect_s = self._wait_left_s = reconnect_s
+        self._on_wait = on_wait
+        self._step = 0
+        self._mission_id = mission_id
+        self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode)
+        self._deadline_ms = deadline_ms
+        self._max_velocity = scenario.max_velocity
+        self._pending: dict[int, Outcome] = {}
+        # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
+        self._undurable: list[Outcome] = []
+        self._lost = False
+        self._fallback: Policy = policy_named(FALLBACK)
+        self._fallback.reset(scenario, seed)
+        self.on_request: Callable[[DecideRequest], None] = lambda request: None
+        self.answered = 0
+        self.last_error: str | None = None
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The edge's choice, or EOF's with source ``onboard`` and the reason."""
+        step = int(observation["step"][0])
+        if step != self._step and self._lost and self._wait_left_s > 0:
+            self._await_edge()
+        self._step = step
+        request = decide_request(
+            uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._pending.get(uav)
+        )
+        self.on_request(request)
+        try:
+            exchange = self._ask(request)
+        except EdgeError as error:
+            self.last_error = str(error)
+            sensor, velocity = self._fallback.decide(uav, observation, taken)
+            return Choice(int(sensor), int(velocity), "onboard", _reason(error))
+        self._pending.pop(uav, None)
+        if request.outcome is not None and not exchange.response.stored:
+            self._undurable.append(request.outcome)
+        self.answered += 1
+        answer = exchange.response
+        return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
+
+    def _await_edge(self) -> None:
+        # Without an edge a step takes microseconds: the mission would end before a restarted edge is up.
+        began = time.monotonic()
+        try:
+            self._probe.wait_ready(self._wait_left_s, on_wait=self._on_wait)
+            # Without this, a restarted edge would create the mission from the next request, with another spec.
+            self._probe.put_mission(self._mission_id, self.spec)
+        except EdgeError as error:
+            self.last_error = str(error)
+        self._wait_left_s -= time.monotonic() - began
+
+    def _ask(self, request: DecideRequest) -> Exchange:
+        try:
+            # A single attempt detects that a lost edge is back with the least delay.
+            exchange = self._client.decide(request, attempts=1 if self._lost else None)
+        except EdgeUnreachable:
+            self._lost = True
+            raise
+        except EdgeRefused as refused:
+            # A restarted edge has neither the mission nor the earlier decision: create it, and omit the outcome.
+            if request.outcome is None or not refused.blames("outcome"):
+                raise
+            self._client.put_mission(self._mission_id, self.spec)
+            exchange = self._client.decide(request.model_copy(update={"outcome": None}))
+        self._lost, self._wait_left_s = False, self._reconnect_s
+        if exchange.response.velocity > self._max_velocity:
+            raise EdgeProtocolError(
+                f"the edge chose {exchange.response.velocity} m/s, the limit is {self._max_velocity}"
+            )
+        return exchange
+
+    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+        """Store the outcome for this UAV's next request."""
+        if choice.exchange is not None:
+            self._pending[uav] = choice.exchange.outcome(cost, failed)
+
+    def land(self) -> None:
+        """Send the outcomes that no later request carried, until the edge is unreachable."""
+        for outcome in (*self._undurable, *self._pending.values()):
+            try:
+                self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
+            except EdgeUnreachable as error:
+                self.last_error = str(error)
+                break
+            except EdgeError as error:
+                self.last_error = str(error)
+        self._pending.clear()
+        self._undurable.clear()
+
+
+def _reason(error: EdgeError) -> str:
+    if isinstance(error, EdgeUnreachable):
+        return "edge_unreachable"
+    return "edge_refused" if isinstance(error, EdgeRefused) else "edge_protocol"

@@ -1,0 +1,252 @@
+"""One mission from take-off to its report: wait for the edge, fly, summarise, write."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import httpx
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from shared.scenario import Scenario
+from shared.wire import Mode, Uplink
+from simulator.cli.running import INTERRUPTED
+from simulator.client import EdgeClient
+from simulator.client.lossy_transport import LossyTransport
+from simulator.records.decision_log import DecisionLog
+from simulator.records.request_log import RequestLog, resolved
+from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, fresh_folder, naming_out
+from simulator.records.summary import BySource, sources_text, summarise
+from simulator.sites.site import Site
+
+# The world and matplotlib take a second to import; `--help` and usage errors do without them.
+if TYPE_CHECKING:
+    from simulator.flying.flight import Flight
+    from simulator.flying.flight_metrics import FlightMetrics
+    from simulator.flying.pilots import Choice, Pilot
+
+API_KEY = "AICVDS_API_KEY"
+# Without a requested deadline the edge's default applies, which may be as long as the paper's step.
+DEFAULT_TIMEOUT_S = 10.0
+NETWORK_SLACK_S = 1.0
+# The timeout of a readiness probe during an outage, short beside the wait for the edge.
+PROBE_TIMEOUT_S = 2.0
+
+
+def new_mission_id(scenario: Scenario, seed: int) -> str:
+    """A new, unique ID such as ``paper-0-1f6c09ab``."""
+    return f"{scenario.name}-{seed}-{secrets.token_hex(4)}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One mission to conduct.
+
+    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. Before take-off the mission waits,
+    at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``.
+    """
+
+    site: Site
+    seed: int
+    mission_id: str
+    out: Path
+    command: str
+    policy: str = "edge"
+    edge: str | None = None
+    mode: Mode | None = None
+    uplink: Uplink = "full"
+    deadline_ms: int | None = None
+    wait_s: float = 120.0
+    wait_out: tuple[str, ...] = ("loading",)
+    reconnect_s: float = 0.0
+
+
+def conduct(
+    job: Job, console: Console, alive: Callable[[], None] = lambda: None, metrics: FlightMetrics | None = None
+) -> int:
+    """Wait for the edge, fly, compare, write and print; returns the exit code.
+
+    ``alive`` is called during the wait, and raises if the edge's process has ended. ``metrics`` counts the decisions
+    and steps of the flight.
+
+    Raises:
+        UsageError: the folder cannot be written.
+        EdgeError: no edge is ready before take-off.
+    """
+    from simulator.flying.pilots import EdgePilot, LocalPilot
+
+    if job.edge is None:
+        fresh_folder(job.out)
+        flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
+        return _conclude(job, flight, None, None, console)
+    lossy = _radio_link(job.site.scenario, job.seed)
+    with _client(job, job.edge) as ground, _client(job, job.edge, lossy) as radio, _probe(job.edge) as probe:
+        model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
+        progress = _ProgressText(metrics)
+        pilot = EdgePilot(
+            radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
+            probe=probe, reconnect_s=job.reconnect_s, on_wait=progress.waiting,
+        )  # fmt: skip
+        created = ground.put_mission(job.mission_id, pilot.spec)
+        fresh_folder(job.out)
+        with naming_out(job.out):
+            requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, created))
+        with requests:
+            pilot.on_request = requests.append
+            flight = _fly(job, pilot, console, progress)
+    code = _conclude(job, flight, created.mode, model, console)
+    if pilot.last_error is not None:
+        unanswered = len(flight.decisions) - pilot.answered
+        print(
+            f"{unanswered} decisions were taken on board. The edge's last failure: {pilot.last_error}", file=sys.stderr
+        )
+    return code or (1 if flight.decisions and not pilot.answered else 0)
+
+
+def _radio_link(scenario: Scenario, seed: int) -> LossyTransport | None:
+    """The transport of the scenario's radio link; ``None`` for a lossless one."""
+    if not scenario.uplink_drop and not scenario.uplink_jitter_ms:
+        return None
+    inner = httpx.HTTPTransport()
+    return LossyTransport(inner, drop=scenario.uplink_drop, jitter_ms=scenario.uplink_jitter_ms, seed=seed)
+
+
+def _client(job: Job, edge: str, transport: httpx.BaseTransport | None = None) -> EdgeClient:
+    """A client of the edge with the job's deadline and uplink; without ``transport`` its link is lossless."""
+    timeout_s = DEFAULT_TIMEOUT_S if job.deadline_ms is None else job.deadline_ms / 1000 + NETWORK_SLACK_S
+    key = os.environ.get(API_KEY) or None
+    return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport, uplink=job.uplink)
+
+
+def _probe(edge: str) -> EdgeClient:
+    return EdgeClient(edge, timeout_s=PROBE_TIMEOUT_S, attempts=1, api_key=os.environ.get(API_KEY) or None)
+
+
+def await_edge(
+    ground: EdgeClient,
+    wait_s: float,
+    console: Console,
+    alive: Callable[[], None] = lambda: None,
+    wait_out: tuple[str, ...] = ("loading",),
+) -> str | None:
+    """Wait until the edge can decide and its LLM's state is none of ``wait_out``; returns the LLM's name, if any.
+
+    Raises:
+        EdgeError: no edge is ready within ``wait_s`` seconds.
+    """
+    with console.status(f"Waiting for the edge at {ground.base_url}") as status:
+
+        def waiting(cause: str) -> None:
+            alive()
+            status.update(f"Waiting for the edge at {ground.base_url}: {escape(cause)}")
+
+        readiness = ground.wait_ready(wait_s, wait_out, on_wait=waiting)
+        alive()
+    if readiness.llm == "ready":
+        console.print(f"The edge is ready; its LLM is {escape(readiness.model or 'unnamed')}.")
+    elif readiness.llm == "off":
+        console.print("The edge is ready, without an LLM.")
+    else:
+        detail = f" ({readiness.detail})" if readiness.detail else ""
+        console.print(f"The edge is ready; its LLM is {readiness.llm}{escape(detail)}, so its policy decides.")
+    return readiness.model
+
+
+class _ProgressText:
+    """The text of the progress line: packets lost and sources so far, or the cause of a wait.
+
+    It also forwards decisions and steps to ``metrics``.
+    """
+
+    def __init__(self, metrics: FlightMetrics | None) -> None:
+        self._metrics = metrics
+        self._update: Callable[[str], None] = lambda text: None
+        self._lost = 0
+        self._sources: Counter[str] = Counter()
+
+    def show_with(self, update: Callable[[str], None]) -> None:
+        """Display the text by calling ``update``."""
+        self._update = update
+
+    def waiting(self, cause: str) -> None:
+        """Show that the fleet waits for a lost edge."""
+        self._update(f"waiting for the edge: {escape(cause)}")
+
+    def decided(self, choice: Choice) -> None:
+        """Count and show a decision."""
+        if self._metrics is not None:
+            self._metrics.decided(choice)
+        self._sources[choice.source] += 1
+        trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
+        self._update(f"{self._lost} lost; {choice.source} decides{trip}")
+
+    def stepped(self, flight: Flight) -> None:
+        """Count and show a step of the whole fleet."""
+        if self._metrics is not None:
+            self._metrics.stepped(flight)
+        self._lost += flight.tally[-1].lost_packets
+        self._update(f"{self._lost} lost; {sources_text(BySource(**self._sources))}")
+
+
+def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Flight:
+    from simulator.flying.flight import fly
+
+    with naming_out(job.out):
+        log = DecisionLog(job.out / DECISIONS)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=12),
+        MofNCompleteColumn(),
+        TextColumn("steps"),
+        TextColumn("{task.fields[text]}"),
+        TimeElapsedColumn(),
+    )
+    with log, Progress(*columns, console=console) as progress:
+        task = progress.add_task("Flying", total=job.site.scenario.steps, text="")
+        text.show_with(lambda shown: progress.update(task, text=shown))
+
+        def stepped(flight: Flight) -> None:
+            progress.advance(task)
+            text.stepped(flight)
+
+        flight = fly(job.site, pilot, job.seed, log, text.decided, stepped)
+    if flight.interrupted:
+        console.print(f"interrupted after {flight.steps_flown} steps; writing their results", highlight=False)
+    return flight
+
+
+def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, console: Console) -> int:
+    from simulator.flying.rollout import baselines
+
+    flown_by = "aic_vds" if job.policy == "edge" else job.policy
+    others = baselines(job.site, job.seed, flight.steps_flown)
+    tallies = {flown_by: flight.tally, **{name: tally for name, tally in others.items() if name != flown_by}}
+    facts = flight.facts(
+        policy=job.policy,
+        edge=job.edge,
+        uplink=job.uplink if job.edge else None,
+        mission_id=job.mission_id,
+        mode=mode,
+        model=model,
+        deadline_ms=job.deadline_ms,
+        command=job.command,
+    )
+    summary = summarise(facts, flight.decisions, tallies)
+    with console.status("Drawing the report"), naming_out(job.out):
+        (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        from simulator.reporting.html_report import write_report
+        from simulator.reporting.terminal_table import show
+
+        write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, flight.sensor_xy)
+    show(summary, console)
+    for name in (SUMMARY, DECISIONS, REPORT, FIGURES, *((REQUESTS,) if job.edge else ())):
+        console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)
+    return INTERRUPTED if flight.interrupted else 0

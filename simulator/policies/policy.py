@@ -1,0 +1,26 @@
+"""The interface of a scheduling policy."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from shared.scenario import Scenario
+from simulator.world import Observation
+
+
+class Policy(Protocol):
+    """Decides for a fleet, one UAV at a time, from that UAV's observation alone."""
+
+    def reset(self, scenario: Scenario, seed: int) -> None:
+        """Start a mission. Called before the first ``decide``."""
+        ...
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+        """Choose a sensor, and a velocity in m/s.
+
+        Args:
+            uav: index of the UAV.
+            observation: of that UAV.
+            taken: sensors chosen by earlier UAVs of this step.
+        """
+        ...

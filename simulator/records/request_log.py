@@ -1,0 +1,64 @@
+"""``requests.jsonl``: the requests of a mission to its edge, for ``aicvds replay``.
+
+The first line is the mission's spec with the edge's defaults resolved and its scenario in full. Each further line is
+one ``POST /decide`` in the order sent. A request is the full report whatever the uplink, with the outcome that it
+carried. The outcomes of the last decisions are in ``decisions.jsonl``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+from pydantic import TypeAdapter
+
+from shared.missions import MissionStatus
+from shared.wire import DecideRequest, MissionSpec
+from simulator.records.json_lines import read_lines
+
+_LINE: TypeAdapter[MissionSpec | DecideRequest] = TypeAdapter(MissionSpec | DecideRequest)
+
+
+class RequestLog:
+    """Writes the spec, then each request when it is sent, and flushes each line.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, spec: MissionSpec) -> None:
+        self._file: IO[str] = path.open("w", encoding="utf-8")
+        self._file.write(spec.model_dump_json() + "\n")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._file.close()
+
+    def append(self, request: DecideRequest) -> None:
+        """Write one line."""
+        self._file.write(request.model_dump_json() + "\n")
+        self._file.flush()
+
+
+def resolved(spec: MissionSpec, status: MissionStatus) -> MissionSpec:
+    """The spec with the defaults of the edge that made the mission, independent of another edge's defaults."""
+    return spec.model_copy(update={"mode": status.mode, "top_k": status.top_k, "prompt": status.prompt})
+
+
+def read_requests(path: Path) -> tuple[MissionSpec, list[DecideRequest]]:
+    """The spec and the requests, without a last line that a crash cut off.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: a line is invalid; the text names it.
+    """
+    lines = read_lines(path, _LINE)
+    if not lines or not isinstance(spec := lines[0], MissionSpec):
+        raise ValueError(f"{path}, line 1: the mission's spec is missing")
+    requests = [line for line in lines[1:] if isinstance(line, DecideRequest)]
+    if len(requests) < len(lines) - 1:
+        raise ValueError(f"{path}: there is more than one spec")
+    return spec, requests

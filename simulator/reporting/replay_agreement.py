@@ -1,0 +1,196 @@
+"""``replay.json``: the agreement of a replayed mission with the logged one, and the costs of both."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from shared.wire import MissionSpec
+from simulator.records.decision import Decision, queried_llm
+from simulator.records.record import Record
+from simulator.records.statistics import mean
+from simulator.records.summary import BySource, RoundTrips, round_trips, sources_text
+
+# The largest difference of velocities that agree, m/s.
+CLOSE_MPS = 1
+# The tokens of an answer for which the LLM's server gives no count: two numbers and a space.
+_ANSWER_TOKENS = 5
+
+
+class Compared(Record):
+    """One logged decision and its replay.
+
+    ``fed_back``: the replayed decision is the same, so the logged outcome is valid for it and was sent to the edge. A
+    replayed decision has no outcome of its own.
+    """
+
+    logged: Decision
+    replayed: Decision
+    fed_back: bool = False
+
+    @property
+    def same(self) -> bool:
+        """Whether the sensor and the velocity are the same."""
+        return (self.logged.sensor_id, self.logged.velocity) == (self.replayed.sensor_id, self.replayed.velocity)
+
+    def line(self) -> str:
+        """As JSON, without the outcome of the replayed decision, which was never observed."""
+        return self.model_dump_json(exclude={"replayed": {"failed", "collected", "lost_packets", "cost"}})
+
+
+class Agreement(Record):
+    """Percentages of ``decisions`` that agree; in velocity within 1 m/s, ``both_pct`` in sensor and velocity."""
+
+    decisions: int
+    sensor_pct: float | None
+    velocity_pct: float | None
+    both_pct: float | None
+
+
+class Side(Record):
+    """One of the two missions: the sources of its decisions, and means over the edge's decisions.
+
+    ``prompt_tokens`` is the edge's count. Fields with ``llm_`` are the LLM server's counts, and ``llm_new_tokens`` are
+    the tokens not read from its prefix cache. ``cost_usd`` is the estimate for all decisions together; None without
+    prices.
+    """
+
+    by_source: BySource
+    by_reason: dict[str, int]
+    model: str | None
+    prompt_tokens: float | None
+    llm_prompt_tokens: float | None
+    llm_new_tokens: float | None
+    llm_completion_tokens: float | None
+    rtt_ms: RoundTrips
+    llm_asked: int
+    cost_usd: float | None
+
+
+class ReplaySummary(Record):
+    """``replay.json``. ``spec`` is the replayed mission's, ``changed`` are its differences from the logged one.
+
+    ``unasked`` is the number of logged decisions without a replay, because it ended early.
+    """
+
+    run: str
+    edge: str
+    mission_id: str
+    version: str
+    command: str
+    spec: MissionSpec
+    changed: dict[str, tuple[Any, Any]]
+    decisions: int
+    unasked: int
+    outcomes_fed_back: int
+    agreement: Agreement
+    by_source: dict[str, Agreement]
+    logged: Side
+    replayed: Side
+
+
+@dataclass(frozen=True)
+class Prices:
+    """US dollars a million tokens of the prompt, the cached prompt and the completion."""
+
+    prompt: float
+    cached: float
+    completion: float
+
+    def of(self, decision: Decision) -> float:
+        """The cost of a decision's LLM query, 0 without one.
+
+        The token counts are the server's where available, otherwise the edge's with nothing cached and a usual answer.
+        """
+        tokens = decision.tokens
+        if tokens is None or not queried_llm(decision):
+            return 0.0
+        prompt = tokens.server_prompt if tokens.server_prompt is not None else tokens.prompt
+        cached = tokens.cached or 0
+        completion = tokens.completion if tokens.completion is not None else _ANSWER_TOKENS
+        fresh = (prompt - cached) * self.prompt
+        return (fresh + cached * self.cached + completion * self.completion) / 1e6
+
+
+def agreement(compared: Sequence[Compared]) -> Agreement:
+    """The agreement over all pairs."""
+    sensor = [c.logged.sensor_id == c.replayed.sensor_id for c in compared]
+    velocity = [abs(c.logged.velocity - c.replayed.velocity) <= CLOSE_MPS for c in compared]
+    both = [s and v for s, v in zip(sensor, velocity, strict=True)]
+    return Agreement(decisions=len(compared), sensor_pct=_pct(sensor), velocity_pct=_pct(velocity), both_pct=_pct(both))
+
+
+def by_source(compared: Sequence[Compared]) -> dict[str, Agreement]:
+    """The agreement by source of the replayed decision."""
+    sources = Counter(c.replayed.source for c in compared)
+    return {name: agreement([c for c in compared if c.replayed.source == name]) for name, _ in sources.most_common()}
+
+
+def side(decisions: Sequence[Decision], prices: Prices | None) -> Side:
+    """The statistics of one mission; without prices, the cost is the edge's estimate."""
+    tokens = [d.tokens for d in decisions if d.tokens is not None]
+    counted = [t for t in tokens if t.server_prompt is not None]
+    return Side(
+        by_source=BySource.model_validate(Counter(d.source for d in decisions)),
+        by_reason=dict(sorted(Counter(d.reason for d in decisions if d.reason is not None).items())),
+        model=next((d.model for d in reversed(decisions) if d.model), None),
+        prompt_tokens=mean([t.prompt for t in tokens]),
+        llm_prompt_tokens=mean([t.server_prompt for t in counted if t.server_prompt is not None]),
+        llm_new_tokens=mean([t.server_prompt - (t.cached or 0) for t in counted if t.server_prompt is not None]),
+        llm_completion_tokens=mean([t.completion for t in counted if t.completion is not None]),
+        rtt_ms=round_trips(decisions),
+        llm_asked=sum(map(queried_llm, decisions)),
+        cost_usd=_cost(decisions, prices),
+    )
+
+
+def _cost(decisions: Sequence[Decision], prices: Prices | None) -> float | None:
+    if prices is not None:
+        return sum(map(prices.of, decisions))
+    estimates = [d.tokens.cost_usd for d in decisions if d.tokens is not None and d.tokens.cost_usd is not None]
+    return sum(estimates) if estimates else None
+
+
+def _pct(agree: Sequence[bool]) -> float | None:
+    return 100 * sum(agree) / len(agree) if agree else None
+
+
+def show(summary: ReplaySummary, console: Console) -> None:
+    """Print two tables: the missions side by side, and their agreement."""
+    sides = Table("", "logged", "replayed", title=f"{summary.decisions} decisions replayed")
+    for name, cell in _ROWS.items():
+        sides.add_row(name, cell(summary.logged), cell(summary.replayed))
+    console.print(sides)
+    agreed = Table("decided by", "decisions", "same sensor", f"velocity within {CLOSE_MPS} m/s", "both")
+    for name, part in (("all", summary.agreement), *summary.by_source.items()):
+        shares = (part.sensor_pct, part.velocity_pct, part.both_pct)
+        agreed.add_row(name, str(part.decisions), *(_cell(share, "{:.0f} %") for share in shares))
+    console.print(agreed)
+    different = summary.decisions - summary.outcomes_fed_back
+    if different:
+        console.print(
+            f"{different} decisions were not fed back: they differ from those flown, so their cost is unknown.",
+            highlight=False,
+        )
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+_ROWS: dict[str, Callable[[Side], str]] = {
+    "LLM": lambda s: s.model or "-",
+    "decided by": lambda s: sources_text(s.by_source),
+    "prompt tokens": lambda s: _cell(s.prompt_tokens, "{:.0f}"),
+    "the LLM's own count": lambda s: _cell(s.llm_prompt_tokens, "{:.0f}"),
+    "of them new, not cached": lambda s: _cell(s.llm_new_tokens, "{:.0f}"),
+    "answer tokens": lambda s: _cell(s.llm_completion_tokens, "{:.1f}"),
+    "round trip p50, ms": lambda s: _cell(s.rtt_ms.p50, "{:.0f}"),
+    "round trip p99, ms": lambda s: _cell(s.rtt_ms.p99, "{:.0f}"),
+    "estimated cost, US$": lambda s: _cell(s.cost_usd, "{:.6f}"),
+}

@@ -1,0 +1,39 @@
+"""A mission's outcome as a table in the terminal."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from simulator.records.summary import Summary, sources_text
+from simulator.reporting.wording import llm_notice, policy_labels
+
+
+def show(summary: Summary, console: Console) -> None:
+    """Print the outcome beside those of EOF and WQCS, and the sources of the decisions."""
+    steps = f"{summary.steps_flown} of {summary.steps} steps" if summary.interrupted else f"{summary.steps} steps"
+    table = Table(title=f"Scenario {summary.scenario}, seed {summary.seed}, {steps}")
+    table.add_column("policy")
+    table.add_column("lost packets", justify="right")
+    table.add_column("loss events", justify="right")
+    labels = policy_labels(summary)
+    for name, lost in summary.lost_packets.items():
+        table.add_row(labels[name], f"{lost:,}", f"{summary.loss_events[name]:,}")
+    console.print(table)
+    if (notice := llm_notice(summary)) is not None:
+        console.print(notice, style="yellow", markup=False, highlight=False, soft_wrap=True)
+    if summary.policy == "edge":
+        console.print(f"{summary.decisions} decisions: {sources_text(summary.by_source)}")
+    tokens, trips = summary.tokens, summary.rtt_ms
+    if trips.p50 is not None:
+        console.print(f"Round trip: median {trips.p50:.0f} ms, 99th percentile {trips.p99:.0f} ms")
+        down = f"; {summary.attention_bytes_mean:.0f} down, to prune by" if summary.attention_bytes_mean else ""
+        console.print(f"Uplink {summary.uplink}: {summary.uplink_bytes_mean:.0f} bytes a decision{down}")
+    if summary.llm_asked and tokens.prompt_mean is not None:
+        cached = "" if tokens.cached_pct is None else f"; {tokens.cached_pct:.0f} % read from the LLM's prefix cache"
+        console.print(
+            f"Prompt: {tokens.prompt_mean:.0f} tokens a decision, {tokens.uncompressed_mean:.0f} with every sensor; "
+            f"attention and masks leave {tokens.state_mean:.0f} of the state block's "
+            f"{tokens.state_uncompressed_mean:.0f}{cached}",
+            soft_wrap=True,
+        )

@@ -1,0 +1,46 @@
+"""From longitudes and latitudes to metres in a scenario's square area."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pyproj import Proj
+
+from shared.channel import FloatArray
+
+
+def to_metres(degrees: ArrayLike) -> FloatArray:
+    """Project WGS 84 to a plane: azimuthal equidistant, centred on the points.
+
+    Distances from the centre are true. Distances across that direction are scaled by ``(r / R) / sin(r / R)`` at ``r``
+    from the centre, with R the Earth's radius of 6371 km: too long by 0.4 millionths at 10 km, 0.004 % at 100 km, and
+    0.2 % at 700 km, the corner of the largest area. y is north at the centre. The centre is the mean of the points as
+    directions from the Earth's centre, so that poles and the antimeridian need no special case.
+
+    Args:
+        degrees: longitudes and latitudes, ``(N, 2)``.
+
+    Returns:
+        x east and y north of the centre, ``(N, 2)`` metres. Rounding to the millimetre makes the same world to the bit
+        with another version of the projection's library.
+    """
+    longitude, latitude = np.asarray(degrees, dtype=np.float64).T
+    east, north = np.radians(longitude), np.radians(latitude)
+    x, y, z = np.mean((np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)), axis=1)
+    # Rounded, since the last bits of the mean depend on how it is summed.
+    lon_0 = round(float(np.degrees(np.arctan2(y, x))), 6)
+    lat_0 = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 6)
+    plane = Proj(proj="aeqd", ellps="WGS84", units="m", lon_0=lon_0, lat_0=lat_0)
+    return np.round(np.stack(plane(longitude, latitude), axis=-1), 3)
+
+
+def in_square(points: FloatArray) -> tuple[FloatArray, float]:
+    """Move points, ``(N, 2)`` metres, to the middle of the smallest square of whole metres with a corner at 0, 0.
+
+    Returns:
+        The points, to the millimetre, and the square's side.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    side = max(1.0, float(np.ceil((high - low).max())))
+    # Rounding must not put a point past the edge.
+    return np.clip(np.round(points - low + (side - (high - low)) / 2, 3), 0.0, side), side

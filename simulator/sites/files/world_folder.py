@@ -1,0 +1,138 @@
+"""The folder of a user's own world: sensors, trajectories, scenario fields and recorded arrivals in files.
+
+``world.geojson`` (RFC 7946, WGS 84) is a FeatureCollection. The property ``role`` is the meaning of a feature:
+
+| role | geometry | becomes |
+|---|---|---|
+| ``sensor`` | Point; property ``id`` or ``name`` | a site; sensor j is the j-th in the file |
+| ``trajectory`` | LineString: there and back; closed LineString or Polygon: laps, in the order drawn | UAV i's route |
+| ``pipeline`` (at most one) | LineString | the line in pictures |
+
+``scenario.toml`` (optional): any field of :class:`shared.scenario.Scenario` that does not follow from the features,
+such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are those of scenario ``paper``.
+
+``arrivals.csv`` (optional): a trace, ``step,<sensor ID>,<sensor ID>,...``, whole packets, one line a step from step 0,
+for at least the mission's steps. Without it arrivals are Poisson with the scenario's rates.
+
+A seed draws each UAV's start along its trajectory, the initial queues and, without a trace, the arrivals.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from shared.channel import FloatArray, link_holds
+from shared.scenario import Point, Scenario
+from shared.trajectory import trajectories
+from simulator.errors import UsageError
+from simulator.sites.files.overrides import read_overrides
+from simulator.sites.files.projection import in_square, to_metres
+from simulator.sites.files.reading import quoted
+from simulator.sites.files.survey import Survey, read_survey
+from simulator.sites.files.trace import read_trace
+from simulator.sites.site import Site
+
+__all__ = ["ARRIVALS", "FEATURES", "OVERRIDES", "site_from_folder"]
+
+FEATURES, OVERRIDES, ARRIVALS = "world.geojson", "scenario.toml", "arrivals.csv"
+MAX_AREA_M = 1_000_000.0
+# The most sensors out of reach that a warning names.
+FAR_NAMED = 5
+
+
+def site_from_folder(
+    folder: Path, steps: int | None = None, on_warning: Callable[[str], None] = lambda text: None
+) -> Site:
+    """The site that a world's folder describes.
+
+    Args:
+        folder: as in this module's docstring; its name is the scenario's, unless ``scenario.toml`` sets ``name``.
+        steps: of a mission, from 1 to 10,000; overrides the scenario's.
+        on_warning: called with a warning about sensors that no UAV can reach.
+
+    Raises:
+        UsageError: a file is missing or invalid; the text names the file, and the line or the feature.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"--world {folder} is no folder; name one that contains {FEATURES}")
+    survey = read_survey(folder / FEATURES)
+    overrides = read_overrides(folder / OVERRIDES)
+    derived = _placed(survey, folder / FEATURES) | ({} if steps is None else {"steps": steps})
+    if "name" not in overrides.values:
+        derived["name"] = _fit_name(folder.resolve().name)
+    scenario = overrides.scenario(derived)
+    site = Site(scenario, _arrivals(folder / ARRIVALS, scenario, list(survey.sensors)))
+    far = [name for name, near in zip(survey.sensors, _in_reach(scenario), strict=True) if not near]
+    if far:
+        named = ", ".join(quoted(name) for name in far[:FAR_NAMED]) + (" and others" if len(far) > FAR_NAMED else "")
+        on_warning(
+            f"{folder / FEATURES}: {len(far)} of {scenario.sensors} sensors can be reached from no trajectory "
+            f"({named}); their packets will be lost"
+        )
+    return site
+
+
+def _placed(survey: Survey, path: Path) -> dict[str, object]:
+    """The fields of a scenario that follow from the features."""
+    lines = [list(survey.sensors.values()), *survey.trajectories.values(), survey.pipeline]
+    metres = to_metres([point for line in lines for point in line])
+    across = float(np.ptp(metres, axis=0).max()) if np.isfinite(metres).all() else np.inf
+    if across > MAX_AREA_M:
+        how_far = f"{across / 1000:,.0f} km across" if np.isfinite(across) else "spread around the Earth"
+        raise UsageError(
+            f"{path}: the features are {how_far}, at most {MAX_AREA_M / 1000:,.0f} km fit; look for a swapped or "
+            f"mistyped coordinate"
+        )
+    metres, side = in_square(metres)
+    ends = np.cumsum([len(line) for line in lines])[:-1]
+    sites, *routes, pipeline = (_points(part) for part in np.split(metres, ends))
+    for label, route in zip(survey.trajectories, routes, strict=True):
+        if len(set(route)) < 2:
+            raise UsageError(f"{path}, {label}: all waypoints are the same; a trajectory needs two that differ")
+    return {
+        "layout": "surveyed",
+        "sensors": len(sites),
+        "uavs": len(routes),
+        "area_m": side,
+        "sites": sites,
+        "routes": tuple(routes),
+        "pipeline": pipeline,
+    }
+
+
+def _in_reach(scenario: Scenario) -> Iterator[bool]:
+    """For each sensor, whether some trajectory comes into its radio range."""
+    paths = [(path, *path.bounds) for path in trajectories(scenario)]
+    for sensor in scenario.sites:
+        yield any(
+            # The bounding boxes exclude most trajectories of a large world without a look at their legs.
+            np.all((low - scenario.radio_radius_m <= sensor) & (sensor <= high + scenario.radio_radius_m))
+            and link_holds(path.locate(sensor)[1], scenario)
+            for path, low, high in paths
+        )
+
+
+def _points(metres: FloatArray) -> tuple[Point, ...]:
+    return tuple((x, y) for x, y in metres.tolist())
+
+
+def _fit_name(folder: str) -> str:
+    """A folder's name as a scenario's name: at most 32 lower-case letters, digits and underscores, a letter first."""
+    name = re.sub(r"[^a-z0-9]+", "_", folder.lower()).strip("_")
+    return (name if re.match("[a-z]", name) else f"world_{name}".rstrip("_"))[:32]
+
+
+def _arrivals(path: Path, scenario: Scenario, sensors: list[str]) -> np.ndarray | None:
+    if not path.exists():
+        return None
+    trace = read_trace(path, sensors)
+    if len(trace) < scenario.steps:
+        raise UsageError(
+            f"{path} has {len(trace)} steps, the mission {scenario.steps}; add lines, or fly fewer steps "
+            f"(--steps {len(trace)})"
+        )
+    return trace

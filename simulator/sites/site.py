@@ -1,0 +1,32 @@
+"""A site: a scenario, and its arrivals if they were recorded rather than drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from shared.scenario import Scenario
+
+# The world takes a second to import, and pyproj a tenth: commands answer `--help` and bad use without them.
+if TYPE_CHECKING:
+    from shared.channel import IntArray
+    from simulator.world import Cost, PipelineWorld
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A scenario and, for recorded traffic, its trace.
+
+    Attributes:
+        arrivals: shape ``(at least T, J)``, packets that arrive in each step at each sensor; ``None`` for Poisson
+            arrivals.
+    """
+
+    scenario: Scenario
+    arrivals: IntArray | None = None
+
+    def world(self, cost: Cost = "default", render_mode: str | None = None) -> PipelineWorld:
+        """A new world on this site."""
+        from simulator.world import PipelineWorld
+
+        return PipelineWorld(self.scenario, arrivals=self.arrivals, cost=cost, render_mode=render_mode)

@@ -1,0 +1,16 @@
+"""Short flights are decision by decision what commit 601e8f2 flew, on board and over a real edge without an LLM."""
+
+import json
+from pathlib import Path
+
+from tests.benchmarks.running import figures
+
+RECORDED = Path(__file__).with_name("flights_601e8f2.json")
+SHORT = r"^(paper|pipeline) (eof|wqcs|value full)|^paper (value|policy|guided) (full|delta|pruned)"
+
+
+def test_seeds_fly_as_they_flew(tmp_path: Path) -> None:
+    found = figures(
+        "flight_hashes", "--seeds", "0", "1", "--steps", "3", "--only", SHORT, out=tmp_path / "flights.json"
+    )
+    assert found == json.loads(RECORDED.read_text())

@@ -1,0 +1,90 @@
+import math
+
+import pytest
+
+from service.learning.trust import Advice, Trust
+
+PRIOR = {"llm": 0.5, "value": 0.25, "policy": 0.25}
+
+
+def advise(trust: Trust, regret: dict[str, float], *, cost: float = 0.0, expected: float = 0.0, times: int = 1) -> None:
+    for _ in range(times):
+        trust.note("a" * 32, Advice(regret, dict.fromkeys(regret, 0.5), expected))
+        trust.settle("a" * 32, cost)
+
+
+def test_the_prior_is_normalised() -> None:
+    assert Trust({"llm": 2.0, "value": 1.0, "policy": 1.0}).weights == PRIOR
+
+
+def test_a_bad_llm_is_given_up_within_five_decisions() -> None:
+    trust = Trust(PRIOR)
+    advise(trust, {"llm": 8.0, "value": 1.0, "policy": 0.5}, times=5)
+    assert trust.weights["llm"] < 0.02
+    assert sum(trust.weights.values()) == pytest.approx(1.0)
+
+
+def test_a_good_llm_is_found_out_and_found_again_after_it_was_bad() -> None:
+    trust = Trust(PRIOR)
+    advise(trust, {"llm": 8.0, "value": 0.0, "policy": 0.0}, times=50)
+    advise(trust, {"llm": 0.0, "value": 4.0, "policy": 4.0}, times=12)
+    assert trust.weights["llm"] > 0.9
+
+
+def test_where_all_do_alike_the_prior_comes_back() -> None:
+    trust = Trust(PRIOR)
+    advise(trust, {"llm": 8.0, "value": 0.0, "policy": 0.0}, times=5)
+    advise(trust, {"llm": 0.0, "value": 0.0, "policy": 0.0}, times=1000)
+    assert trust.weights == pytest.approx(PRIOR, abs=0.01)
+
+
+def test_no_adviser_is_ever_given_up_for_good() -> None:
+    trust = Trust(PRIOR)
+    advise(trust, {"llm": 8.0, "value": 0.0, "policy": 8.0}, times=500)
+    assert min(trust.weights.values()) >= 0.01 * min(PRIOR.values()) - 1e-12
+
+
+def test_who_is_silent_keeps_its_weight() -> None:
+    trust = Trust(PRIOR)
+    advise(trust, {"value": 8.0, "policy": 0.0}, times=10)
+    assert trust.weights["llm"] == 0.5
+    assert trust.weights["policy"] > 0.45
+
+
+def test_who_advised_what_failed_unexpectedly_is_trusted_less() -> None:
+    trust = Trust(PRIOR)
+    trust.note("a" * 32, Advice(dict.fromkeys(PRIOR, 0.0), {"llm": 1.0, "value": 0.0, "policy": 0.0}, 0.0))
+    trust.settle("a" * 32, cost=1.0)
+    assert trust.weights["llm"] < 0.3
+    # An outcome counts once, and one of a decision that it knows nothing of not at all.
+    before = trust.weights
+    trust.settle("a" * 32, cost=1.0)
+    assert trust.weights == before
+
+
+def test_a_cost_that_is_always_higher_than_the_critic_thinks_says_nothing_in_the_end() -> None:
+    trust = Trust(PRIOR)
+    flown = {"llm": 1.0, "value": 0.0, "policy": 0.0}
+    weights = []
+    for _ in range(200):
+        trust.note("a" * 32, Advice(dict.fromkeys(PRIOR, 0.0), flown, 0.0))
+        trust.settle("a" * 32, cost=0.7)
+        weights.append(trust.weights["llm"])
+    assert weights[-1] > weights[99]
+
+
+def test_open_advice_is_bounded() -> None:
+    trust = Trust(PRIOR, most_open=2)
+    for number in range(3):
+        trust.note(f"{number:032x}", Advice(dict.fromkeys(PRIOR, 0.0), dict.fromkeys(PRIOR, 0.5), 0.0))
+    trust.settle(f"{0:032x}", 1.0)
+    assert trust.updates == 0
+    trust.settle(f"{2:032x}", 1.0)
+    assert trust.updates == 1
+
+
+@pytest.mark.parametrize("odd", [1e9, -1e9])
+def test_no_loss_however_large_breaks_the_weights(odd: float) -> None:
+    trust = Trust(PRIOR)
+    advise(trust, {"llm": odd, "value": 0.0, "policy": 0.0}, times=100)
+    assert all(math.isfinite(w) and w > 0 for w in trust.weights.values())

@@ -1,0 +1,31 @@
+import pytest
+
+from service.mission.applied_outcomes import AppliedOutcomes
+
+
+def test_what_was_applied_is_known_with_its_sign_and_its_zero() -> None:
+    applied = AppliedOutcomes(most=3)
+    told = [
+        ("0" * 31 + str(n), cost, failed) for n, (cost, failed) in enumerate([(0.0, True), (0.0, False), (2.5, True)])
+    ]
+    for one in told:
+        applied.add(*one)
+    assert [applied[name] for name, *_ in told] == [(cost, failed) for _, cost, failed in told]
+    again = AppliedOutcomes(most=3)
+    again.load_state_dict(applied.state_dict())
+    assert again.state_dict() == told
+
+
+def test_a_cost_of_minus_zero_is_no_failure() -> None:
+    applied = AppliedOutcomes(most=1)
+    applied.add("0" * 32, -0.0, False)
+    assert applied["0" * 32] == (0.0, False)
+
+
+def test_the_oldest_is_forgotten() -> None:
+    applied = AppliedOutcomes(most=2)
+    for n in range(3):
+        applied.add(f"{n:032x}", 1.0, False)
+    assert [f"{n:032x}" in applied for n in range(3)] == [False, True, True]
+    with pytest.raises(KeyError):
+        applied[f"{0:032x}"]

@@ -1,0 +1,52 @@
+"""`aicvds explore`: the alternation of teachers, the workers, and errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shared.rollouts import read_rollouts
+from shared.scenario import SCENARIOS
+from simulator.commands.explore import main, teacher_of
+from simulator.flying.teachers import TEACHERS, TeacherName
+
+SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
+NAMES: list[TeacherName] = ["planner", "clairvoyant"]
+
+
+def test_both_teachers_alternate() -> None:
+    assert [teacher_of("both", mission) for mission in range(4)] == ["planner", "clairvoyant"] * 2
+    assert teacher_of("clairvoyant", 0) == "clairvoyant"
+    assert set(NAMES) == set(TEACHERS)
+
+
+def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENARIOS, "paper", SHORT)
+    written = []
+    for workers in ("1", "2"):
+        out = tmp_path / f"{workers}.gz"
+        assert main(["--out", str(out), "--missions", "2", "--untaught", "1", "--workers", workers]) == 0
+        written.append(list(read_rollouts(out)[1]))
+    assert written[0] == written[1]
+    assert len(written[0]) == 3 * 36
+    taught = [{step.reference.teacher for step in written[0][m * 36 :][:36] if step.reference} for m in range(3)]
+    assert taught == [{"planner"}, {"clairvoyant"}, set()]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--missions", "-1"], "--missions -1 is less than 0"),
+        (["--missions", "0", "--untaught", "0"], "there is nothing to fly"),
+        (["--workers", "0"], "--workers 0 is not between 1 and 64"),
+        (["--scenario", "moon"], "unknown scenario 'moon'"),
+    ],
+)
+def test_bad_use_is_one_clear_line(
+    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--out", str(tmp_path / "r.gz"), *options]) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1

@@ -1,0 +1,18 @@
+"""Fixtures shared by the simulator's tests."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+
+@pytest.fixture
+def without_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Simulate an installation without torch and TorchRL."""
+    for module in [name for name in sys.modules if name.startswith("simulator.marl")]:
+        monkeypatch.delitem(sys.modules, module)
+    for module in [name for name in sys.modules if name.startswith("torchrl.")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setitem(sys.modules, "torchrl", None)

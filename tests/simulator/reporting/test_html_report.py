@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.scenario import SCENARIOS, Scenario
+from simulator.flying.flight import Flight, fly
+from simulator.flying.pilots import LocalPilot
+from simulator.flying.rollout import baselines
+from simulator.records.decision import Decision
+from simulator.records.summary import Summary, summarise
+from simulator.reporting import figures
+from simulator.reporting.html_report import costliest, drawings, render_report, write_report
+from simulator.reporting.wording import llm_notice, policy_labels
+from simulator.sites.site import Site
+
+SHORT = Scenario(steps=5)
+EVIL = '<script>alert("$x$")</script>&amp;'
+SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "glossary", "provenance")
+
+
+def decision(**changes: object) -> Decision:
+    base = {"step": 0, "uav_id": 0, "position": (1.0, 2.0), "sensor_id": 0, "velocity": 3, "source": "onboard"}
+    return Decision.model_validate({**base, **changes})
+
+
+def page(flight: Flight, model: str | None = "stub-1", decisions: list[Decision] | None = None) -> str:
+    seen = flight.decisions if decisions is None else decisions
+    tallies = {"aic_vds": flight.tally, **baselines(Site(flight.scenario), 0, flight.steps_flown)}
+    summary = summary_of(flight, model)
+    return render_report(
+        summary, flight.scenario, seen, drawings(summary, flight.scenario, seen, tallies, flight.sensor_xy)
+    )
+
+
+def summary_of(flight: Flight, model: str | None) -> Summary:
+    facts = flight.facts(
+        policy="edge", edge="http://edge:8000", mission_id="paper-0-1", mode="llm", model=model,
+        deadline_ms=None, command="aicvds simulate",
+    )  # fmt: skip
+    return summarise(facts, flight.decisions, {"aic_vds": flight.tally})
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """A flight in which every second decision has the fields of an edge's decision."""
+    flown = fly(Site(SHORT), LocalPilot("eof", SHORT, 0), seed=0)
+    flown.decisions = [
+        d.model_copy(update={"rtt_ms": 10.0 + n, "source": "llm", "attempts": 1, "request_bytes": 900}) if n % 2 else d
+        for n, d in enumerate(flown.decisions)
+    ]
+    return flown
+
+
+class Page(HTMLParser):
+    """Collects IDs, and the addresses that a browser would follow or load."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.loaded: list[str] = []
+        self.tags: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in ("src", "href", "xlink:href", "data", "action", "poster", "srcset"):
+                self.loaded.append(value or "")
+
+
+def test_every_section_is_there(flight: Flight) -> None:
+    html = page(flight)
+    for section in SECTIONS:
+        assert f'<section id="{section}">' in html
+    assert Page(html).tags.count("svg") == 6
+    for words in ("AIC-VDS", "EOF", "WQCS", "Jain", "aicvds simulate", "stub-1", "seed 0"):
+        assert words in html
+
+
+def test_the_page_has_the_sources_of_the_decisions(flight: Flight) -> None:
+    summary = summary_of(flight, None)
+    assert policy_labels(summary)["aic_vds"] == "AIC-VDS (8 onboard, 7 llm)"
+    notice = llm_notice(summary)
+    assert notice is not None and "The LLM took 7 of 15 decisions" in notice and "policy_eof 15" in notice
+    html = page(flight)
+    assert "AIC-VDS (8 onboard, 7 llm)" in html and "this is not a result of the LLM" in html
+    assert "guided" not in html and "<td>value</td>" not in html
+    by_llm = summary.by_source.model_copy(update={"llm": 14, "onboard": 1})
+    assert llm_notice(summary.model_copy(update={"by_source": by_llm})) is None
+    assert llm_notice(summary.model_copy(update={"mode": "value"})) is None
+
+
+def test_decisions_of_learned_values_are_named_and_have_no_tokens(flight: Flight) -> None:
+    learned = Flight(flight.scenario, 0, tally=flight.tally, sensor_xy=flight.sensor_xy)
+    learned.decisions = [
+        d.model_copy(update={"source": "value", "reason": "mode_value", "rtt_ms": 3.0}) for d in flight.decisions
+    ]
+    html = page(learned)
+    assert "value: what the edge&#39;s modules learned" in html or "value: what the edge's modules learned" in html
+    assert "<td>value</td><td>15</td>" in html and '<section id="tokens">' not in html
+
+
+def test_a_local_policys_page_has_nothing_of_an_edge() -> None:
+    flown = fly(Site(SHORT), LocalPilot("eof", SHORT, 0), seed=0)
+    facts = flown.facts(
+        policy="eof", edge=None, mission_id="m", mode=None, model=None, deadline_ms=None, command="c"
+    )  # fmt: skip
+    tallies = {"eof": flown.tally}
+    summary = summarise(facts, flown.decisions, tallies)
+    drawn = drawings(summary, SHORT, flown.decisions, tallies, flown.sensor_xy)
+    html = render_report(summary, SHORT, flown.decisions, drawn)
+    for absent in ("latency", "tokens", "deciders"):
+        assert f'<section id="{absent}">' not in html
+    assert "round trip" not in html and "<dt>edge</dt>" not in html and "135 million" not in html
+    assert Page(html).tags.count("svg") == 2
+
+
+def test_a_policy_has_one_colour_on_every_page(flight: Flight) -> None:
+    alone = figures.losses({"eof": flight.tally}, {}).inline
+    assert figures.POLICIES["eof"][0].lower() in alone and figures.POLICIES["aic_vds"][0].lower() not in alone
+
+
+def test_the_costliest_decisions_come_first() -> None:
+    flown = [decision(step=n, cost=float(n % 7)) for n in range(30)]
+    shown = costliest(flown)
+    assert len(shown) == 15 and [d.step for d in shown[:4]] == [6, 13, 20, 27]
+
+
+def test_the_page_needs_nothing_but_itself(flight: Flight) -> None:
+    html = page(flight)
+    parsed = Page(html)
+    assert all(address.startswith(("#", "data:image/png;base64,")) for address in parsed.loaded)
+    assert not {"script", "link", "img", "iframe"} & set(parsed.tags)
+    assert "@import" not in html and "@font-face" not in html
+    without_names = re.sub(r'xmlns(:\w+)?="[^"]*"', "", html).replace("http://edge:8000", "")
+    assert not re.search(r"https?://", without_names)
+    assert all(target.startswith("#") for target in re.findall(r"url\(([^)]*)\)", html))
+
+
+def test_the_figures_ids_do_not_collide_and_all_resolve(flight: Flight) -> None:
+    html = page(flight)
+    parsed = Page(html)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    targets = [a[1:] for a in parsed.loaded if a.startswith("#")] + re.findall(r"url\(#([^)]*)\)", html)
+    targets += re.findall(r'aria-labelledby="([^"]*)"', html)
+    assert set(targets) <= set(parsed.ids)
+
+
+def test_the_page_is_the_same_each_time(flight: Flight) -> None:
+    assert page(flight) == page(flight)
+
+
+def test_text_of_the_edge_is_escaped(flight: Flight) -> None:
+    evil = [d.model_copy(update={"reason": EVIL}) for d in flight.decisions]
+    html = page(flight, model=EVIL, decisions=evil)
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;") >= 2
+
+
+def test_a_flight_of_no_step_has_a_page() -> None:
+    nothing = Flight(SHORT, 0, interrupted=True)
+    html = page(nothing)
+    assert "interrupted after step 0 of 5" in html
+
+
+def test_a_large_fleet_fits(tmp_path: Path) -> None:
+    world = SCENARIOS["dense"].model_copy(update={"steps": 3})
+    flown = fly(Site(world), LocalPilot("random", world, 0), seed=0)
+    write_report(
+        tmp_path / "r.html", summary_of(flown, None), world, flown.decisions, {"a": flown.tally}, np.zeros((100, 2))
+    )
+    assert "The first 9 of 10 UAVs are shown" in (tmp_path / "r.html").read_text(encoding="utf-8")
+
+
+def test_figures_are_written_for_print(tmp_path: Path) -> None:
+    flown = fly(Site(SHORT), LocalPilot("random", SHORT, 0), seed=0)
+    summary = summary_of(flown, None)
+    for out in (tmp_path / "a", tmp_path / "b"):
+        out.mkdir()
+        write_report(out / "r.html", summary, SHORT, flown.decisions, {"aic_vds": flown.tally}, flown.sensor_xy)
+    html = (tmp_path / "a" / "r.html").read_text(encoding="utf-8")
+    assert "seed 0" in html and "<code>aicvds simulate</code>" in html
+    widths = {"losses": 7.16, "latency-map": 7.16, "visits": 3.5, "deciders": 3.5, "latency-steps": 3.5}
+    for name, width in widths.items():
+        assert f"figures/{name}.pdf" in html
+        pdf, svg = ((tmp_path / "a" / "figures" / f"{name}.{kind}").read_bytes() for kind in ("pdf", "svg"))
+        [box] = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) [\d.]+ \]", pdf)
+        assert float(box) == pytest.approx(72 * width)
+        assert b"/FontFile2" in pdf and b"<text" in svg
+        assert pdf == (tmp_path / "b" / "figures" / f"{name}.pdf").read_bytes()
+        assert svg == (tmp_path / "b" / "figures" / f"{name}.svg").read_bytes()
