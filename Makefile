@@ -33,6 +33,8 @@ install: .venv/installed
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet $(TORCH) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
+	@# Commands that run from here would take the entry points of an earlier installation out of its egg-info.
+	rm -rf aic_vds.egg-info
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	$(BIN)/aicvds model fetch
 	@touch $@
