@@ -17,7 +17,8 @@ EPISODES = ("--episodes", "120")
 # A training that goes no further than its first save.
 STANDS_STILL = """
 import signal, sys
-from simulator.marl import train, training
+from simulator.commands import train
+from simulator.marl import training
 
 save = training.Training.save
 
@@ -26,7 +27,7 @@ def stand_still(self):
     signal.pause()
 
 training.Training.save = stand_still
-sys.exit(train.main())
+sys.exit(train.main(sys.argv[1:]))
 """
 
 

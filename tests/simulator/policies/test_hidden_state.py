@@ -136,8 +136,8 @@ def test_an_observation_is_a_copy_that_leads_nowhere() -> None:
     world = PipelineWorld()
     observations, _ = world.reset(seed=SEED)
     for _ in range(3):
-        held = [v for part in (world, world.sensors, world.fleet) for v in vars(part).values()]
-        arrays = [value for value in held if isinstance(value, np.ndarray)]
+        parts = (world, world.sensors, world.fleet, world._beacons)
+        arrays = [value for part in parts for value in vars(part).values() if isinstance(value, np.ndarray)]
         assert len(arrays) > 8
         for observation in observations.values():
             for key, value in observation.items():
