@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.benchmarks.running import figures
+
+pytestmark = pytest.mark.long
 
 
 def test_it_tells_decisions_a_second_memory_and_what_learning_costs(tmp_path: Path) -> None:

@@ -3,7 +3,12 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.benchmarks.running import figures
+
+pytestmark = pytest.mark.long
+
 
 RECORDED = Path(__file__).with_name("flights_601e8f2.json")
 SHORT = r"^(paper|pipeline) (eof|wqcs|value full)|^paper (value|policy|guided) (full|delta|pruned)"

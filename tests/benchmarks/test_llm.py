@@ -6,6 +6,8 @@ import pytest
 
 from tests.benchmarks.running import figures
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.timeout(600)
 def test_a_round_of_every_condition(tmp_path: Path) -> None:

@@ -2,7 +2,11 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.benchmarks.running import figures
+
+pytestmark = pytest.mark.long
 
 
 def test_it_tells_the_share_by_stage_the_memory_and_the_wire(tmp_path: Path) -> None:

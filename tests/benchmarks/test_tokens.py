@@ -6,6 +6,9 @@ import pytest
 
 from tests.benchmarks.running import figures
 
+pytestmark = pytest.mark.long
+
+
 _BLOCKS = ("o200k", "o200k_static", "o200k_experiences", "o200k_state")
 SMALLEST = ("--seeds", "1", "--steps", "4", "--asked", "1", "--policy", "eof", "--encoders", "tiny", "--repeats", "1")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import select
@@ -9,9 +10,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest.mock import patch
 
+from shared import cli
 from tests.waiting import PATIENCE_S
 
 AICVDS = Path(sys.executable).with_name("aicvds")
@@ -22,6 +25,22 @@ def run(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [AICVDS, *args], capture_output=True, text=True, timeout=170, env={**os.environ, **env}, check=False
     )
+
+
+def run_here(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """As :func:`run`, in this process: for commands that end before they start anything."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        patch.dict(os.environ, env),
+        patch.object(sys, "argv", ["aicvds", *args]),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
+        try:
+            code = cli.main()
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    return subprocess.CompletedProcess(args, code, out.getvalue(), err.getvalue())
 
 
 @contextmanager

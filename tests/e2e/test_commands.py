@@ -143,6 +143,7 @@ def shell(command: str, workspace: Path) -> str:
     return ended.stdout
 
 
+@pytest.mark.long
 def test_missions_are_flown_as_shown(workspace: Path) -> None:
     # Who decides is not asked here, and the policy is the quickest.
     with serving_edge(AICVDS_MODE="policy") as (url, _):
@@ -164,6 +165,7 @@ def in_the_background(command: str, workspace: Path) -> Iterator[None]:
         process.wait(PATIENCE_S)
 
 
+@pytest.mark.long
 def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
     make, serve, fly = KEYED
     key = shell(f"{make}; echo $KEY", workspace).strip()

@@ -15,7 +15,7 @@ import pytest
 from simulator.experiments.catalogue import EXPERIMENTS
 from simulator.experiments.result import Result
 from simulator.experiments.stand_ins import answering, drawn
-from tests.e2e.processes import AICVDS, run, serving_edge
+from tests.e2e.processes import AICVDS, run, run_here, serving_edge
 from tests.waiting import PATIENCE_S, until
 
 
@@ -47,7 +47,7 @@ def edge_of(process: subprocess.Popen[bytes]) -> int:
 
 
 def test_help_tells_what_every_experiment_is() -> None:
-    shown = run("experiment", "--help")
+    shown = run_here("experiment", "--help")
     assert shown.returncode == 0
     for name, experiment in EXPERIMENTS.items():
         assert f"{name}: {experiment.summary}" in shown.stdout.replace("\n", " ")
@@ -67,11 +67,12 @@ def test_help_tells_what_every_experiment_is() -> None:
     ],
 )
 def test_bad_use_is_one_line_and_code_2(args: list[str], said: str, tmp_path: Path) -> None:
-    ended = run("experiment", *args, "--out", str(tmp_path / "out"))
+    ended = run_here("experiment", *args, "--out", str(tmp_path / "out"))
     assert ended.returncode == 2
     assert said in ended.stderr and ended.stderr.count("\n") == 1
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     args = ["fairness", "--llm", "none", "--steps", "2", "--seeds", "6"]
     process = started(tmp_path, *args)
@@ -90,6 +91,7 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "fairness").iterdir()} >= {".json", ".csv", ".png", ".svg"}
 
 
+@pytest.mark.long
 def test_an_interrupt_keeps_what_was_flown_and_leaves_no_edge(tmp_path: Path) -> None:
     process = started(tmp_path, "attention", "--llm", "none", "--seeds", "200")
     try:
@@ -104,6 +106,7 @@ def test_an_interrupt_keeps_what_was_flown_and_leaves_no_edge(tmp_path: Path) ->
     assert not Path(f"/proc/{edge}").exists()
 
 
+@pytest.mark.long
 def test_an_edge_that_dies_is_told_with_its_log(tmp_path: Path) -> None:
     process = started(tmp_path, "attention", "--llm", "none", "--seeds", "200")
     try:
@@ -117,6 +120,7 @@ def test_an_edge_that_dies_is_told_with_its_log(tmp_path: Path) -> None:
     assert "the edge ended with code -9" in error and "edge-off.log" in error and "Traceback" not in error
 
 
+@pytest.mark.long
 def test_an_edge_without_a_usable_llm_is_refused(tmp_path: Path) -> None:
     args = ["top-k", "--llm", "http://127.0.0.1:1/v1", "--steps", "2", "--seeds", "1"]
     ended = run("experiment", *args, "--out", str(tmp_path))
@@ -126,6 +130,7 @@ def test_an_edge_without_a_usable_llm_is_refused(tmp_path: Path) -> None:
     assert not flights_in(tmp_path)
 
 
+@pytest.mark.long
 def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:
     with answering(drawn) as llm, serving_edge(AICVDS_LLM_URL=llm) as (url, _):
         ended = run("experiment", "top-k", "--edge", url, "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
@@ -138,7 +143,7 @@ def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:
 
 
 def test_the_page_is_a_command_of_its_own() -> None:
-    shown = run("experiment", "page", "--help")
+    shown = run_here("experiment", "page", "--help")
     assert shown.returncode == 0 and "aicvds experiment page" in shown.stdout
 
 
@@ -151,6 +156,7 @@ def test_help_comes_without_the_heavy_imports() -> None:
     assert done.stderr.strip() == "[]"
 
 
+@pytest.mark.long
 def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: Path) -> None:
     ended = run("experiment", "llm-models", "--steps", "1", "--seeds", "1", "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr

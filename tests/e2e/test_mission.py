@@ -3,8 +3,12 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from simulator.records.decision_log import read_decisions
 from tests.e2e.processes import run, serving_edge
+
+pytestmark = pytest.mark.long
 
 
 def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from shared.rollouts import Header, RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from shared.wire import Features
 from simulator.flying.exploration import explore
-from tests.e2e.processes import run
+from tests.e2e.processes import run, run_here
 
 PAPER = SCENARIOS["paper"]
 # Far past the training worlds that `aicvds explore` records by default.
@@ -38,6 +38,7 @@ def held_out(flown: list[RolloutStep], features: Features = "paper") -> list[Exa
     return [example for mission in replay(header, flown, Reward("immediate"), features) for example in mission]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("teacher", "features", "k", "least"),
     [
@@ -72,8 +73,8 @@ def test_a_scenario_with_a_lower_speed_limit_takes_the_levels_that_it_has(featur
 
 
 @pytest.mark.parametrize("features", ["paper", "reach"])
-def test_a_batch_loses_what_its_examples_lose_one_by_one(features: Features, flown: list[RolloutStep]) -> None:
-    examples, modules = held_out(flown, features)[:40], Modules(features, 15, seed=0)
+def test_a_batch_loses_what_its_examples_lose_one_by_one(features: Features, untaught: list[RolloutStep]) -> None:
+    examples, modules = held_out(untaught, features)[:40], Modules(features, 15, seed=0)
     regression, _ = losses(modules, Batch.of(examples))
     alone = [modules.loss(example.sample, example.reward).item() for example in examples]
     assert len({len(example.sample.features) for example in examples}) > 1
@@ -88,6 +89,7 @@ def test_a_checkpoint_of_another_preset_is_not_loaded(tmp_path: Path, monkeypatc
         checkpoints._packaged.__wrapped__("reach")
 
 
+@pytest.mark.long
 def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
     recorded, checkpoint = tmp_path / "r.jsonl.gz", tmp_path / "c" / "own.pt"
     assert run("explore", "--out", str(recorded), "--missions", "2", "--untaught", "2").returncode == 0
@@ -107,6 +109,7 @@ def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
         assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
+@pytest.mark.long
 def test_the_papers_target_learns_something_else(tmp_path: Path) -> None:
     recorded, weights = tmp_path / "r.jsonl.gz", []
     assert run("explore", "--out", str(recorded), "--missions", "0", "--untaught", "2").returncode == 0
@@ -123,7 +126,7 @@ def test_the_papers_target_learns_something_else(tmp_path: Path) -> None:
     [("--epochs", "not at least 1"), ("--temperature", "not above 0"), ("--batch", "not at least 1")],
 )
 def test_bad_use_is_one_clear_line(tmp_path: Path, option: str, said: str) -> None:
-    ended = run("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"), option, "0")
+    ended = run_here("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"), option, "0")
     assert ended.returncode == 2
     assert f"{option} 0 is {said}" in ended.stderr
     assert ended.stderr.count("\n") == 1
@@ -132,7 +135,7 @@ def test_bad_use_is_one_clear_line(tmp_path: Path, option: str, said: str) -> No
 @pytest.mark.parametrize("content", [b"", b"not gzip"])
 def test_a_broken_file_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "r.gz").write_bytes(content)
-    ended = run("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"))
+    ended = run_here("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"))
     assert ended.returncode == 2
     assert "Traceback" not in ended.stderr
     assert "r.gz" in ended.stderr or "gzip" in ended.stderr

@@ -211,6 +211,7 @@ def lacking(prometheus: httpx.Client, expressions: set[str], seconds: float) -> 
     return expressions
 
 
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_every_expression_returns_data_while_a_mission_flies(tmp_path: Path) -> None:
     port = free_port()

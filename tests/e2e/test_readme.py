@@ -41,6 +41,7 @@ def test_the_curl_works_as_pasted() -> None:
     assert decision.sensor_id in (0, 1, 2)
 
 
+@pytest.mark.long
 def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
     put, get, confirm, own = re.split(r"\n(?=curl)", GUIDE)
     with serving_edge() as (url, _):

@@ -10,7 +10,7 @@ import pytest
 
 from simulator.marl.checkpoint import Checkpoint
 from simulator.marl.curve import read_csv
-from tests.e2e.processes import run
+from tests.e2e.processes import run, run_here
 from tests.waiting import until
 
 EPISODES = ("--episodes", "120")
@@ -35,6 +35,7 @@ def weights_of(folder: Path) -> list[list[float]]:
     return [value.flatten().tolist() for value in Checkpoint.load(folder / "mappo.pt").weights.values()]
 
 
+@pytest.mark.long
 def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     ended = run("train", "mappo", *EPISODES, "--out", str(whole))
@@ -61,7 +62,7 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
 
 
 def test_help_teaches() -> None:
-    told = run("train", "--help").stdout
+    told = run_here("train", "--help").stdout
     for word in ("madqn", "mappo", "--resume", "--episodes", "tensorboard"):
         assert word in told
 
@@ -77,7 +78,7 @@ def test_help_teaches() -> None:
     ],
 )
 def test_bad_use_is_one_line_that_names_the_option(options: list[str], message: str) -> None:
-    ended = run("train", *options)
+    ended = run_here("train", *options)
     assert ended.returncode == 2
     assert message in ended.stderr
     assert len(ended.stderr.strip().splitlines()) == 1

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from shared.scenario import SCENARIOS
 from shared.wire import FeedbackRequest, Uplink
@@ -106,6 +107,7 @@ def test_delta_is_right_where_requests_and_answers_are_lost() -> None:
     assert decided(delta) == decided(full)
 
 
+@pytest.mark.long
 def test_an_edge_that_is_killed_on_the_way(tmp_path: Path) -> None:
     port = str(free_port())
     common = {"AICVDS_MODE": "value", "AICVDS_STORE": str(tmp_path / "m.db")}
@@ -161,6 +163,7 @@ def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot() -> None:
     assert [(d.step, d.uav_id) for d in again] == [(6, 0)]
 
 
+@pytest.mark.long
 def test_simulate_tells_the_uplink_and_its_bytes(tmp_path: Path) -> None:
     told = {}
     with serving_edge(AICVDS_MODE="value") as (url, _):

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from simulator.records.decision_log import read_decisions
-from tests.e2e.processes import run, serving_edge
+from tests.e2e.processes import run, run_here, serving_edge
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "pipeline_world"
 
@@ -37,12 +38,14 @@ def flown_by_an_edge(mode: str, out: Path, *more: str, planner: str = "on") -> d
     return summary_in(out)
 
 
+@pytest.mark.long
 def test_the_example_flown_by_the_edges_learned_values(tmp_path: Path) -> None:
     summary = flown_by_an_edge("value", tmp_path, "--steps", "20")
     assert (summary["scenario"], summary["decisions"], summary["by_source"]["onboard"]) == ("pipeline_world", 60, 0)
     assert summary["by_source"]["value"] > 50
 
 
+@pytest.mark.long
 def test_the_example_flown_by_the_edges_look_ahead(tmp_path: Path) -> None:
     """It looks ahead along the routes: fast as it flies, what it chooses is in reach where the UAV then is."""
     summary = flown_by_an_edge("llm", tmp_path, planner="off")
@@ -53,6 +56,7 @@ def test_the_example_flown_by_the_edges_look_ahead(tmp_path: Path) -> None:
     assert summary["lost_packets"]["aic_vds"] < summary["lost_packets"]["eof"]
 
 
+@pytest.mark.long
 def test_the_example_flown_by_the_edges_planner(tmp_path: Path) -> None:
     summary = flown_by_an_edge("policy", tmp_path, "--steps", "20")
     assert summary["by_source"]["policy"] == summary["decisions"] == 60
@@ -61,19 +65,19 @@ def test_the_example_flown_by_the_edges_planner(tmp_path: Path) -> None:
 
 
 def test_bad_use_is_one_clear_line(tmp_path: Path) -> None:
-    both = run("simulate", "--world", str(EXAMPLE), "--scenario", "paper", "--policy", "eof")
+    both = run_here("simulate", "--world", str(EXAMPLE), "--scenario", "paper", "--policy", "eof")
     assert both.returncode == 2
     assert both.stderr.strip().endswith("contradict each other; give one of the two")
-    assert run("demo", "--world", str(EXAMPLE), "--scenario", "paper", "--out", str(tmp_path)).stderr == (
+    assert run_here("demo", "--world", str(EXAMPLE), "--scenario", "paper", "--out", str(tmp_path)).stderr == (
         both.stderr.replace("aicvds simulate", "aicvds demo")
     )
     (tmp_path / "world.geojson").write_text('{"type": "FeatureCollection",\n "features": [}', encoding="utf-8")
-    broken = run("simulate", "--world", str(tmp_path), "--policy", "eof")
+    broken = run_here("simulate", "--world", str(tmp_path), "--policy", "eof")
     assert broken.returncode == 2
     assert broken.stderr.count("\n") == 1 and "world.geojson is no JSON" in broken.stderr and "line 2" in broken.stderr
 
 
 def test_a_longer_mission_than_the_trace_says_so() -> None:
-    long = run("simulate", "--world", str(EXAMPLE), "--policy", "eof", "--steps", "61")
+    long = run_here("simulate", "--world", str(EXAMPLE), "--policy", "eof", "--steps", "61")
     assert long.returncode == 2
     assert "arrivals.csv has 60 steps, the mission 61" in long.stderr
