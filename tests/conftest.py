@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 
 from service.api.app import create_app
 from service.config.settings import Settings
+from service.prompting import token_accounting
 from service.storage.store import Store
 from tests.running import serving
 from tests.waiting import PATIENCE_S
@@ -34,6 +36,14 @@ Edge = Callable[..., httpx.Client]
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """An answer waits for a slow disk as long as it takes, unless a test says otherwise."""
     monkeypatch.setattr("service.edge.engine._STORE_S", PATIENCE_S)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def vocabulary() -> Iterator[None]:
+    """One token vocabulary for all edges of this process: to build one takes more than most tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(token_accounting, "encoding", cache(token_accounting.encoding))
+        yield
 
 
 @pytest.fixture
