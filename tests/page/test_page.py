@@ -23,6 +23,8 @@ pytestmark = pytest.mark.needs("chromium")
 Report = Callable[..., dict[str, Any]]
 REFUSED = ("Failed to load resource",)
 GONE = (*REFUSED, "net::ERR_")
+# Of the missions that are flown for a page: ten steps of three UAVs.
+STEPS, DECISIONS = 10, 30
 HOSTILE = '<img src=x onerror="window.hacked = 1"><script>window.hacked = 1</script>'
 
 
@@ -41,7 +43,7 @@ def flown(edge: str, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def fly(url: str, out: Path, *options: str) -> None:
-    flown = run("simulate", "--edge", url, "--out", str(out / "run"), *options)
+    flown = run("simulate", "--edge", url, "--steps", str(STEPS), "--out", str(out / "run"), *options)
     assert flown.returncode == 0, flown.stderr
 
 
@@ -56,13 +58,13 @@ def test_a_mission_appears_while_it_flies(visit: Open, start: Start, tmp_path: P
     expect(page.get_by_role("heading", name="No mission yet")).to_be_visible()
     expect(page.locator("#empty-command")).to_have_text(f"aicvds simulate --edge {url} --out runs/mission")
     fly(url, tmp_path)
-    expect(page.locator("#mission")).to_have_attribute("data-made", "90")
+    expect(page.locator("#mission")).to_have_attribute("data-made", str(DECISIONS))
     expect(page.get_by_role("heading", name="No mission yet")).to_be_hidden()
     expect(page.locator(".sensor[role=button]")).to_have_count(10)
     expect(page.locator(".mark.uav")).to_have_count(3)
-    expect(page.locator("#feed li")).to_have_count(90)
+    expect(page.locator("#feed li")).to_have_count(DECISIONS)
     expect(page.locator("#connection")).to_have_text("Live")
-    assert page.locator(".trails line").count() > 50
+    assert page.locator(".trails line").count() > DECISIONS // 2
     assert len(set(page.locator(".trails line").evaluate_all("all => all.map(l => l.getAttribute('stroke'))"))) > 3
     for chart in ("loss", "latency", "tokens"):
         expect(page.locator(f"#{chart} canvas")).to_have_count(1)
@@ -89,13 +91,13 @@ def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: st
     page = visit(flown)
     first = page.locator("#feed button").first
     first.focus()
-    for _ in range(89):
+    for _ in range(DECISIONS - 1):
         page.keyboard.press("ArrowDown")
     expect(page.locator("#feed button").last).to_be_focused()
     page.keyboard.press("Home")
     expect(first).to_be_focused()
     page.keyboard.press("Enter")
-    dialog = page.get_by_role("dialog", name=re.compile("^Step 29: UAV"))
+    dialog = page.get_by_role("dialog", name=re.compile(f"^Step {STEPS - 1}: UAV"))
     expect(dialog.get_by_role("region", name=re.compile("^Static block"))).to_contain_text("You direct a fleet of UAVs")
     expect(dialog.get_by_role("region", name="Current task")).to_have_text(re.compile(r"^(\d+(,-?\d+){6}\s*){5}$"))
     expect(dialog.locator("tr.chosen")).to_have_count(1)
@@ -110,7 +112,7 @@ def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: st
         expect(page.locator(f"#sensor-{sensor}")).to_be_focused()
         expect(page.locator("#readout")).to_contain_text(f"Sensor {sensor}: queue")
     page.keyboard.press("ArrowRight")
-    expect(page.locator("#readout")).to_contain_text("UAV 0 at step 29")
+    expect(page.locator("#readout")).to_contain_text(f"UAV 0 at step {STEPS - 1}")
 
 
 def test_mode_guided_shows_candidates_with_probabilities_and_trust(visit: Open, start: Start, report: Report) -> None:
@@ -146,8 +148,7 @@ def test_what_comes_from_outside_is_text(visit: Open, edge: str, report: Report)
     assert page.evaluate("window.hacked") is None
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1280)])
 def test_it_is_accessible_and_fits(visit: Open, flown: str, scheme: str, width: int) -> None:
     page = visit(flown, color_scheme=scheme, viewport={"width": width, "height": 844}, reduced_motion="reduce")
     expect(page.locator("#tokens canvas")).to_have_count(1)
