@@ -37,6 +37,7 @@ def api() -> Iterator[schemathesis.BaseSchema]:
         yield schemathesis.openapi.from_url(f"{url}/openapi.json")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("path", "method", "mode"), CASES)
 def test_no_input_breaks_the_edge(api: schemathesis.BaseSchema, path: str, method: str, mode: GenerationMode) -> None:
     strategy = api[path][method].as_strategy(generation_mode=mode)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from service.config.settings import Settings
 from service.edge.engine import Engine
@@ -61,6 +62,7 @@ def test_an_outcome_is_learned_after_the_decision_that_it_came_with(tmp_path: Pa
     assert later != taught
 
 
+@pytest.mark.long
 def test_as_many_lessons_are_learned_as_outcomes_come() -> None:
     """Of many UAVs that ask at once, each turn of the event loop brings many outcomes: none is left out for that."""
     turns = 30

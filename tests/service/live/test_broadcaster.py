@@ -166,6 +166,7 @@ def test_nobody_watches_a_mission_that_there_is_not(edge: Edge) -> None:
     assert client.get("/missions/-/events").status_code == 422
 
 
+@pytest.mark.long
 def test_who_stops_reading_holds_little_and_goes_on_from_a_snapshot(report: Report) -> None:
     """Its mission has 10,000 sensors, so that the system's own buffers are soon full."""
     with serving_edge(AICVDS_MODE="value") as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:

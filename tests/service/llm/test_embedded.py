@@ -52,6 +52,7 @@ def test_the_llm_decides_within_the_grammar(loaded: httpx.Client, report: Report
         assert 0 <= answer["velocity"] <= 14
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("row_format", ["json", "markdown"])
 def test_it_reads_every_format(loaded: httpx.Client, report: Report, row_format: str) -> None:
     style = {"format": row_format, "order": "shuffled", "experiences": 30}
@@ -77,6 +78,7 @@ def test_the_static_block_is_read_once(loaded: httpx.Client, report: Report) -> 
     assert third["tokens"]["cached"] > second["tokens"]["cached"]
 
 
+@pytest.mark.long
 def test_guided_asks_for_one_token_and_reads_little_anew(loaded: httpx.Client, app: FastAPI, report: Report) -> None:
     """At k = 5, once the bias is measured: the last experience, five rows, and the chat template's end."""
     loaded.put("/missions/guided", json={"mode": "guided"})
@@ -99,6 +101,7 @@ def test_guided_asks_for_one_token_and_reads_little_anew(loaded: httpx.Client, a
     assert answer["guided"]["calibrated"]
 
 
+@pytest.mark.long
 def test_a_fleets_step_takes_one_call(loaded: httpx.Client, app: FastAPI, report: Report) -> None:
     """One letter a UAV and a line's end between them, each with the LLM's probabilities."""
     loaded.put("/missions/fleet", json={"mode": "guided"})

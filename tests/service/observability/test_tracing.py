@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
 
@@ -125,6 +126,7 @@ def test_a_decision_is_a_trace_under_its_callers(report: Report) -> None:
     assert asked.end_time_unix_nano <= whole.end_time_unix_nano
 
 
+@pytest.mark.long
 def test_an_llm_that_fails_is_an_error_in_the_trace(report: Report) -> None:
     with (
         collecting() as (collector, spans),
@@ -144,6 +146,7 @@ def test_an_llm_that_fails_is_an_error_in_the_trace(report: Report) -> None:
     assert asked.status.code == 2
 
 
+@pytest.mark.long
 def test_a_log_that_nobody_reads_keeps_no_uav_waiting(report: Report) -> None:
     """A pipe holds 64 KB; past that, who writes to it waits."""
     with (

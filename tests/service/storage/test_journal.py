@@ -194,6 +194,7 @@ def test_what_waits_for_a_store_that_fails_is_bounded(
         assert client.get("/missions/test").json() == before
 
 
+@pytest.mark.long
 def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) -> None:
     """A process of its own whose files may not grow past a limit, which it meets in mid-mission."""
     script = (

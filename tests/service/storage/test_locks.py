@@ -118,6 +118,7 @@ async def test_an_edge_that_was_followed_stays_out_and_lets_a_third_in(
     first.close()
 
 
+@pytest.mark.long
 def test_an_edge_ends_though_postgresql_waits_for_a_lock(postgres: str, report: Report) -> None:
     with (
         serving_edge(AICVDS_STORE=postgres, AICVDS_MODE="value") as (url, process),

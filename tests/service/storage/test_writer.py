@@ -67,6 +67,7 @@ def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
         assert client.get("/missions/test").json() == before
 
 
+@pytest.mark.long
 def test_the_last_commit_of_a_killed_edge_ends_before_another_edge_begins(tmp_path: Path, report: Report) -> None:
     path = tmp_path / "m.db"
     with serving_edge(AICVDS_STORE=str(path), AICVDS_MODE="value") as (url, process):
@@ -96,6 +97,7 @@ def test_what_a_terminal_sends_to_the_edge_is_not_for_its_writer(tmp_path: Path,
         assert writers(os.getpid()) == [writer]
 
 
+@pytest.mark.long
 def test_an_edge_ends_though_its_writer_hangs(tmp_path: Path, report: Report) -> None:
     with serving_edge(AICVDS_STORE=str(tmp_path / "m.db"), AICVDS_MODE="value") as (url, process):
         with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:

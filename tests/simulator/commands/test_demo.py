@@ -29,6 +29,7 @@ def summary_in(out: Path) -> Summary:
     return Summary.model_validate_json((out / "summary.json").read_bytes())
 
 
+@pytest.mark.long
 def test_the_demo_serves_flies_and_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AICVDS_MODE", "value")
     (tmp_path / "summary.json").write_text("{}", encoding="utf-8")
@@ -59,6 +60,7 @@ def test_a_taken_port_is_bad_use(stub: EdgeStub, tmp_path: Path, capsys: pytest.
     assert demo.main(["--out", str(tmp_path), "--port", "65536"]) == 2
 
 
+@pytest.mark.long
 def test_the_demo_stops_its_edge_when_interrupted(tmp_path: Path) -> None:
     environment = {**os.environ, "AICVDS_MODE": "value"}
     arguments = ["demo", "--out", str(tmp_path), "--scenario", "dense"]

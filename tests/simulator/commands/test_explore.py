@@ -21,6 +21,7 @@ def test_both_teachers_alternate() -> None:
     assert set(NAMES) == set(TEACHERS)
 
 
+@pytest.mark.long
 def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SCENARIOS, "paper", SHORT)
     written = []

@@ -67,6 +67,7 @@ def test_a_mission_logs_its_requests_and_they_can_be_read(stub: EdgeStub, tmp_pa
     assert 700 < per_decision < 1500, "--help says about 1 kB a decision"
 
 
+@pytest.mark.long
 def test_a_local_policys_mission_leaves_no_requests_of_another(run: Path) -> None:
     assert simulate.main(["--policy", "eof", "--steps", "2", "--out", str(run), "--overwrite"]) == 0
     assert not (run / "requests.jsonl").exists()
