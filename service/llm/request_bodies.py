@@ -11,8 +11,8 @@ Constraint = Literal["grammar", "structured_outputs", "json_schema", "none"]
 
 # The most token probabilities that OpenAI and vLLM give for each position.
 TOP_LOGPROBS = 20
-# The temperature for several labels that are drawn one after the other.
-_LOW_TEMPERATURE = 0.2
+# The temperature at which llama.cpp draws several labels one after the other.
+SEVERAL_LABELS_TEMPERATURE = 0.2
 _LABEL_SEPARATOR = r' "\n" '
 
 
@@ -97,7 +97,7 @@ def label_body(
         body |= {"logprobs": True, "top_logprobs": TOP_LOGPROBS}
         if constraint == "grammar":
             body |= {"post_sampling_probs": True, "samplers": ["temperature"]}
-            body["temperature"] = draw_temperature(lists)
+            body["temperature"] = 1.0 if len(lists) == 1 else SEVERAL_LABELS_TEMPERATURE
     return body
 
 
@@ -133,11 +133,6 @@ def warm_up_body(model: str | None, first: WarmUp, constraint: Constraint, logpr
     if first.labels is None:
         return chat_body(model, first.static, first.user, constraint, [0], 15)
     return label_body(model, first.static, first.user, constraint, [first.labels], logprobs)
-
-
-def draw_temperature(lists: Sequence[Sequence[str]]) -> float:
-    """The temperature at which llama.cpp draws the labels of these lists."""
-    return 1.0 if len(lists) == 1 else _LOW_TEMPERATURE
 
 
 def constrain(constraint: Constraint, sensor_ids: Sequence[int], velocities: int) -> dict[str, Any]:

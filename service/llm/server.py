@@ -18,11 +18,11 @@ from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.llm.model_file import ModelMissing, embedded_model
 from service.llm.probing import probe, probe_body
 from service.llm.request_bodies import (
+    SEVERAL_LABELS_TEMPERATURE,
     Constraint,
     Rewriting,
     WarmUp,
     chat_body,
-    draw_temperature,
     label_body,
     rewriting_body,
     warm_up_body,
@@ -150,9 +150,10 @@ class LlmServer:
         body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
         # The silence of a call for several UAVs says nothing about calls for one.
         answer = await self._decide(body, self._silence if len(lists) == 1 else None)
-        if self.constraint != "grammar" or (temperature := draw_temperature(lists)) == 1.0:
+        if self.constraint != "grammar" or len(lists) == 1:
             return answer
-        return replace(answer, positions=tuple(position.untempered(temperature) for position in answer.positions))
+        positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
+        return replace(answer, positions=positions)
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
         """Call for a rewritten text.

@@ -18,7 +18,8 @@ from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
 from shared.wire import Readiness
 
-Call = Callable[[LlmServer], Coroutine[Any, Any, Completion]]
+Answer = Coroutine[Any, Any, Completion]
+Call = Callable[[LlmServer], Answer]
 
 
 class ServerPool:
@@ -92,13 +93,15 @@ class ServerPool:
         """Stop trying, close the connections, and free the embedded model."""
         await asyncio.gather(*(server.close() for server in self._each))
 
-    async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
-        """As :meth:`LlmServer.ask`."""
-        return await self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
+    # Plain functions that return a coroutine: a call resumes no coroutine that only passes its result on.
 
-    async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
+    def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Answer:
+        """As :meth:`LlmServer.ask`."""
+        return self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
+
+    def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Answer:
         """As :meth:`LlmServer.ask_labels`."""
-        return await self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
+        return self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
         """As :meth:`LlmServer.rewrite`, by the active server."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -138,9 +138,9 @@ class Journal:
             # Packed at once: until it is written, the state would take the memory of a thousand small objects.
             self._take(mission_log, mission_log.seq, pack(state))
 
-    async def stored(self, within_s: float) -> bool:
+    def stored(self, within_s: float) -> Coroutine[Any, Any, bool]:
         """Wait until every event so far is durable; False if that takes longer, or if the store fails."""
-        return await self._commits.stored(within_s)
+        return self._commits.stored(within_s)
 
     async def close(self, within_s: float) -> bool:
         """Write the queue once more; returns whether that has ended, so that the store may be closed."""
