@@ -8,8 +8,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 from urllib.request import getproxies, proxy_bypass
@@ -31,7 +29,7 @@ _MAX_TOKENS, _MAX_POSITIONS = 10**9, 256
 _MAX_NAME = 200
 # The statuses by which servers refuse an unknown field; no other status says anything about the field.
 _NOT_UNDERSTOOD = (400, 404, 422)
-# Bytes of body that the request of this task may bring.
+# Bytes of body that the answer to this task's request may have.
 _ALLOWED: ContextVar[int] = ContextVar("allowed_body_bytes")
 
 
@@ -106,8 +104,11 @@ class LLMClient:
         content = bytearray()
         sent = None if body is None else json.dumps(body, ensure_ascii=False, separators=(",", ":")).encode()
         try:
-            with _allowing(most):
+            allowed = _ALLOWED.set(most)
+            try:
                 request = await self._http.request(method, url, data=sent, allow_redirects=False, **self._proxy)
+            finally:
+                _ALLOWED.reset(allowed)
             async with request as response:
                 if response.headers.get("Content-Encoding", "identity") != "identity":
                     raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
@@ -174,18 +175,8 @@ class _TooMuch(aiohttp.ClientConnectionError):
     """The server sent more bytes than an answer can have."""
 
 
-@contextmanager
-def _allowing(most: int) -> Iterator[None]:
-    """Requests that begin in here are aborted past ``most`` bytes of body and 64 KB of heads."""
-    before = _ALLOWED.set(most)
-    try:
-        yield
-    finally:
-        _ALLOWED.reset(before)
-
-
 class _BoundedConnector(aiohttp.TCPConnector):
-    """Makes bounded connections. Every request on them begins in :func:`_allowing`."""
+    """Makes connections that are aborted past ``_ALLOWED`` bytes of a request's body and 64 KB of heads."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)

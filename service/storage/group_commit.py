@@ -103,7 +103,7 @@ class GroupCommit:
         """Wait until every change so far is durable; False if that takes longer, or if the store fails."""
         if self._written >= self._added:
             return True
-        if self.failing:
+        if self._failure is not None:
             return False
         reached: asyncio.Future[bool] = self._loop.create_future()
         request = self._added, reached
@@ -165,7 +165,7 @@ class GroupCommit:
             self._fail(error)
         self._batch = []
         for ticket, reached in self._requests:
-            if not reached.done() and (ticket <= self._written or self.failing):
+            if not reached.done() and (ticket <= self._written or self._failure is not None):
                 reached.set_result(ticket <= self._written)
         if self._state is _State.WRITING:
             self._go_on()
@@ -173,7 +173,7 @@ class GroupCommit:
             self._go_on_closing()
 
     def _go_on(self) -> None:
-        if self.failing:
+        if self._failure is not None:
             self._state = _State.PAUSING
             self._timer = self._loop.call_later(self._pause_s, self._begin, _State.WRITING)
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
@@ -186,7 +186,7 @@ class GroupCommit:
 
     def _go_on_closing(self) -> None:
         assert self._closed is not None
-        given_up = self.failing and self._state is _State.FINISHING
+        given_up = self._failure is not None and self._state is _State.FINISHING
         if given_up and self._queue:
             log.error(
                 "the last write to the store failed: %d changes are not on disk, no acknowledged outcome among them",
@@ -218,7 +218,7 @@ class GroupCommit:
             self._queue.popleft()
         if self._queue and self._queue[0][0] <= last:
             self._queue = deque(entry for entry in self._queue if id(entry[1]) not in durable)
-        if self.failing:
+        if self._failure is not None:
             log.warning("the store works again")
         self._failure, self._pause_s = None, _FIRST_PAUSE_S
         self._written = max(self._written, last)

@@ -15,7 +15,7 @@ import msgpack
 from service.storage import sqlite_process
 from service.storage.operations import Change
 from service.storage.sql_statements import Statements
-from service.storage.sqlite_process import LENGTH, framed
+from service.storage.sqlite_process import LENGTH
 from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,8 @@ class ProcessWriter:
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
-        self._frame = framed(self._statements.of(changes))
+        transaction = msgpack.packb(self._statements.of(changes))
+        self._frame = LENGTH.pack(len(transaction)) + transaction
         self._repeated = False
         self._submit()
         self._done = done
