@@ -118,6 +118,7 @@ class ServerPool:
             return replace(await call(waiting[0]), model=waiting[0].model)
         running: dict[asyncio.Task[Completion], LlmServer] = {}
         failure: NoDecision | None = None
+        # Once a call is answered: the calls that began after it. Their silence is no failure of their servers.
         later: list[asyncio.Task[Completion]] = []
         try:
             while waiting or running:
