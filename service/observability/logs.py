@@ -89,7 +89,7 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
         ]
     )
     handler = _ThreadedHandler(queue.Queue(_MOST_WAITING))
-    processors = [structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderers]
+    processors: list[Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderers]
     handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=processors))
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     handler.start()
