@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from service.learning.attention import top_k
 from service.learning.initial_weights import initial_weights
+from service.learning.modules import top_k
 from shared.features import FEATURES
 from shared.scenario import Scenario
 

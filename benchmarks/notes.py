@@ -24,7 +24,7 @@ from rich.table import Table
 from service.config.settings import Settings
 from service.guidance.note_compiler import understood
 from service.guidance.note_orders import BadOrders, number_of, read, shown
-from service.llm.answer_format import NoDecision
+from service.llm.answers import NoDecision
 from service.llm.server_pool import ServerPool
 from service.prompting.warm_up import warm_up
 from shared.guidance import Guidance, Impossible

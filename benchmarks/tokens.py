@@ -36,7 +36,7 @@ from rich.table import Table
 
 from service.config.settings import Settings
 from service.deciding.rollout_evaluator import judge
-from service.llm.answer_format import NoDecision, check_answer
+from service.llm.answers import NoDecision, check_answer
 from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
 from shared.scenario import Scenario, scenario_named

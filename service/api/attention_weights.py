@@ -18,7 +18,7 @@ def attention_of(mission: Mission) -> MissionAttention:
     arrays = [
         # A float32's own digits: a float64 would have twice as many, and make the same float32.
         WeightArray(name=name, shape=list(w.shape), values=[float(str(v)) for v in w.detach().numpy().ravel()])
-        for name, w in learner.attention._asdict().items()
+        for name, w in learner.weights.attention._asdict().items()
     ]
     return MissionAttention(
         mission_id=mission.mission_id,

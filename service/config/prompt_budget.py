@@ -1,4 +1,4 @@
-"""How many tokens a prompt may take, before there is one."""
+"""An upper bound of a prompt's tokens, before the prompt exists."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Literal
 
 from shared.wire import Features
 
-# Upper bounds in the embedded model's tokens, which has one for each digit: of the static block, and of a row or an
+# Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an
 # experience in each format.
 _STATIC_TOKENS = 400
 _ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56}
-# The two more columns of feature preset `reach`.
+# Of the two further columns of feature preset `reach`.
 _REACH_TOKENS = 16
 
 
@@ -24,7 +24,7 @@ def prompt_tokens(
     """Upper bound of a prompt's length in the embedded model's tokens.
 
     Args:
-        demonstrations: their text, whose characters are all ASCII: no tokenizer makes more tokens of it.
+        demonstrations: their text, all ASCII: a tokenizer makes at most one token of a character.
     """
     row = _ROW_TOKENS[row_format] + (_REACH_TOKENS if features == "reach" else 0)
     return _STATIC_TOKENS + row * (rows + experiences) + len(demonstrations)

@@ -1,4 +1,4 @@
-"""Every setting of the edge service, in one place. Environment variables carry the prefix ``AICVDS_``."""
+"""Every setting of the edge service; the environment variables have the prefix ``AICVDS_``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _default_store() -> str:
     return str(home / "aicvds" / "missions.db")
 
 
-# Read by `aicvds simulate` and docker-compose.yml, often from the same .env file.
+# Variables of `aicvds simulate` and docker-compose.yml, often in the same .env file.
 _SIMULATORS = {
     f"AICVDS_{name}"
     for name in (
@@ -37,76 +37,78 @@ class Settings(BaseSettings):
     """Settings of one edge service.
 
     Raises:
-        pydantic.ValidationError: a variable is out of bounds; the message names the field.
+        pydantic.ValidationError: a variable has a bad value; the message names the field.
     """
 
     model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", env_ignore_empty=True)
 
-    # An OpenAI-compatible server, up to and including /v1, or several in order of preference, divided by commas.
-    # Unset: the embedded llama.cpp.
+    # URL of an OpenAI-compatible server, up to and including /v1, or of several in order of preference, separated by
+    # commas. Unset: the embedded llama.cpp.
     llm_url: str | None = None
-    # The model to ask for, or one for each server. Unset: the first that the server lists.
+    # Name of the model, or one for each server. Unset: the first model that the server lists.
     llm_model: str | None = None
-    # Sent as a bearer token: to all servers, or one for each.
+    # Bearer token for all servers, or one for each.
     llm_api_key: SecretStr | None = None
-    # Milliseconds after which a second server (or the only one, again) is asked beside one that has not answered.
-    # 0: none is. It doubles what a slow server has to do, so it pays where there are several.
+    # Milliseconds after which a second server, or the only one again, is called beside a server that has not answered.
+    # 0: never. It doubles the work of a slow server, so it pays where there are several.
     hedge_ms: int = Field(0, ge=0, le=60_000)
-    # Another model file for the embedded llama.cpp. Unset: the one that `aicvds model fetch` brought.
+    # Model file of the embedded llama.cpp. Unset: the one of `aicvds model fetch`.
     llm_gguf: Path | None = None
-    # Threads of the embedded llama.cpp. 0: cores - 1, because with as many threads as cores and
-    # anything else running, llama.cpp's spinning workers slow each token a hundredfold.
+    # Threads of the embedded llama.cpp. 0: cores - 1. With as many threads as cores, llama.cpp's spinning workers need
+    # a hundred times as long for a token when anything else runs.
     llm_threads: int = Field(0, ge=0, le=256)
-    # Tokens of the embedded model's context; the settings are refused where the longest prompt would not fit.
+    # Tokens of the embedded model's context. Settings whose longest prompt does not fit are refused.
     llm_context: int = Field(4096, ge=512, le=131_072)
 
-    # Who decides by default: `guided` (the LLM among other advisers), `llm` (the paper's method), `value` (what the
-    # modules learned) or `policy` (the planner); with the last two no LLM is started.
+    # The default mode: `guided` (the LLM among other advisers), `llm` (the paper's method), `value` (the learned
+    # modules) or `policy` (the planner). The last two start no LLM.
     mode: Mode = "guided"
-    # Whether the LLM-free policy plans (extra `planner`) or looks one step ahead.
+    # Whether the policy without LLM plans (extra `planner`) or looks one step ahead.
     planner: Literal["on", "off"] = "on"
-    # Milliseconds that one search for a plan may take; the best plan until then counts.
+    # Milliseconds for one search for a plan; the best plan found by then counts.
     planner_ms: int = Field(500, ge=10, le=60_000)
-    # Milliseconds from request to answer unless the request says otherwise. A third of the paper's 10 s
-    # step, so that three UAVs deciding one after another still fit into it.
+    # Milliseconds from request to answer, unless the request has its own deadline. A third of the paper's 10 s step, so
+    # that three UAVs that decide one after another fit into a step.
     deadline_ms: int = Field(3000, ge=10, le=60_000)
-    # Sensors that the attention module keeps for the prompt (k in the paper).
+    # Sensors that the attention module selects for the prompt (k in the paper).
     top_k: int = Field(5, ge=1, le=100)
-    # Experiences in the prompt before half of them are dropped. Appending keeps the LLM's prefix
-    # cache; dropping costs one prefill of what stays, so it happens rarely.
+    # Experiences in the prompt before half of them are dropped. An appended experience leaves the LLM's prefix cache
+    # valid. Dropping costs a prefill of the others, so it happens rarely.
     experiences: int = Field(8, ge=0, le=200)
-    # Which of them stay: `recent`, those `similar` to the present state, or the `best` and a few of the worst.
+    # The experiences in the prompt: `recent` ones, those `similar` to the present state, or the `best` and a few of the
+    # worst.
     selection: Selection = "recent"
     # Adam's step size for the attention and velocity modules (the paper's table).
     learning_rate: float = Field(5e-4, gt=0, le=1)
 
-    # US dollars a million tokens, for the price in the token accounting. 0: the embedded model costs nothing.
+    # US dollars for a million tokens, in the token accounting. 0: the embedded model costs nothing.
     price_input: float = Field(0.0, ge=0)
     price_cached: float = Field(0.0, ge=0)
     price_output: float = Field(0.0, ge=0)
 
-    # Decisions that may wait for the LLM at once. More would only share its time: they are the policy's at once.
+    # Decisions that wait for the LLM at once. The policy decides for any more at once: they would only share its time.
     llm_concurrency: int = Field(64, ge=1, le=10_000)
-    # Requests in hand at once; one more is answered 503 with Retry-After. Several times `llm_concurrency`, so that
-    # decisions go to the policy before any is refused.
+    # Requests under way at once; one more gets a 503 with Retry-After. Several times `llm_concurrency`, so that the
+    # policy decides before any request is refused.
     max_requests: int = Field(512, ge=1, le=100_000)
-    # File of the keys that requests must carry (`aicvds keys add` makes it); unset: everyone may ask.
+    # File of the accepted API keys (`aicvds keys add` makes it). Unset: requests need no key.
     keys: Path | None = None
-    # Whether everyone may ask who reaches an address other than loopback.
+    # Whether requests to an address other than loopback need no key.
     anonymous: Literal["on", "off"] = "off"
     # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take 0.4 to 0.8 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
-    # Whether an LLM's answer must keep hard rules in mode `llm`: in reach, battery not flat. What breaks one is
-    # overridden by the policy; `off` is the paper's method as it is written.
+    # Whether an LLM's answer must obey hard rules in mode `llm`: sensor in reach, battery not flat. The policy
+    # overrides an answer that breaks one. `off` is the paper's method as published.
     verify: Literal["on", "off"] = "on"
-    # Where missions outlive the process: a SQLite file, or postgresql://user:password@host/database. `none`: nowhere.
+    # The store of the missions: a SQLite file, or postgresql://user:password@host/database. `none`: missions end with
+    # the process.
     store: str = Field(default_factory=_default_store, min_length=1, repr=False)
-    # Missions held at once, in memory or in the store; one more is refused until another is deleted.
+    # Missions at once, in memory or in the store; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
-    # Where the model file and the token vocabulary live.
+    # Folder of the model file and the token vocabulary.
     cache_dir: Path = Field(default_factory=_default_cache)
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    # `text` for people, `json` (an object a line) for machines.
+    # `text` for people, `json` (one object a line) for machines.
     log_format: Literal["text", "json"] = "text"
 
     @field_validator("llm_url")
@@ -143,7 +145,7 @@ class Settings(BaseSettings):
         return self
 
     def each_server(self) -> list[Settings]:
-        """These settings for each LLM server by itself, in order of preference; raises ``ValueError``."""
+        """Settings with a single LLM server, for each server in order of preference; raises ``ValueError``."""
         if self.llm_url is None:
             return [self]
         urls = self.llm_url.split(",")
@@ -164,7 +166,7 @@ class Settings(BaseSettings):
 def _checked_url(url: str) -> str:
     if not url.startswith(("http://", "https://")):
         raise ValueError("must start with http:// or https://, for example http://localhost:8080/v1")
-    # A tenth of a second to import, which an edge with its own LLM does without.
+    # Importing it takes a tenth of a second; an edge with the embedded LLM does not need it.
     import httpx
 
     try:
@@ -176,15 +178,15 @@ def _checked_url(url: str) -> str:
     return url.rstrip("/")
 
 
-def _for_each(servers: int, name: str, given: str | None) -> list[str | None]:
-    """One for each server, or the same for all of them."""
-    several: list[str | None] = [one.strip() or None for one in given.split(",")] if given else [None]
-    if len(several) not in (1, servers):
-        raise ValueError(f"{name} names {len(several)} and AICVDS_LLM_URL {servers} servers: name one, or one for each")
-    return several * servers if len(several) == 1 else several
+def _for_each(servers: int, name: str, value: str | None) -> list[str | None]:
+    """The values of a variable for each server; a single value is for all servers."""
+    values: list[str | None] = [one.strip() or None for one in value.split(",")] if value else [None]
+    if len(values) not in (1, servers):
+        raise ValueError(f"{name} names {len(values)} and AICVDS_LLM_URL {servers} servers: name one, or one for each")
+    return values * servers if len(values) == 1 else values
 
 
 def unknown_variables() -> list[str]:
-    """Variables of the environment that look like settings and are none: typing errors, mostly."""
+    """Environment variables with the prefix of settings that are none: mostly misspelled ones."""
     known = {f"AICVDS_{name.upper()}" for name in Settings.model_fields} | _SIMULATORS
     return sorted(name for name in os.environ if name.startswith("AICVDS_") and name not in known)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from service.guidance.step_guidance import StepGuidance
-from service.learning.attention import top_k
-from service.learning.sample import Sample
+from service.learning.modules import Sample, top_k
 from service.mission.events import Pending
 from service.mission.mission import Mission
 from service.observability.stopwatch import Stopwatch
@@ -166,7 +165,7 @@ class AttendedState:
         if row not in self._velocity_values:
             context = self.contexts[self.admissible.index(row)]
             approach = self.state.approach(row, self.mission.scenario)
-            self._velocity_values[row] = self.mission.learner.velocities(context, approach)
+            self._velocity_values[row] = self.mission.learner.weights.velocities(context, approach)
         return self._velocity_values[row]
 
 
@@ -176,7 +175,7 @@ def _attend(
     """Places in ``admissible`` of the sensors to keep, best first, the scores of all ``(n,)``, and their contexts."""
     if not admissible:
         return [], [], torch.empty(0)
-    scores, contexts = mission.learner.score(features)
+    scores, contexts = mission.learner.weights.score(features)
     if guidance is not None:
         # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
         added = guidance.worth[:, admissible].max(axis=0) / mission.scenario.queue_capacity

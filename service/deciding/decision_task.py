@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from service.deciding.deadline import Deadline
 from service.deciding.llm_query import LlmAdvice
 from service.learning.trust import Advice
-from service.llm.completion import Completion
+from service.llm.answers import Completion
 from service.mission.mission import Mission
 from service.observability.stopwatch import Stopwatch
 from shared.actions import Action

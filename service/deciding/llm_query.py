@@ -14,9 +14,8 @@ import numpy as np
 from service.deciding.attended_state import AttendedState
 from service.deciding.deadline import Deadline
 from service.deciding.deliberation import candidates_of, template_of
-from service.llm.answer_format import NoDecision
+from service.llm.answers import Completion, NoDecision
 from service.llm.calibration import LabelReader
-from service.llm.completion import Completion
 from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -111,7 +110,7 @@ class LlmQueries:
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
-        able = self._llm.status == "ready" and uavs <= self._llm.most_together
+        able = self._llm.status == "ready" and uavs <= self._llm.max_uavs_per_call
         return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
 
     async def ask_for_fleet(
@@ -153,7 +152,7 @@ class LlmQueries:
         self._late = self._late + 1 if reason == "llm_timeout" else 0
         if reason is not None and (self._late == 0 or self._late >= _LATE):
             log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
-            self._llm.most_together = uavs - 1
+            self._llm.max_uavs_per_call = uavs - 1
             self._late = 0
 
     async def _query(
@@ -162,7 +161,7 @@ class LlmQueries:
         """The completion and the probabilities of each UAV's labels, or the reason why there are none."""
         completion, by_label, reason = None, None, None
         try:
-            completion = await self._within(self._labels.ask(static, user, labels), deadline)
+            completion = await self._within(self._llm.ask_labels(static, user, labels), deadline)
             by_label = self._labels.read(completion, static, labels)
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
@@ -176,7 +175,7 @@ class LlmQueries:
 
     def _calibrated(self, completion: Completion | None, static: str, labels: Sequence[Sequence[str]]) -> bool:
         known = self._labels.bias(self._model(completion), static, len(labels)) is not None
-        return known and completion is not None and bool(completion.places)
+        return known and completion is not None and bool(completion.positions)
 
     async def _within(self, query: Coroutine[Any, Any, Completion], deadline: Deadline) -> Completion:
         if len(self._waiting) >= self._limit:

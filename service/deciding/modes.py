@@ -13,8 +13,7 @@ from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.deliberation import Deliberation
 from service.deciding.llm_query import LlmQueries
 from service.deciding.verifier import verify
-from service.llm.answer_format import NoDecision, check_answer
-from service.llm.completion import Completion
+from service.llm.answers import Completion, NoDecision, check_answer
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.deciding.attended_state import AttendedState
-from service.llm.answer_format import NoDecision
+from service.llm.answers import NoDecision
 from shared.actions import Action
 from shared.channel import link_holds
 

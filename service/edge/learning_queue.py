@@ -9,7 +9,7 @@ import time
 from collections import deque
 from typing import NamedTuple
 
-from service.learning.sample import Sample
+from service.learning.modules import Sample
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 

@@ -182,7 +182,7 @@ class MissionRegistry:
                 mission_id,
                 limit,
             )
-        self._journal.follow(mission, kept.seq, kept.events)
+        self._journal.resume(mission, kept.seq, kept.events)
         self._missions[mission_id] = mission
         self._stored.discard(mission_id)
         self._on_load(mission)

@@ -19,7 +19,7 @@ from typing import Protocol
 from service.guidance.note_orders import INSTRUCTION, BadOrders, read, shown
 from service.guidance.operator_guidance import OperatorGuidance
 from service.guidance.order_grammar import constrain_orders
-from service.llm.answer_format import NoDecision
+from service.llm.answers import NoDecision
 from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
 from shared.guidance import Guidance, Impossible

@@ -21,7 +21,7 @@ from service.guidance.note_orders import (
     numbers_in,
     parsed,
 )
-from service.llm.answer_format import Constraint
+from service.llm.request_bodies import Constraint
 
 _MOST_NUMBERS = 10
 _MOST_RULES = 60

@@ -1,4 +1,4 @@
-"""Where the modules start: a checkpoint that ships with the package, or random weights."""
+"""A mission's initial weights: those that ship with the package, or random ones."""
 
 from __future__ import annotations
 
@@ -9,18 +9,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from service.learning.modules import Modules
-from service.learning.parameters import Weights
+from service.learning.modules import Modules, Weights
 from shared.wire import Features, Init
 
-# Only preset `paper` has weights for each velocity level.
+# The weights that preset `paper` has for each velocity level; preset `reach` has none.
 _LEVEL_TENSORS = ("velocity.out.weight", "velocity.out.bias")
 
 
 def initial_modules(init: Init, preset: Features, levels: int, seed: int) -> Modules:
-    """Modules of a feature preset for velocities 0..levels - 1, pretrained or random by seed.
+    """Modules of a feature preset for velocities 0..levels - 1, pretrained, or random by seed.
 
-    The checkpoints know 0..14 m/s; a scenario with a lower limit takes the levels that it has.
+    The shipped weights have 0..14 m/s; a scenario with a lower limit uses the first levels.
     """
     modules = Modules(preset, levels, seed)
     if init == "pretrained":
@@ -32,7 +31,7 @@ def initial_modules(init: Init, preset: Features, levels: int, seed: int) -> Mod
 
 
 def initial_weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
-    """Those of :func:`initial_modules`; pretrained, the same for every mission."""
+    """The weights of :func:`initial_modules`; all missions share the pretrained ones."""
     return (
         _pretrained(preset, levels) if init == "pretrained" else initial_modules(init, preset, levels, seed).weights()
     )
@@ -44,7 +43,7 @@ def _pretrained(preset: Features, levels: int) -> Weights:
 
 
 def save(modules: Modules, path: Path) -> None:
-    """Write a checkpoint that names its feature preset."""
+    """Write the modules' weights with the name of their feature preset."""
     torch.save({"features": modules.preset, "weights": modules.state_dict()}, path)
 
 

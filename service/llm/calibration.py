@@ -1,11 +1,11 @@
-"""Reading an LLM's choice among labels: the probabilities of its tokens, less what it favours whatever is asked.
+"""An LLM's choice among labels: the probabilities of its tokens, corrected for the model's label bias.
 
-Language models favour labels for their name and for their place in the prompt (Zheng et al. 2024, "Large Language
+Language models prefer labels for their name and for their position in the prompt (Zheng et al. 2024, "Large Language
 Models Are Not Robust Multiple Choice Selectors"). Contextual calibration (Zhao et al. 2021, "Calibrate Before Use")
-asks the same prompt with content that says nothing, takes the mean of the answers for the bias b, and divides:
-``p'(a) = p(a) / b(a)``, renormalised over the labels offered. A label's place in the prompt is fixed by its name, so
-one bias covers both. It is measured once for a model, a static block and a number of lists, in the background after the
-first decision. Of several lists, the later ones' bias is that after the letters which the model drew for the earlier.
+sends the same prompt with content-free text, takes the mean of the answers as the bias b, and divides:
+``p'(a) = p(a) / b(a)``, renormalised over the offered labels. A label's name fixes its position in the prompt, so one
+bias covers both. The bias is measured once for a model, a static block and a number of lists, in the background after
+the first decision. The bias of a later list is the one after the labels drawn for the earlier lists.
 """
 
 from __future__ import annotations
@@ -14,43 +14,44 @@ import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
-from service.llm.answer_format import NoDecision, check_labels
-from service.llm.completion import Completion
+from service.llm.answers import Completion, NoDecision, check_labels
 from service.llm.server_pool import ServerPool
 from shared.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 
-# Left to the labels that were not named by a server that only names one.
+# Probability of all labels but the named one, where the server gives no probabilities.
 _SMOOTHING = 0.05
-# Of the uniform probability: a label that the content-free prompts hardly ever drew is not multiplied without bound.
+# Least bias, as a share of the uniform probability: the factor of a label that is hardly ever drawn stays bounded.
 _LEAST_BIAS = 0.1
-# Less than any probability that means something, and far from where halving or dividing loses it.
+# Less than any meaningful probability, and large enough to be halved and divided without underflow.
 _TINY = 1e-12
-_KEPT = 64
+_MOST_BIASES = 64
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
-# The model, the static block, and how many lists of labels.
+# The model, the static block, and the number of lists of labels.
 _Question = tuple[str | None, str, int]
 
 
 def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
-    """The LLM's probability of each label offered, summing to 1, for each list that it was to name one of.
+    """The LLM's probabilities of the labels of each list; those of a list sum to 1.
 
-    A label that is not among the tokens told gets half of the least that is. Where the server tells no probabilities,
-    its answer gets 0.95 and all labels of the list share the rest.
+    A label that is not among the likeliest tokens gets half of the least probability among them. Where the server gives
+    no probabilities, its answer gets 0.95, and all labels of the list share the rest.
 
     Raises:
-        NoDecision: neither the tokens told nor the text name a label offered.
+        NoDecision: neither the likeliest tokens nor the text name an offered label.
     """
-    # Between several labels stand the ends of lines; a single one stands first, whatever was drawn.
-    places = completion.places if len(lists) == 1 else [place for place in completion.places if place.token.strip()]
-    told = [
-        {label: place.likeliest[label] for label in labels if label in place.likeliest}
-        for place, labels in zip(places, lists, strict=False)
+    # Several labels have ends of lines between them. A single label is at the first position, whatever token was drawn.
+    positions = completion.positions
+    if len(lists) > 1:
+        positions = tuple(position for position in positions if position.token.strip())
+    found = [
+        {label: position.likeliest[label] for label in labels if label in position.likeliest}
+        for position, labels in zip(positions, lists, strict=False)
     ]
-    if len(told) == len(lists) and all(sum(place.values()) > 0.0 for place in told):
-        return [_filled(place, labels) for place, labels in zip(told, lists, strict=True)]
+    if len(found) == len(lists) and all(sum(by_label.values()) > 0.0 for by_label in found):
+        return [_filled(by_label, labels) for by_label, labels in zip(found, lists, strict=True)]
     answers = check_labels(completion.text, lists)
     return [
         {label: _SMOOTHING / len(labels) + (1.0 - _SMOOTHING) * (label == answer) for label in labels}
@@ -58,52 +59,48 @@ def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> l
     ]
 
 
-def _filled(told: Mapping[str, float], labels: Collection[str]) -> dict[str, float]:
-    least = max(_TINY, 0.5 * min(value for value in told.values() if value > 0.0))
-    return _normalised({label: told.get(label) or least for label in labels})
+def _filled(found: Mapping[str, float], labels: Collection[str]) -> dict[str, float]:
+    least = max(_TINY, 0.5 * min(value for value in found.values() if value > 0.0))
+    return _normalised({label: found.get(label) or least for label in labels})
 
 
-def calibrated(told: Mapping[str, float], bias: Mapping[str, float]) -> dict[str, float]:
-    """``p(a) / b(a)``, renormalised; the bias is that of the labels offered among themselves."""
-    offered = _normalised({label: bias[label] for label in told})
-    least = _LEAST_BIAS / len(told)
-    return _normalised({label: value / max(offered[label], least) for label, value in told.items()})
+def calibrated(measured: Mapping[str, float], bias: Mapping[str, float]) -> dict[str, float]:
+    """``p(a) / b(a)``, renormalised; the bias is normalised over the offered labels first."""
+    offered = _normalised({label: bias[label] for label in measured})
+    least = _LEAST_BIAS / len(measured)
+    return _normalised({label: value / max(offered[label], least) for label, value in measured.items()})
 
 
 class LabelReader:
-    """Asks one LLM for labels, and learns what it favours, for every mission of a service.
+    """Reads the labels that an LLM answers, and measures its label bias, for every mission of an edge.
 
-    One question may have several lists of labels, of each of which the answer is to name one.
+    A request has one or several lists of labels; its answer names one label of each list.
     """
 
     def __init__(self, llm: ServerPool) -> None:
         self._llm = llm
-        self._bias = BoundedDict[_Question, list[dict[str, float]]](_KEPT)
+        self._bias = BoundedDict[_Question, list[dict[str, float]]](_MOST_BIASES)
         self._attempts: dict[_Question, int] = {}
         self._task: asyncio.Task[None] | None = None
 
     def bias(self, model: str | None, static: str, lists: int = 1) -> list[dict[str, float]] | None:
-        """What a model favours under a static block, by list, once that is measured."""
+        """A model's bias under a static block, by list; None until it is measured."""
         return self._bias.get((model, static, lists))
 
-    async def ask(self, static: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
-        """One answer; raises :class:`NoDecision`. What it tells is for :meth:`read`."""
-        return await self._llm.ask_labels(static, user, lists)
-
     def read(self, completion: Completion, static: str, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
-        """The labels' probabilities by list, without the bias where that is known; raises :class:`NoDecision`."""
-        told = probabilities(completion, lists)
+        """The labels' probabilities by list, calibrated once the bias is known; raises :class:`NoDecision`."""
+        measured = probabilities(completion, lists)
         bias = self.bias(completion.model, static, len(lists))
-        if bias is None or not completion.places:
-            return told
-        return [calibrated(*pair) for pair in zip(told, bias, strict=True)]
+        if bias is None or not completion.positions:
+            return measured
+        return [calibrated(*pair) for pair in zip(measured, bias, strict=True)]
 
     def calibrate(self, model: str | None, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
-        """Measure a model's bias in the background, unless it is known, being measured, or cannot be.
+        """Measure a model's bias in the background, unless it is known, under way, or impossible to measure.
 
         Args:
-            texts: user messages that say nothing.
-            lists: every label that a question under this static block can offer, by list.
+            texts: content-free user messages.
+            lists: every label that a request under this static block can offer, by list.
         """
         key = (model, static, len(lists))
         busy = self._task is not None and not self._task.done()
@@ -113,7 +110,7 @@ class LabelReader:
         self._task = asyncio.create_task(self._measure(key, texts, lists), name="calibration")
 
     async def close(self) -> None:
-        """Give up measuring."""
+        """Cancel the measurement."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -121,19 +118,19 @@ class LabelReader:
     async def _measure(self, key: _Question, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
             async with asyncio.timeout(_TIMEOUT_S):
-                answers = [await self.ask(key[1], text, lists) for text in texts]
-            told = [probabilities(answer, lists) for answer in answers]
+                answers = [await self._llm.ask_labels(key[1], text, lists) for text in texts]
+            measured = [probabilities(answer, lists) for answer in answers]
         except (NoDecision, TimeoutError) as error:
             log.warning("label bias not measured: %s", error)
             return
         if {answer.model for answer in answers} != {key[0]}:
-            # Another server answered meanwhile.
+            # Another server has answered some of them.
             return
         self._bias[key] = [
-            {label: sum(answer[at][label] for answer in told) / len(told) for label in labels}
-            for at, labels in enumerate(lists)
+            {label: sum(answer[index][label] for answer in measured) / len(measured) for label in labels}
+            for index, labels in enumerate(lists)
         ]
-        if len(self._attempts) > 16 * _KEPT:
+        if len(self._attempts) > 16 * _MOST_BIASES:
             self._attempts.clear()
 
 

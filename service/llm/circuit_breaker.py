@@ -1,12 +1,14 @@
-"""The circuit breaker: an LLM that fails again and again is not asked for a while, so that nobody waits for it.
+"""The circuit breaker: an LLM that fails again and again gets no calls for a while, so that no decision waits for it.
 
-Closed, calls go through. After three failures in a row it opens, and no decision is kept waiting. After a pause the LLM
-is probed beside the decisions, so that no UAV pays for the attempt; where the probe is answered it is half open: calls
-go through again, and the first failure opens it for twice as long, the first answer closes it. What counts as a failure
-is for :mod:`service.llm.server` to say.
+Closed, the breaker lets calls through. Three failures in a row open it, and no call goes through. After a pause the LLM
+is probed beside the decisions, so that no UAV pays for the attempt. An answered probe makes the breaker half open:
+calls go through again, the first failure opens it for twice as long, and the first answer closes it.
+:mod:`service.llm.server` decides what counts as a failure.
 """
 
 from __future__ import annotations
+
+import math
 
 _FAILURES = 3
 _PAUSE_S, _LONGEST_PAUSE_S = 5.0, 60.0
@@ -20,11 +22,11 @@ class CircuitBreaker:
         self._openings = 0
 
     def answered(self) -> None:
-        """A call was answered."""
+        """Count an answer."""
         self._failures = self._openings = 0
 
     def failed(self) -> bool:
-        """A call was not; returns whether that opens the breaker."""
+        """Count a failure; returns whether it opens the breaker."""
         self._failures += 1
         if self._failures < (1 if self._openings else _FAILURES):
             return False
@@ -34,5 +36,39 @@ class CircuitBreaker:
 
     @property
     def pause_s(self) -> float:
-        """How long to leave the LLM alone, once open."""
+        """Seconds from the opening to the next probe."""
         return min(_LONGEST_PAUSE_S, _PAUSE_S * 2.0 ** min(self._openings - 1, 10))
+
+
+class SilenceCounter:
+    """Adds up the time in which calls waited in vain; so much of it, without an answer between, is one failure.
+
+    A call that was cancelled early, by a short deadline or in a fleet that shares one, counts for the time that it
+    waited. Calls that waited side by side count once. A call during which another was answered does not count: it
+    waited in the server's queue.
+
+    Args:
+        failure_s: seconds of silence that are one failure.
+    """
+
+    def __init__(self, failure_s: float) -> None:
+        self._failure_s = failure_s
+        self._silent_s = 0.0
+        self._answered_at = self._counted_until = -math.inf
+
+    def answered(self, now: float) -> None:
+        """A call was answered at ``now``, seconds of any steady clock."""
+        self._answered_at, self._silent_s = now, 0.0
+
+    def answered_since(self, begun: float) -> bool:
+        """Whether a call was answered after ``begun``."""
+        return self._answered_at > begun
+
+    def cancelled(self, begun: float, now: float) -> bool:
+        """Count a call that was cancelled while it waited; returns whether the silence is a failure now."""
+        self._silent_s += now - max(begun, self._counted_until)
+        self._counted_until = now
+        if self._silent_s < self._failure_s:
+            return False
+        self._silent_s = 0.0
+        return True

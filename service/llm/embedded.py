@@ -1,4 +1,4 @@
-"""The embedded LLM: llama.cpp in this process, serving the same HTTP interface as any other on loopback."""
+"""The embedded LLM: llama.cpp in this process, with the HTTP interface of any other server, on loopback."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from pathlib import Path
 
 import xllamacpp
 
-# llama.cpp sets aside up to 8 GB of host memory for old prompts unless told otherwise.
+# By default llama.cpp uses up to 8 GB of host memory for old prompts.
 _PROMPT_CACHE_MIB = 64
 _ONLY_ERRORS = 1
 _BATCH = 128
 
 
 class LoadFailed(RuntimeError):
-    """The model file is none that llama.cpp can load."""
+    """llama.cpp cannot load the model file."""
 
 
 class EmbeddedServer:
-    """A loaded model behind a loopback address. Loading takes seconds and blocks: call it in a thread.
+    """A loaded model behind a loopback address. The constructor blocks for seconds: call it in a thread.
 
-    The server wants a key made at start, so that other users of the machine cannot spend its time.
+    The server requires a random key, so that other users of the machine cannot spend its time.
 
     Args:
         context: tokens, which the slots share evenly.
-        slots: requests taken at once, each with a prefix cache of its own. With one, the static prefix and the
+        slots: requests served at once, each with its own prefix cache. With one slot, the static block and the
             experiences are one prefix for the whole fleet.
 
     Raises:
@@ -38,7 +38,7 @@ class EmbeddedServer:
         params.cpuparams_batch.n_threads = threads
         params.n_ctx = context
         params.n_parallel = slots
-        # llama.cpp notices a cancelled call between batches: large ones keep the next decision waiting for seconds.
+        # llama.cpp notices a cancelled call between batches: the next decision would wait seconds for a large one.
         params.n_batch = params.n_ubatch = _BATCH
         params.cache_ram_mib = _PROMPT_CACHE_MIB
         params.verbosity = _ONLY_ERRORS

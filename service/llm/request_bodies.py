@@ -1,24 +1,28 @@
-"""The request bodies of chat completions: what an LLM server is asked, and how it is held to the answer's form."""
+"""The request bodies of chat completions, with the fields that constrain a server to the form of the answer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
-from service.llm.answer_format import Constraint, constrain, constrain_labels
+# The kinds of constraint that servers obey: llama.cpp's grammar, vLLM's structured outputs, OpenAI's JSON schema.
+Constraint = Literal["grammar", "structured_outputs", "json_schema", "none"]
 
-# The most likely tokens that OpenAI and vLLM tell.
-TOLD_TOKENS = 20
-# The temperature at which several labels are drawn one after the other.
-_COOL = 0.2
+# The most token probabilities that OpenAI and vLLM give for each position.
+TOP_LOGPROBS = 20
+# The temperature at which llama.cpp draws several labels one after the other.
+SEVERAL_LABELS_TEMPERATURE = 0.2
+_LABEL_SEPARATOR = r' "\n" '
 
 
 @dataclass(frozen=True, slots=True)
 class Rewriting:
-    """A text to be rewritten, after worked examples of texts and what became of them.
+    """A text to be rewritten as worked examples show.
 
-    ``constrain`` gives the request fields that hold a server to the form of the answer, by what it obeys.
+    Attributes:
+        examples: pairs of a text and its rewritten form.
+        constrain: returns the request fields for the answer's form under a server's constraint.
     """
 
     instruction: str
@@ -29,9 +33,10 @@ class Rewriting:
 
 @dataclass(frozen=True, slots=True)
 class WarmUp:
-    """A first question, so that the server has read the static block before a decision pays for it.
+    """A first request: the server reads the static block before a decision has to wait for that.
 
-    ``labels`` are what it is answered by; None where it is answered by a sensor and a velocity.
+    Attributes:
+        labels: labels of the answer; None where the answer is a sensor and a velocity.
     """
 
     static: str
@@ -42,10 +47,9 @@ class WarmUp:
 def chat_body(
     model: str | None, system: str, user: str, constraint: Constraint, sensor_ids: list[int], velocities: int
 ) -> dict[str, Any]:
-    """The request body of one decision: greedy, short, and held to the answer's form where the server can.
+    """The request body of one decision: greedy, short, and constrained to ``sensor_id velocity``.
 
-    ``cache_prompt`` is llama.cpp's; it is sent only to a server that understood llama.cpp's ``grammar``, because
-    strict servers refuse fields they do not know.
+    Strict servers refuse unknown fields. So llama.cpp's ``cache_prompt`` goes only to a server that obeys ``grammar``.
     """
     body: dict[str, Any] = {
         "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
@@ -71,15 +75,16 @@ def label_body(
 ) -> dict[str, Any]:
     """The request body for one label of each list, with the likeliest tokens' probabilities if ``logprobs``.
 
-    llama.cpp tells its probabilities from before the grammar unless asked for those after sampling; after sampling at
-    temperature 0 all but one are 0. So it samples at temperature 1 with nothing cut off: the text is then a draw, and
-    the probabilities are exactly the model's among the labels. A later label is told given those drawn before it; so of
-    several it draws at a low temperature, nearly always the likeliest, and :meth:`Place.untempered` undoes that.
+    By default llama.cpp gives its probabilities from before the grammar. After sampling at temperature 0 all but one
+    are 0. So it samples at temperature 1 without cutting any token off: the text is a draw, and the probabilities are
+    exactly the model's among the labels. The probabilities of a later label depend on the labels drawn before it. So
+    several labels are drawn at a low temperature, nearly always the likeliest, which :meth:`TokenPosition.untempered`
+    undoes.
     """
     body: dict[str, Any] = {
         "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
         "temperature": 0,
-        # A token a label, and one for each end of a line between them.
+        # A token for each label, and one for each end of a line between them.
         "max_tokens": 2 * len(lists) - 1,
         "stream": False,
         **constrain_labels(constraint, lists),
@@ -89,52 +94,95 @@ def label_body(
     if constraint == "grammar":
         body["cache_prompt"] = True
     if logprobs:
-        body |= {"logprobs": True, "top_logprobs": TOLD_TOKENS}
+        body |= {"logprobs": True, "top_logprobs": TOP_LOGPROBS}
         if constraint == "grammar":
             body |= {"post_sampling_probs": True, "samplers": ["temperature"]}
-            body["temperature"] = draw_temperature(lists)
+            body["temperature"] = 1.0 if len(lists) == 1 else SEVERAL_LABELS_TEMPERATURE
     return body
 
 
 def rewriting_body(
-    model: str | None,
-    instruction: str,
-    examples: Sequence[tuple[str, str]],
-    text: str,
-    held: dict[str, Any],
-    temperature: float,
-    seed: int,
+    model: str | None, wanted: Rewriting, constraint: dict[str, Any], temperature: float, seed: int
 ) -> dict[str, Any]:
-    """The request body for rewriting a text as the examples are, which are shown as turns of the conversation.
+    """The request body for rewriting a text; the examples appear as messages of the conversation.
 
     Args:
-        held: the fields that hold the server to the answer's form.
+        constraint: the fields that constrain the server to the answer's form.
     """
-    turns = [
+    examples = [
         {"role": role, "content": content}
-        for example in examples
+        for example in wanted.examples
         for role, content in zip(("user", "assistant"), example, strict=True)
     ]
+    system = {"role": "system", "content": wanted.instruction}
     body: dict[str, Any] = {
-        "messages": [{"role": "system", "content": instruction}, *turns, {"role": "user", "content": text}],
+        "messages": [system, *examples, {"role": "user", "content": wanted.text}],
         "temperature": temperature,
         "seed": seed,
         "max_tokens": 128,
         "stream": False,
-        **held,
+        **constraint,
     }
     if model:
         body["model"] = model
     return body
 
 
-def draw_temperature(lists: Sequence[Sequence[str]]) -> float:
-    """At which llama.cpp draws the labels of so many lists."""
-    return 1.0 if len(lists) == 1 else _COOL
-
-
 def warm_up_body(model: str | None, first: WarmUp, constraint: Constraint, logprobs: bool) -> dict[str, Any]:
-    """The request body of a server's first question."""
+    """The request body of a server's first request."""
     if first.labels is None:
         return chat_body(model, first.static, first.user, constraint, [0], 15)
     return label_body(model, first.static, first.user, constraint, [first.labels], logprobs)
+
+
+def constrain(constraint: Constraint, sensor_ids: Sequence[int], velocities: int) -> dict[str, Any]:
+    """The request fields that constrain a server to ``sensor_id velocity``.
+
+    Args:
+        sensor_ids: the admissible sensors.
+        velocities: number of velocity levels, 0..velocities - 1.
+    """
+    sensors = [str(i) for i in sensor_ids]
+    levels = [str(v) for v in range(velocities)]
+    if constraint == "grammar":
+        return {"grammar": f'root ::= ({_alternatives(sensors)}) " " ({_alternatives(levels)})'}
+    if constraint == "structured_outputs":
+        return {"structured_outputs": {"regex": f"({'|'.join(sensors)}) ({'|'.join(levels)})"}}
+    if constraint == "json_schema":
+        return {"response_format": json_schema(list(sensor_ids), list(range(velocities)))}
+    return {}
+
+
+def constrain_labels(constraint: Constraint, lists: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """The request fields that constrain a server to one label of each list, each a single token on its own line.
+
+    OpenAI's ``json_schema`` could only name a label within an object, not as a token of its own. Such a server is not
+    constrained, and the labels are found among its likeliest tokens.
+    """
+    if constraint == "grammar":
+        choices = [_alternatives(labels) for labels in lists]
+        root = choices[0] if len(choices) == 1 else _LABEL_SEPARATOR.join(f"({choice})" for choice in choices)
+        return {"grammar": f"root ::= {root}"}
+    if constraint == "structured_outputs" and len(lists) == 1:
+        return {"structured_outputs": {"choice": list(lists[0])}}
+    if constraint == "structured_outputs":
+        return {"structured_outputs": {"regex": r"\n".join(f"({'|'.join(labels)})" for labels in lists)}}
+    return {}
+
+
+def json_schema(sensor_ids: list[int], velocities: list[int]) -> dict[str, Any]:
+    """OpenAI's ``response_format`` for ``{"sensor_id": ..., "velocity": ...}``."""
+    schema = {
+        "type": "object",
+        "properties": {
+            "sensor_id": {"type": "integer", "enum": sensor_ids},
+            "velocity": {"type": "integer", "enum": velocities},
+        },
+        "required": ["sensor_id", "velocity"],
+        "additionalProperties": False,
+    }
+    return {"type": "json_schema", "json_schema": {"name": "decision", "strict": True, "schema": schema}}
+
+
+def _alternatives(texts: Sequence[str]) -> str:
+    return " | ".join(f'"{text}"' for text in texts)

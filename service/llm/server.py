@@ -1,4 +1,4 @@
-"""The LLM that this edge asks: which one, whether it is ready, and how it can be held to the answer's form."""
+"""One LLM server: its life cycle, its health, and the calls that the edge makes to it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
-from service.llm.answer_format import Constraint, NoDecision
-from service.llm.circuit_breaker import CircuitBreaker
-from service.llm.completion import Completion, NotUnderstood, Unreachable
+from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
+from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.llm.model_file import ModelMissing, embedded_model
 from service.llm.probing import probe, probe_body
 from service.llm.request_bodies import (
+    SEVERAL_LABELS_TEMPERATURE,
+    Constraint,
     Rewriting,
     WarmUp,
     chat_body,
-    draw_temperature,
     label_body,
     rewriting_body,
     warm_up_body,
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _RETRY_S = 5.0
-# Said to a call that is hung up because another server, asked before, has answered: that is no fault of this one.
-LOST = "another answered"
+# Message to a call that is cancelled because an earlier call was answered: that is no failure of this server.
+EARLIER_CALL_ANSWERED = "another answered"
 _PROBE_TIMEOUT_S = 60.0
-# What is no decision gives way to one so often, and waits so long for so much silence between them: each spoils the
-# other's prefix cache. In a mission decisions come seconds apart.
+# A rewriting gives way to decisions so often, and waits so long at most for so much time without any: each spoils the
+# other's prefix cache. In a mission, decisions come seconds apart.
 _STEPS_BACK = 3
 _SILENCE_S = 0.5
 _PATIENCE_S = 10.0
@@ -49,52 +49,64 @@ _PATIENCE_S = 10.0
 class _Status:
     llm: Literal["loading", "ready", "unavailable", "off"]
     detail: str | None = None
-    # Whether the circuit breaker is open.
     breaker_open: bool = False
 
 
 class LlmServer:
-    """Brings the LLM up in the background and keeps trying while a remote one is down.
+    """Starts an LLM in the background, calls it, and tries again while it is unavailable.
 
-    ``/healthz`` and decisions by the policy go on meanwhile. States: ``loading``, ``ready``, ``unavailable``
-    (with the reason in ``detail``), and ``off`` where the service was told to do without. A server that fails again and
-    again is ``unavailable`` too, until a probe finds it well: see :mod:`service.llm.circuit_breaker`; ``on_open`` hears
-    of it.
+    ``/healthz`` and decisions by the policy go on meanwhile. The states are ``loading``, ``ready``, ``unavailable``
+    with the reason in ``detail``, and ``off`` in a mode without LLM. A server that fails again and again is
+    ``unavailable`` too, until a probe is answered: see :mod:`service.llm.circuit_breaker`.
+
+    Args:
+        warm_up: the first request to a server.
+        on_open: called when the circuit breaker opens.
+
+    Attributes:
+        model: name of the model, once it is known.
+        constraint: the kind of constraint that the server obeys.
+        logprobs: whether the server gives the probabilities of tokens.
+        max_uavs_per_call: number of UAVs that one call may decide for.
     """
 
     def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
         self._settings = settings
         self._warm_up = warm_up
         self._on_open = on_open
-        self._breaker = CircuitBreaker()
-        self._answered_at = self._counted_at = -math.inf
-        self._waited_s = 0.0
         self._status = _Status("off" if settings.mode in ("value", "policy") else "loading")
         self._client: LLMClient | None = None
         self._embedded: EmbeddedServer | None = None
+        # Brings the server up, or waits for its recovery.
         self._task: asyncio.Task[None] | None = None
         self.model = settings.llm_model
         self.constraint: Constraint = "none"
-        # Whether the server tells the probabilities of tokens.
         self.logprobs = False
-        # UAVs that it may be asked about at once.
-        self.most_together = 1
-        self._deciding = 0
+        self.max_uavs_per_call = 1
+        self._breaker = CircuitBreaker()
+        self._silence = SilenceCounter(settings.deadline_ms / 2e3)
+        # Decisions under way, the end of the last one, and the rewriting that gives way to the next one.
+        self._decisions = 0
         self._decided_at = -math.inf
-        self._beside: asyncio.Task[Completion] | None = None
+        self._rewriting: asyncio.Task[Completion] | None = None
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
-        """Where the LLM stands."""
+        """The state of the LLM."""
         return self._status.llm
 
     @property
     def breaker_open(self) -> bool:
-        """Whether its circuit breaker is open."""
+        """Whether the circuit breaker is open."""
         return self._status.breaker_open
 
+    @property
+    def recovering(self) -> bool:
+        """Whether an LLM that is not ready may become ready by itself."""
+        return self._task is not None and not self._task.done()
+
     def readiness(self) -> Readiness:
-        """What ``/readyz`` says."""
+        """The answer of ``/readyz``."""
         ready = self.status == "ready"
         return Readiness(
             ready=True,
@@ -106,17 +118,12 @@ class LlmServer:
         )
 
     def start(self) -> None:
-        """Begin loading or probing, unless the LLM is off."""
+        """Begin to load or reach the LLM, unless it is off."""
         if self.status != "off":
             self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up", context=Context())
 
-    @property
-    def recovering(self) -> bool:
-        """Whether an LLM that is not ready may yet be, without anybody's doing."""
-        return self._task is not None and not self._task.done()
-
     async def close(self) -> None:
-        """Stop trying, close connections, free the embedded model."""
+        """Stop trying, close the connections, and free the embedded model."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -126,106 +133,84 @@ class LlmServer:
             await asyncio.to_thread(self._embedded.close)
 
     async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
-        """One decision's completion; the caller sets the time limit.
+        """Call for one decision's sensor and velocity; the caller sets the time limit.
 
         Raises:
             NoDecision: no answer, with the reason.
         """
-        return await self._decide(chat_body(self.model, system, user, self.constraint, sensor_ids, velocities))
+        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
+        return await self._decide(body, self._silence)
 
     async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
-        """A token a list that should be a label, with the likeliest tokens' probabilities where the server tells them.
+        """Call for one label of each list, with the likeliest tokens' probabilities where the server gives them.
 
         Raises:
             NoDecision: no answer, with the reason.
         """
         body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
-        # Silence to a question about several UAVs says nothing of how questions about one fare.
-        answer = await self._decide(body, patient=len(lists) > 1)
-        if self.constraint != "grammar" or (temperature := draw_temperature(lists)) == 1.0:
+        # The silence of a call for several UAVs says nothing about calls for one.
+        answer = await self._decide(body, self._silence if len(lists) == 1 else None)
+        if self.constraint != "grammar" or len(lists) == 1:
             return answer
-        return replace(answer, places=tuple(place.untempered(temperature) for place in answer.places))
+        positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
+        return replace(answer, positions=positions)
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
-        """A text rewritten as told, in a form that the server is held to where it can be.
+        """Call for a rewritten text.
 
-        The embedded model has one slot: a decision that asks it meanwhile goes first, a few times.
+        The embedded model has one slot: a few times, the call is given up for a decision and begins again.
 
         Raises:
-            ValueError: ``wanted.constrain`` finds nothing to ask about.
+            ValueError: ``wanted.constrain`` finds nothing to rewrite.
             NoDecision: no answer, with the reason.
         """
-        held = wanted.constrain(self.constraint)
-        body = rewriting_body(self.model, wanted.instruction, wanted.examples, wanted.text, held, temperature, seed)
+        body = rewriting_body(self.model, wanted, wanted.constrain(self.constraint), temperature, seed)
         for _ in range(_STEPS_BACK if self._embedded is not None else 0):
-            await self._silence()
-            self._beside = asyncio.create_task(self._ask(body), name="ask-beside")
+            await self._await_silence()
+            self._rewriting = asyncio.create_task(self._ask(body), name="llm-rewriting")
             try:
-                await asyncio.wait({self._beside})
+                await asyncio.wait({self._rewriting})
             finally:
-                self._beside.cancel()
-            if not self._beside.cancelled():
-                return self._beside.result().text
+                self._rewriting.cancel()
+            if not self._rewriting.cancelled():
+                return self._rewriting.result().text
         return (await self._ask(body)).text
 
-    async def _decide(self, body: dict[str, Any], *, patient: bool = False) -> Completion:
-        """Ask for a decision: what is asked beside is given up for it. To be ``patient`` is not to count silence."""
-        self._deciding += 1
-        if self._beside is not None:
-            self._beside.cancel()
+    async def _await_silence(self) -> None:
+        """Wait until no decision has been asked for a while, but not longer than ``_PATIENCE_S``."""
+        begun = time.monotonic()
+        while (now := time.monotonic()) < begun + _PATIENCE_S:
+            if not self._decisions and now - max(begun, self._decided_at) >= _SILENCE_S:
+                return
+            await asyncio.sleep(min(0.1, _SILENCE_S))
+
+    async def _decide(self, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
+        """Call for a decision, and count its result; ``silence`` counts the wait of a cancelled call."""
+        self._decisions += 1
+        if self._rewriting is not None:
+            self._rewriting.cancel()
         begun = time.monotonic()
         try:
             answer = await self._ask(body)
         except NotUnderstood:
-            # That says something of this request, and nothing of the server.
+            # The fault is the request's, not the server's.
             raise
         except NoDecision as error:
             self._failed(error.reason)
             raise
-        except asyncio.CancelledError as hung_up:
-            if not patient and LOST not in hung_up.args:
-                self._in_vain(begun)
+        except asyncio.CancelledError as cancelled:
+            if silence is None or EARLIER_CALL_ANSWERED in cancelled.args or silence.answered_since(begun):
+                raise
+            if silence.cancelled(begun, time.monotonic()):
+                self._failed("llm_timeout")
             raise
         else:
             self._breaker.answered()
-            self._answered_at, self._waited_s = time.monotonic(), 0.0
+            self._silence.answered(time.monotonic())
             return answer
         finally:
-            self._deciding -= 1
+            self._decisions -= 1
             self._decided_at = time.monotonic()
-
-    def _in_vain(self, begun: float) -> None:
-        """Count silence: half of a deadline of it, with no answer between, is one failure.
-
-        Who has hardly waited, by a short deadline or in a fleet that shares one, counts for as long as he waited.
-        Several who waited side by side count once; who waited while another was answered stood in a queue.
-        """
-        if self._answered_at > begun:
-            return
-        now = time.monotonic()
-        self._waited_s += now - max(begun, self._counted_at)
-        self._counted_at = now
-        if self._waited_s >= self._settings.deadline_ms / 2e3:
-            self._waited_s = 0.0
-            self._failed("llm_timeout")
-
-    def _failed(self, reason: Reason) -> None:
-        if self.status != "ready" or not self._breaker.failed():
-            return
-        pause_s = self._breaker.pause_s
-        detail = f"failed too often, the last time by {reason}: left alone {pause_s:g} s"
-        self._status = _Status("unavailable", detail, breaker_open=True)
-        log.warning("LLM %s", self._status.detail)
-        self._on_open()
-        self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())
-
-    async def _silence(self) -> None:
-        """Wait until no decision has been asked for a while, but not for ever."""
-        begun = time.monotonic()
-        while (now := time.monotonic()) < begun + _PATIENCE_S:
-            if not self._deciding and now - max(begun, self._decided_at) >= _SILENCE_S:
-                return
-            await asyncio.sleep(min(0.1, _SILENCE_S))
 
     async def _ask(self, body: dict[str, Any]) -> Completion:
         if self._client is None or self.status != "ready":
@@ -238,8 +223,18 @@ class LlmServer:
                 self.start()
             raise
 
+    def _failed(self, reason: Reason) -> None:
+        if self.status != "ready" or not self._breaker.failed():
+            return
+        pause_s = self._breaker.pause_s
+        detail = f"failed too often, the last time by {reason}: no calls for {pause_s:g} s"
+        self._status = _Status("unavailable", detail, breaker_open=True)
+        log.warning("LLM %s", self._status.detail)
+        self._on_open()
+        self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())
+
     async def _recover(self) -> None:
-        """After the breaker opened: pause, ask one short question, and so on until it is answered."""
+        """After the breaker has opened: pause and probe, until a probe is answered."""
         while self._client is not None:
             await asyncio.sleep(self._breaker.pause_s)
             try:
@@ -273,33 +268,34 @@ class LlmServer:
             await asyncio.sleep(_RETRY_S)
 
     async def _connect(self) -> LLMClient:
-        """Reach the server, learn what it obeys, and have it read the static block before a decision pays for it."""
-        settings, http = self._settings, await asyncio.to_thread(_http)
+        """Reach or load the LLM, probe its abilities, and send the warm-up."""
+        settings, http_client = self._settings, await asyncio.to_thread(_http_client)
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
-            self._client = http(settings.llm_url, api_key=key)
+            self._client = http_client(settings.llm_url, api_key=key)
         elif self._client is None:
             gguf = embedded_model(settings)
             self._embedded = await asyncio.to_thread(
                 EmbeddedServer, gguf, threads=settings.embedded_threads, context=settings.llm_context
             )
-            self._client = http(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
+            self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
             if self.model is None:
                 self.model = next(iter(await self._client.models()), None)
-            able = await probe(self._client, self.model)
-            self.constraint, self.logprobs, self.most_together = able.constraint, able.logprobs, able.most_together
+            found = await probe(self._client, self.model)
+            self.constraint, self.logprobs = found.constraint, found.logprobs
+            self.max_uavs_per_call = found.max_uavs_per_call
         try:
             async with asyncio.timeout(_PROBE_TIMEOUT_S):
                 await self._client.complete(warm_up_body(self.model, self._warm_up, self.constraint, self.logprobs))
         except (NoDecision, TimeoutError) as error:
-            log.info("the static block was not read beforehand: %s", error)
+            log.info("the LLM did not answer the warm-up: %s", error)
         return self._client
 
 
-def _http() -> type[LLMClient]:
-    """The client, whose aiohttp takes a fifth of a second to import: the edge decides before that."""
+def _http_client() -> type[LLMClient]:
+    """The client's class: importing aiohttp takes a fifth of a second, in which the edge decides already."""
     from service.llm.client import LLMClient
 
     return LLMClient

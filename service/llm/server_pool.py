@@ -1,7 +1,7 @@
-"""Several LLM servers in order of preference: the first that is well is asked, and the next one where that fails.
+"""Several LLM servers in order of preference: the first that is ready is called, and the next one where that fails.
 
-Each has its own health and circuit breaker. Optionally a second one is asked beside the first that keeps a UAV waiting
-(a hedged request: Dean and Barroso 2013, "The Tail at Scale"); whoever answers first counts, and the other is hung up.
+Each server has its own health and circuit breaker. Optionally a second server is called beside a slow first one (a
+hedged request: Dean and Barroso 2013, "The Tail at Scale"). The first answer counts, and the other call is cancelled.
 """
 
 from __future__ import annotations
@@ -13,17 +13,22 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from service.config.settings import Settings
-from service.llm.answer_format import NoDecision
-from service.llm.completion import Completion
+from service.llm.answers import Completion, NoDecision
 from service.llm.request_bodies import Rewriting, WarmUp
-from service.llm.server import LOST, LlmServer
+from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
 from shared.wire import Readiness
 
-Ask = Callable[[LlmServer], Coroutine[Any, Any, Completion]]
+Answer = Coroutine[Any, Any, Completion]
+Call = Callable[[LlmServer], Answer]
 
 
 class ServerPool:
-    """The LLM servers of one edge, as one; ``on_open`` hears when one's circuit breaker opens."""
+    """The LLM servers of one edge, used as one server.
+
+    Args:
+        warm_up: the first request to each server.
+        on_open: called when a server's circuit breaker opens.
+    """
 
     def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
         self._each = [LlmServer(one, warm_up, on_open) for one in settings.each_server()]
@@ -31,95 +36,98 @@ class ServerPool:
 
     @property
     def active(self) -> LlmServer:
-        """The one that is asked now: the first that is ready, or the first of all."""
+        """The server that is called now: the first that is ready, or the first of all."""
         return next((server for server in self._each if server.status == "ready"), self._each[0])
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
-        """Where the active one stands."""
+        """The state of the active server."""
         return self.active.status
 
     @property
     def model(self) -> str | None:
-        """The active one's."""
+        """The active server's model."""
         return self.active.model
 
     @property
     def logprobs(self) -> bool:
-        """Whether the active one tells the probabilities of tokens."""
+        """Whether the active server gives the probabilities of tokens."""
         return self.active.logprobs
 
     @property
-    def most_together(self) -> int:
-        """UAVs that the active one may be asked about at once."""
-        return self.active.most_together
+    def max_uavs_per_call(self) -> int:
+        """Number of UAVs that one call of the active server may decide for."""
+        return self.active.max_uavs_per_call
 
-    @most_together.setter
-    def most_together(self, most: int) -> None:
-        self.active.most_together = most
+    @max_uavs_per_call.setter
+    def max_uavs_per_call(self, number: int) -> None:
+        self.active.max_uavs_per_call = number
 
     @property
     def recovering(self) -> bool:
-        """Whether one that is not ready may yet be, without anybody's doing."""
+        """Whether a server that is not ready may become ready by itself."""
         return any(server.recovering for server in self._each)
 
     @property
     def statuses(self) -> Counter[str]:
-        """How many servers stand where."""
+        """Number of servers by state."""
         return Counter(server.status for server in self._each)
 
     @property
     def breakers_open(self) -> int:
-        """How many servers' circuit breakers are open."""
+        """Number of open circuit breakers."""
         return sum(server.breaker_open for server in self._each)
 
     def readiness(self) -> Readiness:
-        """What ``/readyz`` says: of the active one, and how many more are well."""
+        """The answer of ``/readyz``: the active server's, and the number of other ready servers."""
         active = self.active
-        well = sum(server.status == "ready" for server in self._each if server is not active)
-        return active.readiness().model_copy(update={"standing_by": well})
+        others = sum(server.status == "ready" for server in self._each if server is not active)
+        return active.readiness().model_copy(update={"standing_by": others})
 
     def start(self) -> None:
-        """Begin loading or probing all of them, unless the LLM is off."""
+        """Begin to load or reach all servers, unless the LLM is off."""
         for server in self._each:
             server.start()
 
     async def close(self) -> None:
-        """Stop trying, close connections, free the embedded model."""
+        """Stop trying, close the connections, and free the embedded model."""
         await asyncio.gather(*(server.close() for server in self._each))
 
-    async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
-        """As :meth:`LlmServer.ask`."""
-        return await self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
+    # Plain functions that return a coroutine: a call resumes no coroutine that only passes its result on.
 
-    async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
+    def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Answer:
+        """As :meth:`LlmServer.ask`."""
+        return self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
+
+    def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Answer:
         """As :meth:`LlmServer.ask_labels`."""
-        return await self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
+        return self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
-        """As :meth:`LlmServer.rewrite`, of the active one."""
+        """As :meth:`LlmServer.rewrite`, by the active server."""
         return await self.active.rewrite(wanted, temperature=temperature, seed=seed)
 
-    async def _first(self, ask: Ask, uavs: int = 1) -> Completion:
-        """The first answer of those that are well, asked one after another; the first failure where there is none."""
-        well = [server for server in self._each if server.status == "ready" and server.most_together >= uavs]
-        waiting = deque(well or self._each[:1])
+    async def _first(self, call: Call, uavs: int = 1) -> Completion:
+        """The first answer of the ready servers, called one after another; without an answer the first failure."""
+        ready = [server for server in self._each if server.status == "ready" and server.max_uavs_per_call >= uavs]
+        waiting = deque(ready or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
-            # Behind one address there may be several machines.
+            # A hedge to the same address: there may be several machines behind it.
             waiting.append(waiting[0])
         if len(waiting) == 1:
-            return replace(await ask(waiting[0]), model=waiting[0].model)
+            return replace(await call(waiting[0]), model=waiting[0].model)
         running: dict[asyncio.Task[Completion], LlmServer] = {}
         failure: NoDecision | None = None
+        # Once a call is answered: the calls that began after it. Their silence is no failure of their servers.
         later: list[asyncio.Task[Completion]] = []
         try:
             while waiting or running:
                 if not running:
-                    self._begin(ask, waiting, running)
+                    self._begin(call, waiting, running)
                 hedge = self._hedge_s if waiting and len(running) == 1 else None
                 done, _ = await asyncio.wait(running, timeout=hedge, return_when=asyncio.FIRST_COMPLETED)
                 if not done:
-                    self._begin(ask, waiting, running)
+                    self._begin(call, waiting, running)
                 for task in done:
                     later = list(running)[list(running).index(task) + 1 :]
                     server = running.pop(task)
@@ -130,11 +138,11 @@ class ServerPool:
                         waiting = deque(other for other in waiting if other is not server)
         finally:
             for task in running:
-                task.cancel(LOST if task in later else None)
+                task.cancel(EARLIER_CALL_ANSWERED if task in later else None)
             await asyncio.gather(*running, return_exceptions=True)
         raise failure or NoDecision("llm_unavailable", "there is no server")
 
     @staticmethod
-    def _begin(ask: Ask, waiting: deque[LlmServer], running: dict[asyncio.Task[Completion], LlmServer]) -> None:
+    def _begin(call: Call, waiting: deque[LlmServer], running: dict[asyncio.Task[Completion], LlmServer]) -> None:
         server = waiting.popleft()
-        running[asyncio.create_task(ask(server), name="ask-llm")] = server
+        running[asyncio.create_task(call(server), name="ask-llm")] = server

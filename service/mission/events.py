@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.learning.sample import Sample
+from service.learning.modules import Sample
 from service.learning.trust import Advice
 from service.mission.idempotency import Answered
 from service.prompting.row_formats import Cells

@@ -15,8 +15,7 @@ from service.errors import Conflict, NotFound, Refused
 from service.guidance.operator_guidance import OperatorGuidance
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
-from service.learning.parameters import Weights
-from service.learning.sample import Sample
+from service.learning.modules import Sample, Weights
 from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.mission.applied_outcomes import AppliedOutcomes
 from service.mission.delta_reports import AnyReport, DeltaBases

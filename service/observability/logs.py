@@ -1,4 +1,4 @@
-"""Logs, as text for people or as JSON for machines: what is bound to a request stands in each of its lines."""
+"""Logs, as text for people or as JSON for machines; each line of a request has the fields bound to that request."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ from shared.wire import DecideResponse
 log = logging.getLogger(__name__)
 
 _MOST_WAITING = 10_000
-_LAST_WORDS_S = 1.0
+# The longest wait for the last lines of a process.
+_LAST_LINES_S = 1.0
 
 
-class _Patient(logging.handlers.QueueHandler):
-    """Writes to stderr from a thread of its own: where nobody reads it, or its disk is slow, no decision waits for it.
+class _ThreadedHandler(logging.handlers.QueueHandler):
+    """Writes to stderr from a thread, so that no decision waits for a slow disk or a reader that has stopped.
 
-    What does not fit into the queue is dropped, and how much that was is told when there is room again.
+    Lines that do not fit into the queue are dropped; their number is logged when there is room again.
     """
 
     queue: queue.Queue[str | None]
 
     def start(self) -> None:
-        """Begin to write, until the process ends; then what is waiting gets a moment."""
+        """Start the thread, which writes until the process ends, and the queued lines for a moment longer."""
         self._dropped = 0
         self._ends = 0.0
         self._writer = threading.Thread(target=self._write, name="logs", daemon=True)
@@ -40,13 +41,13 @@ class _Patient(logging.handlers.QueueHandler):
         atexit.register(self._end)
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Never waits, but for the last lines: see :meth:`hurry`."""
+        """Queue a line without waiting, except after :meth:`hurry`."""
         try:
             self.queue.put_nowait(record.getMessage())
             if self._dropped:
-                said = "%d lines of the log were dropped: nobody took them"
-                about = logging.LogRecord(__name__, logging.WARNING, __file__, 0, said, (self._dropped,), None)
-                self.queue.put_nowait(self.format(about))
+                message = "%d lines of the log were dropped: stderr is too slow"
+                dropped = logging.LogRecord(__name__, logging.WARNING, __file__, 0, message, (self._dropped,), None)
+                self.queue.put_nowait(self.format(dropped))
                 self._dropped = 0
         except queue.Full:
             self._dropped += 1
@@ -54,12 +55,12 @@ class _Patient(logging.handlers.QueueHandler):
             time.sleep(0.002)
 
     def hurry(self) -> None:
-        """The process may end any moment: from now on lines are waited for, a second in all."""
-        self._ends = time.monotonic() + _LAST_WORDS_S
+        """The process may end at any moment: from now on a line waits until it is written, a second in all."""
+        self._ends = time.monotonic() + _LAST_LINES_S
 
     def _write(self) -> None:
         while (line := self.queue.get()) is not None:
-            # A full disk, say; it may have room again.
+            # A full disk, for example, may have room again later.
             with suppress(OSError, ValueError):
                 print(line, file=sys.stderr, flush=True)
             self.queue.task_done()
@@ -67,11 +68,11 @@ class _Patient(logging.handlers.QueueHandler):
     def _end(self) -> None:
         with suppress(queue.Full):
             self.queue.put_nowait(None)
-        self._writer.join(timeout=_LAST_WORDS_S)
+        self._writer.join(timeout=_LAST_LINES_S)
 
 
 def configure(level: str, form: Literal["text", "json"]) -> None:
-    """Send every log of this process to stderr in this form; ``logging``'s ``extra`` and bound names become fields."""
+    """Send every log of this process to stderr; the ``extra`` of ``logging`` and bound names become fields."""
     shared: list[Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.stdlib.add_log_level,
@@ -79,41 +80,38 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
         structlog.stdlib.ExtraAdder(),
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
-    ending: list[Processor] = (
+    renderers: list[Processor] = (
         [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
         if form == "json"
-        # The other formatters print local variables, keys among them.
+        # The other exception formatters print local variables, API keys among them.
         else [
             structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)
         ]
     )
-    handler = _Patient(queue.Queue(_MOST_WAITING))
-    handler.setFormatter(
-        structlog.stdlib.ProcessorFormatter(
-            foreign_pre_chain=shared, processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, *ending]
-        )
-    )
+    handler = _ThreadedHandler(queue.Queue(_MOST_WAITING))
+    processors: list[Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta, *renderers]
+    handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=processors))
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     handler.start()
-    # httpx logs every request at level info, address included.
+    # At level info httpx logs every request with its address.
     logging.getLogger("httpx").setLevel(logging.WARNING)
 
 
 def hurry() -> None:
-    """The process may end any moment, by a signal that leaves no time: lines are waited for from now on."""
+    """The process may end at any moment, by a signal: from now on a line waits until it is written."""
     for handler in logging.getLogger().handlers:
-        if isinstance(handler, _Patient):
+        if isinstance(handler, _ThreadedHandler):
             handler.hurry()
 
 
 def bind(mission_id: str, step: int) -> None:
-    """Name these in every line of the request at hand."""
+    """Add these fields to every line of this request."""
     structlog.contextvars.clear_contextvars()
     structlog.contextvars.bind_contextvars(mission_id=mission_id, step=step)
 
 
 def decided(answer: DecideResponse) -> None:
-    """One line a decision; at level warning where it was late."""
+    """Log an answered decision; at level warning where it was late."""
     late = answer.latency_ms["total"] > answer.deadline_ms
     log.log(
         logging.WARNING if late else logging.INFO,

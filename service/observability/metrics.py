@@ -1,4 +1,4 @@
-"""Every Prometheus name of the edge, in one place. No label carries a mission, UAV or sensor: cardinality."""
+"""Every Prometheus metric of the edge. No label names a mission, UAV or sensor: there are too many of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STATUSES = ("loading", "ready", "unavailable", "off")
 
 
 class Metrics:
-    """The metrics of one service, in a registry of their own."""
+    """The metrics of one edge, in their own registry."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -32,27 +32,32 @@ class Metrics:
             "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], registry=r, buckets=_DECISION_BUCKETS
         )
         self.overhead_seconds = Histogram(
-            "aicvds_overhead_seconds", "The edge's own share: all but the LLM", registry=r, buckets=_OVERHEAD_BUCKETS
+            "aicvds_overhead_seconds",
+            "The edge's own time: all stages but the LLM",
+            registry=r,
+            buckets=_OVERHEAD_BUCKETS,
         )
         self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
         self.llm_breaker_opened = Counter(
-            "aicvds_llm_breaker_opened", "Times the LLM was left alone for failing again and again", registry=r
+            "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened", registry=r
         )
         self.llm_breaker_open = Gauge(
-            "aicvds_llm_breaker_open", "LLM servers that are left alone now, for failing again and again", registry=r
+            "aicvds_llm_breaker_open", "LLM servers whose circuit breaker is open now", registry=r
         )
-        self.llm_servers = Gauge("aicvds_llm_servers", "LLM servers by where they stand", ["status"], registry=r)
+        self.llm_servers = Gauge("aicvds_llm_servers", "LLM servers by state", ["status"], registry=r)
         self.llm_tokens = Counter("aicvds_llm_tokens", "Tokens that the LLM server reported", ["kind"], registry=r)
         self.llm_trust = Histogram(
             "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
         )
         self.critic_timeouts = Counter(
-            "aicvds_critic_timeouts", "Decisions of mode guided that could not wait for the critic", registry=r
+            "aicvds_critic_timeouts",
+            "Decisions of mode guided that could not wait for the rollout evaluator",
+            registry=r,
         )
-        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens spared by attention and masks", registry=r)
+        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens saved by attention and masks", registry=r)
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
         self.costs_clipped = Counter(
-            "aicvds_costs_clipped", "Outcomes whose cost was more than a step can cost", registry=r
+            "aicvds_costs_clipped", "Outcomes whose cost exceeded the most that a step can cost", registry=r
         )
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
         self.learner_update_loss = Summary(
@@ -60,27 +65,27 @@ class Metrics:
         )
         self.overflow_risk = Histogram(
             "aicvds_overflow_risk",
-            "At each decision: share of the sensors that are expected to overflow before their next visit",
+            "At each decision, the share of sensors that are expected to overflow before their next visit",
             registry=r,
             buckets=_SHARE_BUCKETS,
         )
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
-        self.missions = Gauge("aicvds_missions", "Missions held, in memory or in the store", registry=r)
+        self.missions = Gauge("aicvds_missions", "Missions in memory or in the store", registry=r)
         self.store_seconds = Histogram(
             "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
         )
         self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
-        # To find a child by its labels takes as long as to count it; there are few.
+        # Looking up a child by its labels takes as long as counting; there are few children.
         self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
         self._tokens = cache(self.llm_tokens.labels)
 
     def record_llm(self, statuses: Mapping[str, int], breakers_open: int) -> None:
-        """Where the LLM servers stand now.
+        """Set the states of the LLM servers.
 
         Args:
-            statuses: how many stand where.
-            breakers_open: how many circuit breakers are open.
+            statuses: number of servers by state.
+            breakers_open: number of open circuit breakers.
         """
         for status in _STATUSES:
             self.llm_servers.labels(status).set(statuses.get(status, 0))

@@ -1,4 +1,4 @@
-"""How long the stages of a decision take."""
+"""The times of a decision's stages."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class Stopwatch:
-    """Milliseconds by stage since the request came in."""
+    """Milliseconds by stage since the request arrived."""
 
     started: float = field(default_factory=time.perf_counter)
     stages: dict[str, float] = field(default_factory=dict)
     _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, stage: str) -> None:
-        """End a stage, or one more part of it."""
+        """End a stage, or a further part of it."""
         now = time.perf_counter()
         self.stages[stage] = round(self.stages.get(stage, 0.0) + (now - self._last) * 1e3, 3)
         self._last = now

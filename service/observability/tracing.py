@@ -1,8 +1,8 @@
-"""OpenTelemetry traces (extra ``otel``): one span a decision, in it one a stage, the LLM's as a client span.
+"""OpenTelemetry traces (extra ``otel``): a span for each decision, with a span for each stage.
 
-Set the standard ``OTEL_EXPORTER_OTLP_ENDPOINT``, and spans go there; without it, or without the extra, there are none.
-A ``traceparent`` that the request carries is the decision's parent. The LLM's span follows the semantic conventions for
-generative AI. Prompts and answers are not in it.
+Spans go to the standard ``OTEL_EXPORTER_OTLP_ENDPOINT``; without it, or without the extra, there are none. A request's
+``traceparent`` is the decision's parent. The LLM's stage is a client span, which follows the semantic conventions for
+generative AI. It has neither prompt nor answer.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
-# Why an LLM's span is an error; the other reasons say that nobody asked it, or that it is no failure.
+# Reasons that make the LLM's span an error. The other reasons are no failure, or mean that the LLM was not called.
 _FAILURES = ("llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity")
 
 
 def provider_from_environment(version: str) -> TracerProvider | None:
-    """A provider that exports over OTLP, where the environment names an endpoint; None without one or the extra."""
+    """A provider that exports over OTLP; None without an endpoint in the environment, or without the extra."""
     if not any(os.environ.get(name) for name in _ENDPOINTS):
         return None
     try:
@@ -45,18 +45,18 @@ def provider_from_environment(version: str) -> TracerProvider | None:
 
 
 class Traces:
-    """Records decisions; without a provider, nothing."""
+    """Records decisions, if there is a provider."""
 
     def __init__(self, provider: TracerProvider | None, settings: Settings) -> None:
         self.provider = provider
         self._tracer = None if provider is None else provider.get_tracer("aic_vds.edge")
-        self._server = _where(settings.llm_url)
+        self._server = _address(settings.llm_url)
         self._vendor = "openai" if settings.llm_url else "llama.cpp"
 
     def decided(self, answer: DecideResponse) -> None:
-        """The spans of a decision just answered, from its stages' times, which follow each other.
+        """Record the spans of a decision that has just been answered, from the times of its consecutive stages.
 
-        Those of a batch all end now, as their answers do.
+        The decisions of a batch are answered together, so their spans all end now.
         """
         if self._tracer is None:
             return
@@ -65,14 +65,15 @@ class Traces:
 
         ended = time.time_ns()
         begun = ended - _ns(answer.latency_ms["total"])
-        whole = self._tracer.start_span("decide", kind=SpanKind.SERVER, start_time=begun, attributes=_about(answer))
+        attributes = _attributes(answer)
+        whole = self._tracer.start_span("decide", kind=SpanKind.SERVER, start_time=begun, attributes=attributes)
         inside = trace.set_span_in_context(whole)
         for stage, milliseconds in answer.latency_ms.items():
             if stage == "total":
                 continue
             until = begun + _ns(milliseconds)
             if stage == "llm":
-                attributes = self._of_llm(answer)
+                attributes = self._llm_attributes(answer)
                 name, kind = f"chat {answer.model or 'unknown'}", SpanKind.CLIENT
             else:
                 attributes, name, kind = {}, stage, SpanKind.INTERNAL
@@ -83,7 +84,7 @@ class Traces:
             begun = until
         whole.end(ended)
 
-    def _of_llm(self, answer: DecideResponse) -> dict[str, Any]:
+    def _llm_attributes(self, answer: DecideResponse) -> dict[str, Any]:
         attributes: dict[str, Any] = {
             "gen_ai.operation.name": "chat",
             "gen_ai.provider.name": self._vendor,
@@ -99,13 +100,13 @@ class Traces:
         return attributes
 
     def close(self) -> None:
-        """Send what is waiting."""
+        """Send the queued spans."""
         if self.provider is not None:
             self.provider.shutdown()
 
 
 class Traced:
-    """Pure ASGI middleware: the caller's trace is the parent of what is recorded while it is served."""
+    """Pure ASGI middleware: the client's trace is the parent of the spans of its request."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -117,27 +118,27 @@ class Traced:
         from opentelemetry import context
         from opentelemetry.propagate import extract
 
-        told = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
-        token = context.attach(extract(told))
+        headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+        token = context.attach(extract(headers))
         try:
             await self.app(scope, receive, send)
         finally:
             context.detach(token)
 
 
-def _where(url: str | None) -> dict[str, Any]:
-    """Where the only LLM server is; of several nobody knows which was asked."""
+def _address(url: str | None) -> dict[str, Any]:
+    """The address of a single LLM server; of several, the called one is not known."""
     if url is None or "," in url:
         return {}
-    # The settings have imported it where they name a server.
+    # Already imported: the settings check the URL with it.
     import httpx
 
     parsed = httpx.URL(url)
     return {"server.address": parsed.host, "server.port": parsed.port or (443 if parsed.scheme == "https" else 80)}
 
 
-def _about(answer: DecideResponse) -> dict[str, Any]:
-    told = {
+def _attributes(answer: DecideResponse) -> dict[str, Any]:
+    attributes = {
         "aicvds.decision_id": answer.decision_id,
         "aicvds.mission_id": answer.mission_id,
         "aicvds.uav_id": answer.uav_id,
@@ -146,7 +147,7 @@ def _about(answer: DecideResponse) -> dict[str, Any]:
         "aicvds.sensor_id": answer.sensor_id,
         "aicvds.velocity": answer.velocity,
     }
-    return told if answer.reason is None else {**told, "aicvds.reason": answer.reason}
+    return attributes if answer.reason is None else {**attributes, "aicvds.reason": answer.reason}
 
 
 def _ns(milliseconds: float) -> int:

@@ -13,8 +13,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from service.learning.attention import top_k
-from service.learning.parameters import Weights
+from service.learning.modules import Weights, top_k
 from service.prompting.row_formats import Cells, cells
 from shared.features import State, augment
 from shared.scenario import Scenario

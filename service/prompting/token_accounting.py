@@ -6,7 +6,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from service.config.settings import Settings
-from service.llm.completion import Completion
+from service.llm.answers import Completion
 from service.prompting.prompt import Prompt
 from service.prompting.tokenizer import ENCODING, encoding
 from shared.wire import Tokens

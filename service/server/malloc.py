@@ -1,23 +1,24 @@
-"""How the process's memory goes back to the system."""
+"""glibc's malloc: how soon freed memory returns to the system."""
 
 from __future__ import annotations
 
 import ctypes
 
-# glibc's names for what mallopt sets (malloc.h).
+# Names and numbers of mallopt's options (malloc.h).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 _BYTES = 128 * 1024
 
 
 def hand_back_memory() -> None:
-    """Have glibc's malloc keep little of what is freed; elsewhere nothing changes. Before the first thread starts.
+    """Make glibc's malloc return freed memory early; call it before the first thread starts. Elsewhere it does nothing.
 
-    It gives every thread an arena of its own, and raises the size from which memory goes back at once to that of the
-    largest block ever freed: the LLM's states, megabytes each. What threads freed then lay about in all arenas: after a
-    quarter of an hour with 200 missions 117 MB, and more each minute; with one arena and fixed sizes 12 MB.
+    By default malloc gives every thread an arena. It also raises the size from which a freed block returns at once to
+    that of the largest block ever freed: the LLM's states have megabytes each. So memory that threads freed stayed in
+    all the arenas: after a quarter of an hour with 200 missions 117 MB, and more each minute; with one arena and fixed
+    sizes 12 MB.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:
         return
-    for what, value in ((_ARENA_MAX, 1), (_MMAP_THRESHOLD, _BYTES), (_TRIM_THRESHOLD, _BYTES)):
-        mallopt(what, value)
+    for option, value in ((_ARENA_MAX, 1), (_MMAP_THRESHOLD, _BYTES), (_TRIM_THRESHOLD, _BYTES)):
+        mallopt(option, value)

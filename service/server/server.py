@@ -1,4 +1,4 @@
-"""The HTTP server: uvicorn's, which ends in order."""
+"""The HTTP server: uvicorn, with an orderly shutdown."""
 
 from __future__ import annotations
 
@@ -13,31 +13,28 @@ from service.observability import logs
 from service.server.connection_limits import BoundedHttpProtocol
 from service.server.startup_gate import StartupGate
 
-# The longest that a request takes from its connection's being accepted to its first bytes, when the service ends.
+# At shutdown, the longest time from an accepted connection to the first bytes of its request.
 _ARRIVING_S = 0.25
-# In-flight decisions are hurried to end within 4 s; past this, shutting down does not wait for them. With the last
-# checkpoints and the last commit it is less than the 10 s after which `docker stop` kills.
+# The longest that shutdown waits for decisions under way, which have to end within 4 s. With the last checkpoints and
+# the last commit that is less than the 10 s after which `docker stop` kills.
 _SHUTDOWN_S = 5
 
 
 class Server(uvicorn.Server):
-    """Serves the edge, from before it is loaded until everyone who connected before SIGTERM is answered.
+    """Serves the edge, also while it loads, until every client that connected before SIGTERM is answered.
 
     Args:
-        load: imports and makes the edge, in a thread.
-        log_level: uvicorn's; at ``debug`` requests are logged too.
-
-    Attributes:
-        error: why the edge could not be loaded, if so: the server ends then.
+        load: imports and makes the edge's application, in a thread.
+        log_level: of uvicorn; at ``debug`` requests are logged too.
     """
 
     def __init__(self, load: Callable[[], Starlette], log_level: str) -> None:
-        self._loading = StartupGate(load, self._end)
+        self._gate = StartupGate(load, self._end)
         config = uvicorn.Config(
-            self._loading,
+            self._gate,
             log_config=None,
             http=BoundedHttpProtocol,
-            # There are none; their library would take heads that nobody counts.
+            # The edge has no websockets; their library would read request heads without a limit.
             ws="none",
             log_level=log_level,
             timeout_graceful_shutdown=_SHUTDOWN_S,
@@ -47,24 +44,24 @@ class Server(uvicorn.Server):
 
     @property
     def error(self) -> Exception | None:
-        """As the class says."""
-        return self._loading.error
+        """Why the edge could not be loaded, if so; the server ends then."""
+        return self._gate.error
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Answer who has connected, hurrying whoever waits for the LLM; then keep what is to be kept."""
-        self._loading.give_up()
-        if self._loading.app is not None:
-            self._loading.app.state.engine.hurry()
-        await self._close_the_door(sockets or [])
+        """Answer the connected clients, with less time for the LLM; then end the application, which saves its state."""
+        self._gate.open()
+        if self._gate.app is not None:
+            self._gate.app.state.engine.hurry()
+        await self._stop_accepting(sockets or [])
         await super().shutdown(sockets)
-        # What uvicorn does after this is to say goodbye, and to raise the signal again.
+        # After this uvicorn only logs its end, and raises the signal again.
         logs.hurry()
 
     def _end(self) -> None:
         self.should_exit = True
 
-    async def _close_the_door(self, sockets: list[socket.socket]) -> None:
-        """Accept who has connected, then nobody else, and let their requests arrive: uvicorn would drop them."""
+    async def _stop_accepting(self, sockets: list[socket.socket]) -> None:
+        """Accept the clients that have connected, and wait for their requests: uvicorn would drop them."""
         for _ in range(3):
             await asyncio.sleep(0)
         for server in self.servers:

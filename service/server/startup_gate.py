@@ -1,4 +1,7 @@
-"""What the edge answers while it loads: that it lives. Imports nothing that takes long: torch is what it waits for."""
+"""The application while the edge loads: it answers ``GET /healthz``, and every other request waits.
+
+It imports nothing that takes long, torch above all.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from starlette.types import Receive, Scope, Send
 from service.server.security_headers import SecurityHeaders
 from shared.wire import Problem
 
-# As service.api.routes has it: the process lives, and nothing else is said.
+# The same answer as that of service.api.routes: the process lives.
 _ALIVE = SecurityHeaders(JSONResponse({"status": "ok"}))
 _PROBLEM = Problem(title="Service Unavailable", status=503, detail="the edge ends before it has started", errors=[])
 _REFUSED = SecurityHeaders(
@@ -23,15 +26,18 @@ _REFUSED = SecurityHeaders(
 
 
 class StartupGate:
-    """An ASGI application that becomes another one as soon as that is loaded.
+    """An ASGI application that passes requests on to the edge's application once that is loaded.
 
-    Until then ``GET /healthz`` is answered, and every other request waits. Where the other cannot be loaded, those get
-    a 503, ``error`` says why, and ``stop`` is called. Where the server is to end before, they get a 503 too. Garbage is
-    collected from then on, if it was not before.
+    Until then ``GET /healthz`` is answered, and every other request waits. If the edge cannot be loaded, or the server
+    ends before that, the requests that wait get a 503. Garbage collection is enabled after loading.
 
     Args:
-        load: imports and makes the other, in a thread.
-        stop: ends the server.
+        load: imports and makes the application, in a thread.
+        stop: ends the server; called if the application cannot be loaded.
+
+    Attributes:
+        app: the application, once it is loaded.
+        error: why it could not be loaded, if so.
     """
 
     def __init__(self, load: Callable[[], Starlette], stop: Callable[[], None]) -> None:
@@ -40,56 +46,57 @@ class StartupGate:
         self._load = load
         self._stop = stop
         self._state: Mapping[str, Any] = {}
-        self._settled = asyncio.Event()
-        self._ended = asyncio.Event()
+        self._opened = asyncio.Event()
+        self._ending = asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._live(receive, send)
             return
-        if not self._settled.is_set():
+        if not self._opened.is_set():
             if scope["type"] == "http" and (scope["method"], scope["path"]) == ("GET", "/healthz"):
                 await _ALIVE(scope, receive, send)
                 return
-            await self._settled.wait()
+            await self._opened.wait()
         if self.app is None:
             await _REFUSED(scope, receive, send)
             return
         await self.app({**scope, "state": dict(self._state)}, receive, send)
 
-    def give_up(self) -> None:
-        """Have nobody wait any longer: the server ends."""
-        self._settled.set()
+    def open(self) -> None:
+        """Let the requests wait no longer: the server ends."""
+        self._opened.set()
 
     async def _live(self, receive: Receive, send: Send) -> None:
-        """Started at once; ended when the other has ended, or at once where it is not loaded yet."""
+        """The lifespan: starts at once, and ends after the application, or at once where that is not loaded yet."""
         await receive()
         await send({"type": "lifespan.startup.complete"})
         running = asyncio.create_task(self._run(), name="application")
         await receive()
         if self.app is None:
             running.cancel()
-        self._ended.set()
+        self._ending.set()
         await asyncio.gather(running, return_exceptions=True)
         await send({"type": "lifespan.shutdown.complete"})
 
     async def _run(self) -> None:
-        """Load the other, and keep it running until the server ends."""
+        """Load the application, and run its lifespan until the server ends."""
         try:
             app = await asyncio.to_thread(self._load)
             async with app.router.lifespan_context(app) as state:
                 self.app, self._state = app, state or {}
-                # A million objects of torch and others stay as long as the process: no collection need look at them,
-                # which takes a tenth of a second in the midst of a decision.
+                # A million objects of torch and other libraries live as long as the process. Frozen, they cost no
+                # collection time, which is a tenth of a second in the midst of a decision.
                 gc.freeze()
                 gc.enable()
-                # Python collects again when what is new is a quarter of what it found last: that is little from now on.
+                # Python runs a full collection once the new objects are a quarter of those that the last one found:
+                # few from now on.
                 gc.collect()
-                self._settled.set()
-                await self._ended.wait()
+                self._opened.set()
+                await self._ending.wait()
         except Exception as error:
             self.error = error
-            self._settled.set()
+            self._opened.set()
             self._stop()
         finally:
             gc.enable()

@@ -1,8 +1,9 @@
-"""Group commit: what waits is written in one transaction, many changes to an fsync.
+"""Group commit: all changes that wait are written in one transaction, so that one fsync serves many of them.
 
-It is written when somebody waits for it, so that what a decision changes is one commit. What comes while that is
-written gathers for the next, so that under load a commit serves many answers. Where the store fails, nothing that waits
-is lost: it is tried again, and meanwhile decisions go on while what must be on disk is refused.
+A transaction begins as soon as a request waits for its changes; without one, a quarter of a second after the first
+change. Changes that arrive while a transaction runs form the next one, so that under load a commit serves many answers.
+A failed transaction loses nothing: its changes stay in the queue and are tried again after a pause. Meanwhile decisions
+go on, and a request whose changes must be durable is refused.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import asyncio
 import logging
 import time
 from collections import deque
+from enum import Enum
 from itertools import islice
 
 from service.observability.metrics import Metrics
@@ -20,165 +22,218 @@ from service.storage.writer import Writer
 
 log = logging.getLogger(__name__)
 
-# Changes to a commit, and bytes of checkpoints: networks of 10,000 sensors have megabytes each.
-_MOST_AT_ONCE, _MOST_BYTES = 1000, 16_000_000
+# Changes in a transaction, and bytes of checkpoints: networks of 10,000 sensors have megabytes each.
+_MOST_CHANGES, _MOST_BYTES = 1000, 16_000_000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
-# The longest that what nobody waits for stays unwritten.
+# The longest that a change waits for others if no request waits for it.
 _LINGER_S = 0.25
 
 
+class _State(Enum):
+    """What happens to the queue now, and what comes next."""
+
+    # The queue is empty. The next change begins LINGERING.
+    IDLE = "idle"
+    # A timer, or the first request that waits, begins a transaction.
+    LINGERING = "lingering"
+    # A transaction runs.
+    WRITING = "writing"
+    # The last transaction failed. A timer begins the next one.
+    PAUSING = "pausing"
+    # `close` was called while a transaction ran. One that fails is tried once more.
+    DRAINING = "draining"
+    # A transaction runs that began after `close` was called. If it fails, the queue is given up.
+    FINISHING = "finishing"
+    # No further transaction begins.
+    CLOSED = "closed"
+
+
 class GroupCommit:
-    """Has a writer write what is added, in order, and tells who waits when it is on disk; on the event loop."""
+    """A queue of changes in front of a writer; used on the event loop only.
+
+    Every change has a ticket, a number that grows. All changes up to the ticket ``_written`` are durable.
+    """
 
     def __init__(self, writer: Writer, metrics: Metrics) -> None:
         self._writer = writer
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
+        self._state = _State.IDLE
+        # A change leaves the queue once it is durable.
         self._queue: deque[tuple[int, Change]] = deque()
         self._added = self._written = 0
-        # What is being written, since when, and whether it is the last attempt.
+        # The changes of the transaction that runs, and its beginning.
         self._batch: list[tuple[int, Change]] = []
-        self._begun, self._last = 0.0, False
-        # When it is written without being waited for, or tried again.
-        self._later: asyncio.TimerHandle | None = None
+        self._begun = 0.0
+        # Ends LINGERING or PAUSING.
+        self._timer: asyncio.TimerHandle | None = None
         self._pause_s = _FIRST_PAUSE_S
-        self._failing = False
-        self._why = ""
-        self._waiting: list[tuple[int, asyncio.Future[bool]]] = []
-        self._over: asyncio.Future[None] | None = None
+        # Why the last transaction failed, if it did.
+        self._failure: str | None = None
+        # Requests that wait: the ticket that each needs, and whether it was reached.
+        self._requests: list[tuple[int, asyncio.Future[bool]]] = []
+        # Made by `close`; done once the state is CLOSED, cancelled where `close` ran out of time.
+        self._closed: asyncio.Future[None] | None = None
 
     @property
     def failing(self) -> bool:
-        """Whether the last attempt to write failed."""
-        return self._failing
+        """Whether the last transaction failed."""
+        return self._failure is not None
 
     def add(self, change: Change) -> None:
-        """To be written, in its turn."""
+        """Queue a change behind all others."""
         self._added += 1
         self._queue.append((self._added, change))
-        if self._later is None and not self._batch:
-            self._later = self._loop.call_later(_LINGER_S, self._write)
+        if self._state is _State.IDLE:
+            self._linger()
 
-    def supersede(self, taken: Checkpoint) -> None:
-        """Add a checkpoint in the place of the last of the events that it stands for, which leave the queue.
+    def supersede(self, checkpoint: Checkpoint) -> None:
+        """Queue a checkpoint in place of the mission's queued events that it covers, at the last one's position.
 
-        While the store fails events would gather without end. What comes after them is written no sooner than it.
+        While the store fails, the queue would otherwise grow without bound. Later changes are still written after it.
         """
-        covered = [ticket for ticket, change in self._queue if _covered(change, taken)]
+        covered = [ticket for ticket, change in self._queue if _covers(checkpoint, change)]
         if not covered:
-            self.add(taken)
+            self.add(checkpoint)
             return
-        kept = [(ticket, change) for ticket, change in self._queue if not _covered(change, taken)]
-        self._queue = deque(sorted([*kept, (covered[-1], taken)], key=lambda entry: entry[0]))
+        others = [(ticket, change) for ticket, change in self._queue if not _covers(checkpoint, change)]
+        self._queue = deque(sorted([*others, (covered[-1], checkpoint)], key=lambda entry: entry[0]))
 
     async def stored(self, within_s: float) -> bool:
-        """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
+        """Wait until every change so far is durable; False if that takes longer, or if the store fails."""
         if self._written >= self._added:
             return True
-        if self._failing:
+        if self._failure is not None:
             return False
-        written: asyncio.Future[bool] = self._loop.create_future()
-        mine = self._added, written
-        self._waiting.append(mine)
-        self._write()
+        reached: asyncio.Future[bool] = self._loop.create_future()
+        request = self._added, reached
+        self._requests.append(request)
+        if self._state is _State.LINGERING:
+            self._begin(_State.WRITING)
         try:
             async with asyncio.timeout(max(0.0, within_s)):
-                return await written
+                return await reached
         except TimeoutError:
             return False
         finally:
-            if mine in self._waiting:
-                self._waiting.remove(mine)
+            if request in self._requests:
+                self._requests.remove(request)
 
     async def close(self, ends: float) -> bool:
-        """Write what waits, once more; returns whether that has ended by then, the loop's time."""
-        over = self._over = self._loop.create_future()
-        if not self._batch:
-            self._go_on()
+        """Try once more to write the queue; returns whether that ended before ``ends``, a time of the event loop."""
+        closed = self._closed = self._loop.create_future()
+        match self._state:
+            case _State.WRITING:
+                self._state = _State.DRAINING
+            case _State.LINGERING | _State.PAUSING:
+                self._begin(_State.FINISHING)
+            case _State.IDLE | _State.CLOSED:
+                self._end()
         try:
             async with asyncio.timeout_at(ends):
-                await over
+                await closed
         except TimeoutError:
             return False
         self._writer.close()
         return True
 
-    def _write(self) -> None:
-        """Write what waits, unless some is being written: what is left follows when that has ended."""
-        over = self._over is not None and self._over.done()
-        if self._batch or not self._queue or over:
-            return
-        self._stop_waiting()
-        packed = 0
-        for entry in islice(self._queue, _MOST_AT_ONCE):
-            self._batch.append(entry)
-            packed += len(entry[1].state) if isinstance(entry[1], Checkpoint) else 0
-            if packed > _MOST_BYTES:
-                break
-        self._begun, self._last = time.perf_counter(), self._over is not None
-        try:
-            self._writer.write([change for _, change in self._batch], self._ended)
-        except Exception as error:
-            self._loop.call_soon(self._ended, error)
+    def _linger(self) -> None:
+        self._state = _State.LINGERING
+        self._timer = self._loop.call_later(_LINGER_S, self._begin, _State.WRITING)
 
-    def _ended(self, error: Exception | None) -> None:
+    def _begin(self, state: _State) -> None:
+        """Begin a transaction of the first changes of the queue."""
+        self._stop_timer()
+        self._state = state
+        checkpoint_bytes = 0
+        for entry in islice(self._queue, _MOST_CHANGES):
+            self._batch.append(entry)
+            checkpoint_bytes += len(entry[1].state) if isinstance(entry[1], Checkpoint) else 0
+            if checkpoint_bytes > _MOST_BYTES:
+                break
+        self._begun = time.perf_counter()
+        try:
+            self._writer.write([change for _, change in self._batch], self._written_or_failed)
+        except Exception as error:
+            self._loop.call_soon(self._written_or_failed, error)
+
+    def _written_or_failed(self, error: Exception | None) -> None:
+        """The transaction has ended: answer the requests that waited for it, and begin what comes next."""
         if error is None:
-            self._metrics.store_seconds.observe(time.perf_counter() - self._begun)
-            self._done()
+            self._succeed()
         else:
             self._fail(error)
         self._batch = []
-        for ticket, waiting in self._waiting:
-            if not waiting.done() and (ticket <= self._written or self._failing):
-                waiting.set_result(ticket <= self._written)
-        self._go_on()
+        for ticket, reached in self._requests:
+            if not reached.done() and (ticket <= self._written or self._failure is not None):
+                reached.set_result(ticket <= self._written)
+        if self._state is _State.WRITING:
+            self._go_on()
+        else:
+            self._go_on_closing()
 
     def _go_on(self) -> None:
-        """What comes after an attempt, or at the end."""
-        if self._over is not None and (not self._queue or (self._failing and self._last)):
-            if self._queue:
-                log.error(
-                    "the store failed to the end: %d changes are not on disk, no outcome among them was acknowledged",
-                    len(self._queue),
-                )
-            if not self._over.done():
-                self._over.set_result(None)
-        elif self._over is not None:
-            self._write()
-        elif self._failing:
-            self._later = self._loop.call_later(self._pause_s, self._write)
+        if self._failure is not None:
+            self._state = _State.PAUSING
+            self._timer = self._loop.call_later(self._pause_s, self._begin, _State.WRITING)
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
-        elif any(not waiting.done() for _, waiting in self._waiting):
-            self._write()
-        elif self._queue:
-            self._later = self._loop.call_later(_LINGER_S, self._write)
+        elif not self._queue:
+            self._state = _State.IDLE
+        elif any(not reached.done() for _, reached in self._requests):
+            self._begin(_State.WRITING)
+        else:
+            self._linger()
 
-    def _stop_waiting(self) -> None:
-        if self._later is not None:
-            self._later.cancel()
-            self._later = None
+    def _go_on_closing(self) -> None:
+        assert self._closed is not None
+        given_up = self._failure is not None and self._state is _State.FINISHING
+        if given_up and self._queue:
+            log.error(
+                "the last write to the store failed: %d changes are not on disk, no acknowledged outcome among them",
+                len(self._queue),
+            )
+        if given_up or not self._queue or self._closed.done():
+            self._end()
+        else:
+            self._begin(_State.FINISHING)
 
-    def _done(self) -> None:
+    def _end(self) -> None:
+        self._state = _State.CLOSED
+        self._stop_timer()
+        if self._closed is not None and not self._closed.done():
+            self._closed.set_result(None)
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _succeed(self) -> None:
+        """Take the durable changes from the queue."""
+        self._metrics.store_seconds.observe(time.perf_counter() - self._begun)
         last = self._batch[-1][0]
-        # A checkpoint may have come into their midst meanwhile.
-        done = {id(change) for _, change in self._batch}
-        while self._queue and id(self._queue[0][1]) in done:
+        # Meanwhile `supersede` may have put a checkpoint between them, which is not durable yet.
+        durable = {id(change) for _, change in self._batch}
+        while self._queue and id(self._queue[0][1]) in durable:
             self._queue.popleft()
         if self._queue and self._queue[0][0] <= last:
-            self._queue = deque(entry for entry in self._queue if id(entry[1]) not in done)
-        if self._failing:
+            self._queue = deque(entry for entry in self._queue if id(entry[1]) not in durable)
+        if self._failure is not None:
             log.warning("the store works again")
-        self._failing, self._pause_s = False, _FIRST_PAUSE_S
+        self._failure, self._pause_s = None, _FIRST_PAUSE_S
         self._written = max(self._written, last)
 
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()
-        why = cause(error)
-        # Once each: where the database is away a while, and then another edge's, both are told.
-        if not self._failing or why != self._why:
-            log.error("the store fails, what waits is tried again: %s", why)
-        self._failing, self._why = True, why
+        failure = cause(error)
+        # Each cause is logged once in a row: a database may be away first, and then locked by another edge.
+        if failure != self._failure:
+            log.error("the store fails, queued changes are tried again: %s", failure)
+        self._failure = failure
 
 
-def _covered(change: Change, by: Checkpoint) -> bool:
-    return isinstance(change, Entry | Checkpoint) and change.mission_id == by.mission_id and change.seq <= by.seq
+def _covers(checkpoint: Checkpoint, change: Change) -> bool:
+    """Whether a change is an event, or an older checkpoint, that the checkpoint makes unnecessary."""
+    if not isinstance(change, Entry | Checkpoint):
+        return False
+    return change.mission_id == checkpoint.mission_id and change.seq <= checkpoint.seq

@@ -1,13 +1,13 @@
-"""The journal: what changes missions is on disk before it is acknowledged.
+"""The journal: an event that changes a mission is durable before it is acknowledged.
 
-The events of each mission are numbered, and now and then a checkpoint of its whole state takes their place.
+The events of each mission are numbered. From time to time a checkpoint of the mission's whole state replaces them.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -23,52 +23,52 @@ from service.storage.store import Store
 
 log = logging.getLogger(__name__)
 
-# A mission is checkpointed after so many events, so that it is read back in a fraction of a second. A decision about
-# many sensors takes longer to play again: it counts for one more every hundred of them.
+# Events between two checkpoints of a mission: replaying so many takes a fraction of a second. A decision about many
+# sensors takes longer to replay, and counts for one more event every hundred sensors.
 _EVENTS = 256
 _SENSORS = 100
-# With so many sensors a checkpoint takes up to a second to pack.
+# From so many sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
 
 
 class MissionLog:
-    """A mission's place in the journal.
+    """A mission's position in the journal.
 
     Attributes:
-        seq: its newest event's.
-        since_checkpoint: what it would take to read it back, in events, since its last checkpoint.
-        deleted: it was deleted; what still happens to it is nobody's business, and another may have its ID.
+        seq: number of the newest event.
+        since_checkpoint: weight of the events since the last checkpoint, in events of a small network.
+        deleted: the mission was deleted. Its late events are dropped: a new mission may have its ID.
     """
 
-    def __init__(self, mission: Mission, seq: int, since: int) -> None:
+    def __init__(self, mission: Mission, seq: int, since_checkpoint: int) -> None:
         self.mission = mission
         self.seq = seq
-        self.since_checkpoint = since
+        self.since_checkpoint = since_checkpoint
         self.deleted = False
 
 
 class NullJournal:
-    """Keeps nothing: missions live as long as the process."""
+    """The journal of an edge without a store: missions live as long as the process."""
 
     failing = False
 
     def begin(self, mission: Mission) -> None:
-        """Nothing is kept."""
+        """Ignore a new mission."""
 
     def end(self, mission_id: str) -> None:
-        """Nothing was kept."""
+        """Ignore a deleted mission."""
 
     async def stored(self, within_s: float) -> bool:
-        """Nobody waits for what nobody keeps."""
+        """Return True: there is nothing to wait for."""
         return True
 
     async def close(self, within_s: float) -> bool:
-        """Nobody writes."""
+        """Return True: there is nothing to write."""
         return True
 
 
 class Journal:
-    """Writes to a store; on the event loop."""
+    """The journal of the missions of one store; used on the event loop only."""
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
         self._commits = GroupCommit(store.writer(), metrics)
@@ -79,21 +79,26 @@ class Journal:
 
     @property
     def failing(self) -> bool:
-        """Whether the last attempt to write failed."""
+        """Whether the last transaction failed."""
         return self._commits.failing
 
     def begin(self, mission: Mission) -> None:
-        """A mission is made, and its events are heard from now on."""
+        """Record a new mission, and every event of it from now on."""
         self._commits.add(Made(mission.mission_id, mission.asked_for, mission.spec))
-        # Missions that begin together, and fly alike, are not to be checkpointed all at once.
-        self._follow(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS)
+        # Missions that begin together and fly alike must not all need a checkpoint at the same time.
+        self._record(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS)
 
-    def follow(self, mission: Mission, seq: int, played: Sequence[Event]) -> None:
-        """Hear a mission's events, of which so many are in the store, these since its last checkpoint."""
-        self._follow(mission, seq, sum(map(_weight, played)))
+    def resume(self, mission: Mission, seq: int, replayed: Sequence[Event]) -> None:
+        """Record every event of a restored mission from now on.
 
-    def _follow(self, mission: Mission, seq: int, since: int) -> None:
-        mission_log = MissionLog(mission, seq, since)
+        Args:
+            seq: number of its newest event in the store.
+            replayed: its events since its last checkpoint.
+        """
+        self._record(mission, seq, sum(map(_weight, replayed)))
+
+    def _record(self, mission: Mission, seq: int, since_checkpoint: int) -> None:
+        mission_log = MissionLog(mission, seq, since_checkpoint)
         self._logs[mission.mission_id] = mission_log
 
         def record(event: Event) -> None:
@@ -106,15 +111,15 @@ class Journal:
         mission.record = record
 
     def end(self, mission_id: str) -> None:
-        """A mission is deleted."""
+        """Record that a mission is deleted."""
         if (mission_log := self._logs.pop(mission_id, None)) is not None:
             mission_log.deleted = True
-            # Mission and hearer hold each other: all of it would stay in memory until a collection finds it.
+            # The mission and `record` refer to each other: the mission would stay in memory until a collection.
             mission_log.mission.record = unheard
         self._commits.add(Deleted(mission_id))
 
     def due(self, mission: Mission, least: int = _EVENTS) -> MissionLog | None:
-        """The mission's log, where it has so many events since its last checkpoint; they are counted anew then."""
+        """The log of a mission that has at least so many events since its last checkpoint, whose count begins anew."""
         mission_log = self._logs.get(mission.mission_id)
         if mission_log is None or mission_log.mission is not mission or mission_log.since_checkpoint < least:
             return None
@@ -122,25 +127,23 @@ class Journal:
         return mission_log
 
     def checkpoint(self, mission_log: MissionLog, state: dict[str, Any]) -> None:
-        """Keep a mission's state as it is now in place of the events until now.
-
-        Those that still wait to be written need not be.
-        """
+        """Replace a mission's events until now by its state; those still in the queue are not written any more."""
         if mission_log.mission.scenario.sensors >= _LARGE:
-            # Beside the decisions, one after the other; meanwhile the journal has the events that it stands for.
+            # A thread packs one checkpoint after the other, so that no decision waits. Until then the journal has the
+            # events that the checkpoint replaces.
             packing = self._loop.run_in_executor(self._packing, pack, state)
             self._packed.add(packing)
             packing.add_done_callback(partial(self._take_packed, mission_log, mission_log.seq))
         else:
-            # Packed at once: as it is, it would take the memory of a thousand small objects until it is written.
+            # Packed at once: until it is written, the state would take the memory of a thousand small objects.
             self._take(mission_log, mission_log.seq, pack(state))
 
-    async def stored(self, within_s: float) -> bool:
-        """Wait until all that happened so far is on disk; False where it is not in time, or the store fails."""
-        return await self._commits.stored(within_s)
+    def stored(self, within_s: float) -> Coroutine[Any, Any, bool]:
+        """Wait until every event so far is durable; False if that takes longer, or if the store fails."""
+        return self._commits.stored(within_s)
 
     async def close(self, within_s: float) -> bool:
-        """Write what waits, once more; returns whether that has ended, and the store may be closed."""
+        """Write the queue once more; returns whether that has ended, so that the store may be closed."""
         ends = self._loop.time() + within_s
         if self._packed:
             await asyncio.wait(self._packed, timeout=within_s)
@@ -152,7 +155,7 @@ class Journal:
         if packing.cancelled():
             return
         if (error := packing.exception()) is not None:
-            log.error("a checkpoint could not be made, the journal has its events: %r", error)
+            log.error("a checkpoint could not be packed, the journal keeps its events: %r", error)
             return
         self._take(mission_log, seq, packing.result())
 
@@ -162,7 +165,7 @@ class Journal:
 
 
 def _weight(event: Event) -> int:
-    """What it takes to play an event again, in events of a small network: a lesson grows with the sensors."""
+    """The work of replaying an event, in events of a small network: training grows with the number of sensors."""
     if isinstance(event, Decided) and event.decision.sample is not None:
         return 1 + len(event.decision.sample.features) // _SENSORS
     return 1

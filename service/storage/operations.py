@@ -1,4 +1,4 @@
-"""What changes a store, and the SQL for it."""
+"""The changes that a store can be asked to make."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Made:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """The event number ``seq`` of a mission, from 1."""
+    """Event number ``seq`` of a mission; the first is 1."""
 
     mission_id: str
     seq: int
@@ -38,7 +38,7 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class Deleted:
-    """A mission is over."""
+    """A mission is deleted."""
 
     mission_id: str
 

@@ -1,4 +1,4 @@
-"""The writer of a SQLite store: a process of its own at the other end of a socket."""
+"""The writer of a SQLite store: a process of its own, at the other end of a socket."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ import msgpack
 from service.storage import sqlite_process
 from service.storage.operations import Change
 from service.storage.sql_statements import Statements
-from service.storage.sqlite_process import LENGTH, framed
+from service.storage.sqlite_process import LENGTH
 from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)
 
-# The longest that a process may take to end when nothing is left to write.
-_ENDS_S = 1.0
+# The longest wait for a process that has nothing left to write.
+_EXIT_S = 1.0
 _READ_BYTES = 65_536
 
 
 class ProcessWriter:
-    """Has a process of its own write a SQLite file, and starts another where that ended.
+    """Starts a process that writes a SQLite file, and another one when that process ends.
 
-    The event loop itself sends and receives. A thread would wait at every step of a commit for the interpreter, which
-    the decisions have, and the decisions for the thread.
+    The event loop itself sends and receives. A thread would wait for the interpreter at every step of a commit, while
+    decisions run, and the decisions would wait for the thread.
 
     Args:
         statements: SQL for SQLite.
-        path: the file's.
-        lock: descriptor of the lock on it. The process has it too, so that no other edge takes the file between a
-            killed edge's end and its last commit.
+        path: of the file.
+        lock: descriptor of the file's lock. The process inherits it, so that no other edge takes the file between the
+            end of a killed edge and that edge's last commit.
     """
 
     def __init__(self, statements: Statements, path: str, lock: int) -> None:
@@ -44,22 +44,25 @@ class ProcessWriter:
         self._lock = lock
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
+        # Set while the event loop reads the socket.
         self._loop: asyncio.AbstractEventLoop | None = None
+        # Called when the transaction at hand has ended; None where there is none.
         self._done: Done | None = None
-        # What is being written, whether by a second process already, and what of it is still to be sent.
+        # The transaction at hand, whether a second process already writes it, and the rest of it that is not sent.
         self._frame = b""
         self._repeated = False
         self._outgoing = memoryview(b"")
-        # Whether the socket takes no more for now.
+        # Whether the event loop waits until the socket takes more.
         self._full = False
         self._incoming = bytearray()
-        # So that it is ready when the first decision is; who cannot start it now tries again to write.
+        # The process is ready before the first decision. If it cannot start now, `write` tries again.
         with suppress(OSError):
             self._start()
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
-        self._frame = framed(self._statements.of(changes))
+        transaction = msgpack.packb(self._statements.of(changes))
+        self._frame = LENGTH.pack(len(transaction)) + transaction
         self._repeated = False
         self._submit()
         self._done = done
@@ -69,22 +72,22 @@ class ProcessWriter:
         self._end()
 
     def _end(self) -> str:
-        """What the process said in the end, where it had to say something."""
-        said = ""
+        """End the process, and return the last line that it wrote to stderr, or its exit code."""
+        message = ""
         if self._socket is not None:
             if self._loop is not None and not self._loop.is_closed():
                 self._loop.remove_reader(self._socket.fileno())
                 self._loop.remove_writer(self._socket.fileno())
             self._socket.close()
         if self._process is not None:
-            # Then it ends by itself; where the disk hangs it keeps the lock, and ends later.
+            # The process ends when its socket is closed. If the disk hangs, it ends later and has the lock until then.
             with suppress(subprocess.TimeoutExpired):
-                said = self._process.communicate(timeout=_ENDS_S)[1].decode(errors="replace").strip()
-                said = said.splitlines()[-1] if said else f"exit code {self._process.returncode}"
+                message = self._process.communicate(timeout=_EXIT_S)[1].decode(errors="replace").strip()
+                message = message.splitlines()[-1] if message else f"exit code {self._process.returncode}"
         self._socket = self._process = self._loop = None
         self._full = False
         self._incoming.clear()
-        return said
+        return message
 
     def _submit(self) -> None:
         edge = self._socket or self._start()
@@ -100,14 +103,14 @@ class ProcessWriter:
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    # Without the folder of that file in its path: some of its names are the standard library's too.
+                    # -P keeps the script's folder out of its path: some modules there have names of standard ones.
                     [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), self._path],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
-                    # Not the edge's own: who waits for the end of that waits for a killed edge's last commit besides.
+                    # With the edge's own stderr, a reader of the edge's log would wait for a killed edge's last commit.
                     stderr=subprocess.PIPE,
                     pass_fds=(theirs.fileno(), self._lock),
-                    # What a terminal sends to the edge is not for it.
+                    # Signals of a terminal are for the edge, not for this process.
                     start_new_session=True,
                 )
             except OSError:
@@ -122,7 +125,7 @@ class ProcessWriter:
             with suppress(BlockingIOError):
                 self._outgoing = self._outgoing[self._socket.send(self._outgoing) :]
         except OSError:
-            # It has ended; whoever reads is told in a moment.
+            # The process has ended; `_receive` finds the end of the stream next.
             self._outgoing = self._outgoing[:0]
         if self._outgoing:
             self._loop.add_writer(self._socket.fileno(), self._send)
@@ -140,7 +143,7 @@ class ProcessWriter:
         except OSError:
             received = b""
         if not received:
-            self._ended()
+            self._restart()
             return
         self._incoming += received
         if len(self._incoming) < LENGTH.size:
@@ -148,28 +151,29 @@ class ProcessWriter:
         end = LENGTH.size + LENGTH.unpack_from(self._incoming)[0]
         if len(self._incoming) < end:
             return
-        why = msgpack.unpackb(self._incoming[LENGTH.size : end])
+        failure = msgpack.unpackb(self._incoming[LENGTH.size : end])
         del self._incoming[:end]
         self._frame, self._outgoing = b"", memoryview(b"")
-        self._tell(None if why is None else WriteFailed(why))
+        self._report(None if failure is None else WriteFailed(failure))
 
-    def _ended(self) -> None:
-        said = self._end()
-        log.warning("the process that writes the store has ended (%s): another begins", said)
+    def _restart(self) -> None:
+        """The process has ended: a second process tries its transaction once more."""
+        message = self._end()
+        log.warning("the process that writes the store has ended (%s): another begins", message)
         if self._done is None:
             return
-        failed: Exception = WriteFailed(f"the process that writes it has ended ({said})")
+        failure: Exception = WriteFailed(f"the process that writes it has ended ({message})")
         if not self._repeated:
-            # Written or not, to write it again does no harm.
+            # The transaction may be committed already: to carry it out again does no harm.
             self._repeated = True
             try:
                 self._submit()
                 return
             except OSError as error:
-                failed = error
-        self._tell(failed)
+                failure = error
+        self._report(failure)
 
-    def _tell(self, error: Exception | None) -> None:
+    def _report(self, error: Exception | None) -> None:
         done, self._done = self._done, None
         if done is not None:
             done(error)

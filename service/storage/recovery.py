@@ -1,4 +1,4 @@
-"""Reading a mission back: its last checkpoint, and the events since played again on it."""
+"""Recovery of a mission from the store: its last checkpoint, and the events since then, replayed."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from service.mission.mission import Mission
 from service.storage.store import StoredMission
 
 
-def restore_mission(mission_id: str, kept: StoredMission, settings: Settings) -> Mission:
-    """The mission as it was after the last event kept, but for its plan, which is made again.
+def restore_mission(mission_id: str, stored: StoredMission, settings: Settings) -> Mission:
+    """The mission after its last stored event, except for its plan, which is made again.
 
     Raises:
-        ValueError: what is kept does not fit together.
+        ValueError: the stored state and events do not fit together.
     """
-    mission = Mission(mission_id, kept.asked_for, settings, kept.spec)
+    mission = Mission(mission_id, stored.asked_for, settings, stored.spec)
     try:
-        if kept.state is not None:
-            mission.load_state_dict(kept.state)
-            mission.learner.load_state_dict(kept.state["learner"])
-        for event in kept.events:
-            _play(mission, event)
+        if stored.state is not None:
+            mission.load_state_dict(stored.state)
+            mission.learner.load_state_dict(stored.state["learner"])
+        for event in stored.events:
+            _replay(mission, event)
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError) as error:
-        raise ValueError(f"mission {mission_id} cannot be read back: {error!r}") from error
+        raise ValueError(f"mission {mission_id} cannot be restored: {error!r}") from error
     return mission
 
 
-def _play(mission: Mission, event: Event) -> None:
+def _replay(mission: Mission, event: Event) -> None:
     match event:
         case Reported(step, uav):
             mission.observe(uav, step)
-        case Decided(decision, attempt, counsel):
-            mission.commit(decision, attempt, counsel)
-        case Settled(outcome, taught):
-            sample = mission.apply(outcome, taught=taught)
-            if sample is not None and taught:
+        case Decided(decision, attempt, report):
+            mission.commit(decision, attempt, report)
+        case Settled(outcome, used_for_training):
+            sample = mission.apply(outcome, taught=used_for_training)
+            if sample is not None and used_for_training:
                 mission.learn(sample, outcome.cost)
         case Guided(state):
             mission.reinstate(state)

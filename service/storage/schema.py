@@ -1,10 +1,10 @@
-"""The store's tables; the migrations bring a database to them."""
+"""The store's tables, as the newest migration leaves them."""
 
 from __future__ import annotations
 
 import sqlalchemy as sa
 
-# The newest of service/storage/migrations/versions.
+# The newest version in service/storage/migrations/versions.
 SCHEMA = "0002"
 
 metadata = sa.MetaData()
@@ -12,7 +12,7 @@ missions = sa.Table(
     "missions",
     metadata,
     sa.Column("mission_id", sa.String(64), primary_key=True),
-    # As it was asked for, and in full, so that a mission is what it was whatever the settings become.
+    # The spec as requested, and with all defaults filled in: a mission stays the same when the settings change.
     sa.Column("asked_for", sa.Text, nullable=False),
     sa.Column("spec", sa.Text, nullable=False),
 )

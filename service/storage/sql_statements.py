@@ -9,17 +9,17 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.storage.event_codec import encode
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, missions
+from service.storage.serialization import encode
 
-# As the database's driver takes it, and its parameters: a row, or many.
+# SQL for the database's driver, and the rows of its parameters.
 Statement = tuple[str, list[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class _Compiled:
-    """SQL, and the names of its parameters where the driver wants them."""
+    """SQL, and the names of its parameters if the driver wants names."""
 
     sql: str
     names: tuple[str, ...] | None
@@ -27,19 +27,19 @@ class _Compiled:
     def row(self, *values: Any) -> Any:
         return values if self.names is None else dict(zip(self.names, values, strict=True))
 
-    def once(self, *values: Any) -> Statement:
+    def of_one_row(self, *values: Any) -> Statement:
         return self.sql, [self.row(*values)]
 
 
 class Statements:
-    """SQL in one dialect. Carried out again, by who does not know whether it was, it changes nothing.
+    """SQL in one dialect. Each statement is idempotent, for a writer that does not know whether it was committed.
 
-    Compiled once: what SQLAlchemy does to make a statement, and to run one, is a good part of what a commit takes.
+    The SQL is compiled once: making and running statements by SQLAlchemy is a large part of a commit's time.
     """
 
     def __init__(self, dialect: sa.Dialect) -> None:
         self._dialect = dialect
-        # Each dialect has its own; SQLAlchemy has imported the one that is used.
+        # "On conflict" is not generic SQL; SQLAlchemy has imported the dialect in use already.
         insert: Any = import_module(f"sqlalchemy.dialects.{dialect.name}").insert
         put = insert(checkpoints)
         newer = {"seq": put.excluded.seq, "state": put.excluded.state}
@@ -57,28 +57,28 @@ class Statements:
         ]
 
     def of(self, changes: Sequence[Change]) -> list[Statement]:
-        """Those that make the changes, in their order; events one after the other are one statement."""
-        told: list[Statement] = []
+        """The statements that make the changes in their order; consecutive events share one statement."""
+        statements: list[Statement] = []
         entries: list[Any] | None = None
         for change in changes:
             if not isinstance(change, Entry):
                 entries = None
-                told.extend(self._of(change))
+                statements.extend(self._of(change))
                 continue
             if entries is None:
                 entries = []
-                told.append((self._entry.sql, entries))
+                statements.append((self._entry.sql, entries))
             entries.append(self._entry.row(change.mission_id, change.seq, *encode(change.event)))
-        return told
+        return statements
 
     def _of(self, change: Made | Checkpoint | Deleted) -> list[Statement]:
         match change:
             case Made(mission_id, asked_for, spec):
-                return [self._made.once(mission_id, asked_for.model_dump_json(), spec.model_dump_json())]
+                return [self._made.of_one_row(mission_id, asked_for.model_dump_json(), spec.model_dump_json())]
             case Checkpoint(mission_id, seq, state):
-                return [self._checkpoint.once(mission_id, seq, state), self._covered.once(mission_id, seq)]
+                return [self._checkpoint.of_one_row(mission_id, seq, state), self._covered.of_one_row(mission_id, seq)]
             case Deleted(mission_id):
-                return [deleted.once(mission_id) for deleted in self._deleted]
+                return [deleted.of_one_row(mission_id) for deleted in self._deleted]
 
     def _compiled(self, statement: sa.UpdateBase, *names: str) -> _Compiled:
         keys = names if isinstance(statement, sa.Insert) else None

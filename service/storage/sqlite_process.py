@@ -1,11 +1,11 @@
-"""The process that writes a SQLite store, so that a commit waits for no interpreter that decides, nor that for it.
+"""The process that writes a SQLite store, so that commits and decisions do not wait for the same interpreter.
 
-Run by :class:`service.storage.process_writer.ProcessWriter`, which is at the other end of a socket. Each way goes
-MessagePack, after its length in four bytes: a list of [SQL, rows], all of which is committed, or none; back nil, or why
-it was not.
+:class:`service.storage.process_writer.ProcessWriter` runs it, at the other end of a socket. Each message is MessagePack
+after its length in four bytes. A request is a transaction, a list of [SQL, rows], which is committed as a whole or not
+at all. Its answer is nil, or the reason of the failure.
 
-It ends, the last commit done, when the other end is closed, however the edge ended. It imports next to nothing, so
-that it takes 17 MB and a twentieth of a second.
+The process ends when the other end is closed, after its last commit, even if the edge was killed. It imports very
+little, so that it takes 17 MB and starts in a twentieth of a second.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from typing import Any
 import msgpack
 
 LENGTH = struct.Struct("<I")
-# Milliseconds that a transaction waits for another program's lock of the file.
+# Milliseconds that a transaction waits while another program has the file locked.
 BUSY_MS = 1000
-# WAL, so that readers and the writer do not wait for each other; FULL, so that power may fail after a commit.
+# WAL: readers and the writer do not wait for each other. FULL: a commit survives a power failure.
 PRAGMAS = ("journal_mode=WAL", "synchronous=FULL", f"busy_timeout={BUSY_MS}")
 
 
 def framed(message: Any) -> bytes:
-    """A message with its length before it."""
+    """A message in MessagePack, after its length."""
     packed: bytes = msgpack.packb(message)
     return LENGTH.pack(len(packed)) + packed
 
 
 def serve(edge: socket.socket, path: str) -> None:
-    """Commit what the edge sends until it is gone."""
+    """Commit the transactions that the edge sends, until it closes the socket."""
     database = Database(path)
     with edge.makefile("rb") as sent:
         while len(head := sent.read(LENGTH.size)) == LENGTH.size:
@@ -46,16 +46,16 @@ def serve(edge: socket.socket, path: str) -> None:
 
 
 class Database:
-    """A connection, opened when it is needed, and after each failure anew."""
+    """A connection that opens at its first transaction, and again after each failure."""
 
     def __init__(self, path: str) -> None:
         self._path = path
         self._db: sqlite3.Connection | None = None
 
     def commit(self, transaction: list[tuple[str, list[Any]]]) -> str | None:
-        """Carry out all of it, or nothing and tell why."""
+        """Commit a transaction; returns None, or the reason why nothing of it was committed."""
         try:
-            db = self._db or self._opened()
+            db = self._db or self._open()
             db.execute("BEGIN IMMEDIATE")
             for sql, rows in transaction:
                 db.executemany(sql, rows)
@@ -66,13 +66,13 @@ class Database:
         return None
 
     def close(self) -> None:
-        """Give up what is not committed."""
+        """Close the connection; an open transaction is rolled back."""
         if self._db is not None:
             with suppress(sqlite3.Error):
                 self._db.close()
             self._db = None
 
-    def _opened(self) -> sqlite3.Connection:
+    def _open(self) -> sqlite3.Connection:
         self._db = sqlite3.connect(self._path, isolation_level=None)
         for pragma in PRAGMAS:
             self._db.execute(f"PRAGMA {pragma}")
@@ -80,7 +80,7 @@ class Database:
 
 
 if __name__ == "__main__":
-    # A terminal, or a service manager, sends these to the edge and to whatever it started.
+    # A terminal or a service manager sends these signals to the edge and to its children.
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     with socket.socket(fileno=int(sys.argv[1])) as other, suppress(ConnectionError):

@@ -1,7 +1,7 @@
-"""Where missions outlive the process: SQLite in WAL mode, or PostgreSQL, by SQLAlchemy; the schema by alembic.
+"""The store, in which missions outlive the process: SQLite in WAL mode, or PostgreSQL, by SQLAlchemy and alembic.
 
-One edge uses a store at a time. A mission is its spec, its last checkpoint, and the events since: what a checkpoint
-holds is deleted from the journal in the same transaction that brings it.
+One edge uses a store at a time. A stored mission is its spec, its last checkpoint and the events since then: the
+transaction that writes a checkpoint deletes the events that it covers.
 """
 
 from __future__ import annotations
@@ -14,25 +14,32 @@ import sqlalchemy as sa
 
 from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
-from service.storage.event_codec import decode
 from service.storage.locks import AdvisoryLock, FileLock, StoreUnusable
 from service.storage.process_writer import ProcessWriter
 from service.storage.schema import SCHEMA, checkpoints, journal, missions, terms
-from service.storage.serialization import unpack
+from service.storage.serialization import decode, unpack
 from service.storage.sql_statements import Statements
 from service.storage.sqlite_process import BUSY_MS, PRAGMAS
 from service.storage.thread_writer import ThreadWriter
 from service.storage.writer import Writer
 from shared.wire import MissionSpec
 
-# The longest that PostgreSQL is waited for: to connect, for a statement, and for a network that says nothing.
+# Time limits of PostgreSQL: to connect; for a statement, and for a network without an answer.
 _CONNECT_S = 5
 _STATEMENT_MS = 5000
 
 
 @dataclass(frozen=True, slots=True)
 class StoredMission:
-    """A mission as the store has it: its last checkpoint, and the events since; ``seq`` is the newest's."""
+    """A mission in the store.
+
+    Attributes:
+        asked_for: the spec as requested.
+        spec: the same with all defaults filled in.
+        seq: number of the newest event.
+        state: the last checkpoint, if there is one.
+        events: those since the checkpoint.
+    """
 
     asked_for: MissionSpec
     spec: ResolvedSpec
@@ -45,23 +52,23 @@ class Store:
     """One database; its methods may be called from any thread.
 
     Args:
-        url: a path of a SQLite file, or a URL as SQLAlchemy has them.
+        url: path of a SQLite file, or a URL of SQLAlchemy.
 
     Raises:
-        StoreUnusable: it cannot be reached, is damaged or of a newer version, or another edge uses it.
+        StoreUnusable: the store cannot be reached, is damaged or of a newer version, or another edge uses it.
     """
 
     def __init__(self, url: str) -> None:
-        self._hold: FileLock | AdvisoryLock | None = None
+        self._lock: FileLock | AdvisoryLock | None = None
         try:
             self._engine = _engine(url)
             if self._engine.url.database and self._engine.dialect.name == "sqlite":
-                self._hold = FileLock(self._engine.url.database)
+                self._lock = FileLock(self._engine.url.database)
             else:
-                self._hold = AdvisoryLock(self._engine, terms)
+                self._lock = AdvisoryLock(self._engine, terms)
             self._migrate()
-            if isinstance(self._hold, AdvisoryLock):
-                self._hold.begin_term()
+            if isinstance(self._lock, AdvisoryLock):
+                self._lock.begin_term()
         except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
             self.close()
             raise StoreUnusable(cause(error)) from None
@@ -70,10 +77,10 @@ class Store:
             raise
 
     def close(self) -> None:
-        """Let another edge have it."""
-        if self._hold is not None:
-            self._hold.close()
-            self._hold = None
+        """Close the connections and release the lock."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
         if hasattr(self, "_engine"):
             self._engine.dispose()
 
@@ -83,36 +90,36 @@ class Store:
             return list(db.scalars(sa.select(missions.c.mission_id)))
 
     def load(self, mission_id: str) -> StoredMission | None:
-        """A mission as it was last written, or None; raises ``ValueError`` where what is there cannot be read."""
+        """A stored mission, or None; raises ``ValueError`` where it is damaged."""
         with self._engine.connect() as db:
             found = db.execute(sa.select(missions).where(missions.c.mission_id == mission_id)).first()
             if found is None:
                 return None
             last = db.execute(sa.select(checkpoints).where(checkpoints.c.mission_id == mission_id)).first()
-            since = 0 if last is None else last.seq
-            wanted = (journal.c.mission_id == mission_id) & (journal.c.seq > since)
+            covered = 0 if last is None else last.seq
+            wanted = (journal.c.mission_id == mission_id) & (journal.c.seq > covered)
             rows = db.execute(sa.select(journal).where(wanted).order_by(journal.c.seq)).all()
         numbers = [row.seq for row in rows]
-        if numbers != list(range(since + 1, since + 1 + len(rows))):
-            raise ValueError(f"mission {mission_id}: events are missing after {since}")
+        if numbers != list(range(covered + 1, covered + 1 + len(rows))):
+            raise ValueError(f"mission {mission_id}: events are missing after {covered}")
         return StoredMission(
             asked_for=MissionSpec.model_validate_json(found.asked_for),
             spec=ResolvedSpec.model_validate_json(found.spec),
-            seq=since + len(rows),
+            seq=covered + len(rows),
             state=None if last is None else unpack(last.state),
             events=[decode(row.kind, row.body) for row in rows],
         )
 
     def writer(self) -> Writer:
-        """Who writes to it, beside the event loop; to be closed before the store is."""
-        assert self._hold is not None
+        """A writer of this store, which works beside the event loop; to be closed before the store."""
+        assert self._lock is not None
         statements = Statements(self._engine.dialect)
-        if isinstance(self._hold, FileLock):
-            return ProcessWriter(statements, self._hold.file, self._hold.descriptor)
-        return ThreadWriter(statements, self._hold.transaction)
+        if isinstance(self._lock, FileLock):
+            return ProcessWriter(statements, self._lock.file, self._lock.descriptor)
+        return ThreadWriter(statements, self._lock.transaction)
 
     def _migrate(self) -> None:
-        """Bring the schema up to date; alembic, slow to import, only where it is not."""
+        """Bring the schema up to date. alembic is slow to import, so an up-to-date store does without it."""
         with self._engine.connect() as db:
             known = sa.inspect(db).has_table("alembic_version")
             version = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
@@ -138,7 +145,7 @@ def _engine(url: str) -> sa.Engine:
     try:
         parsed = sa.make_url(url)
     except (sa.exc.ArgumentError, ValueError):
-        # What cannot be told apart may be part of a password.
+        # The text is not repeated: any part of it may be part of a password.
         raise ValueError("is no address: write @, : and / in a password as %40, %3A and %2F") from None
     if "@" in (parsed.host or ""):
         raise ValueError("names a host with an @: write @ in a password as %40")
@@ -166,6 +173,6 @@ def _prepare(connection: Any, _: object) -> None:
 
 
 def cause(error: Exception) -> str:
-    """An error in one line, without the statement and its parameters; drivers name no password."""
+    """An error in one line, without the SQL statement and its parameters; drivers write no password."""
     origin = getattr(error, "orig", None) or error
     return str(origin).strip().splitlines()[0] if str(origin).strip() else type(origin).__name__

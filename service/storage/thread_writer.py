@@ -17,42 +17,42 @@ from service.storage.writer import Done
 
 
 class ThreadWriter:
-    """Has a thread write to a database that is another process anyhow.
+    """Writes from a thread: the database is another process already.
 
     Args:
         statements: SQL for the database.
-        begin: makes a transaction, committed at its end.
+        begin: makes a transaction that is committed at its end.
     """
 
     def __init__(self, statements: Statements, begin: Callable[[], AbstractContextManager[sa.Connection]]) -> None:
         self._statements = statements
         self._begin = begin
-        self._given: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        # Nobody waits for one that hangs, when the edge ends.
+        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        # A daemon: the end of the edge does not wait for a database that hangs.
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
-        self._given.put(partial(self._write, self._statements.of(changes), done, asyncio.get_running_loop()))
+        self._jobs.put(partial(self._write, self._statements.of(changes), done, asyncio.get_running_loop()))
 
     def close(self) -> None:
         """As :class:`Writer` says."""
-        self._given.put(None)
+        self._jobs.put(None)
         self._thread.join()
 
     def _run(self) -> None:
-        while (given := self._given.get()) is not None:
-            given()
+        while (job := self._jobs.get()) is not None:
+            job()
 
     def _write(self, transaction: Sequence[Statement], done: Done, loop: asyncio.AbstractEventLoop) -> None:
-        failed: Exception | None = None
+        failure: Exception | None = None
         try:
             with self._begin() as db:
                 for sql, rows in transaction:
                     db.exec_driver_sql(sql, rows)
         except Exception as error:
-            failed = error
-        # Unless the edge has ended meanwhile.
+            failure = error
+        # The event loop is closed if the edge has ended meanwhile.
         with suppress(RuntimeError):
-            loop.call_soon_threadsafe(done, failed)
+            loop.call_soon_threadsafe(done, failure)

@@ -1,4 +1,4 @@
-"""Who writes to a store, beside the event loop: a process for SQLite, a thread for PostgreSQL."""
+"""The interface of a store's writer, beside the event loop: a process writes SQLite, a thread PostgreSQL."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Protocol
 
 from service.storage.operations import Change
 
-# Called on the event loop: with None when all is on disk, or with why nothing is, as far as is known.
+# Called on the event loop: with None when the transaction is durable, or with the reason why it probably is not.
 Done = Callable[[Exception | None], None]
 
 
 class WriteFailed(Exception):
-    """What was to be written is not on disk, as far as is known."""
+    """The transaction is not durable, as far as the writer knows."""
 
 
 class Writer(Protocol):
     """Writes one transaction after the other; called from the event loop."""
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
-        """Begin to write all of it, in order, or nothing; the one before must have ended.
+        """Begin a transaction of all the changes, in their order; the transaction before must have ended.
 
         Args:
-            done: told once, in a later turn of the loop, how it ended.
+            done: called once with the result, in a later iteration of the event loop.
 
         Raises:
-            Exception: it could not begin; ``done`` is not told.
+            Exception: the transaction could not begin; ``done`` is not called.
         """
 
     def close(self) -> None:
-        """End; nothing may be on its way."""
+        """End the writer; no transaction may be under way."""

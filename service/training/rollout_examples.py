@@ -14,7 +14,7 @@ from torch import Tensor
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.look_ahead import look_ahead
-from service.learning.sample import Sample
+from service.learning.modules import Sample
 from service.mission.mission import Mission
 from service.training.reward import Reward, Speed
 from shared.actions import Action

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.learning.attention import top_k
-from service.learning.parameters import Weights
+from service.learning.modules import Weights, top_k
 from service.training.rollout_examples import Example, Taught
 
 

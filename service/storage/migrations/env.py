@@ -1,4 +1,4 @@
-"""Run by alembic, on the connection that :meth:`service.storage.store.Store` gives it."""
+"""The migrations; alembic runs this on the connection that :class:`service.storage.store.Store` passes."""
 
 from __future__ import annotations
 

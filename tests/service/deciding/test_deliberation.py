@@ -16,9 +16,8 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import Deliberation
 from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
 from service.learning.trust import LLM
-from service.llm.answer_format import NoDecision
+from service.llm.answers import Completion, NoDecision, TokenPosition
 from service.llm.calibration import calibrated, probabilities
-from service.llm.completion import Completion, Place
 from service.mission.mission import Mission
 from service.prompting.candidates import velocities
 from service.prompting.guided_prompt import GuidedTemplate
@@ -52,7 +51,7 @@ def deliberation(mission: Mission, step: int = 0) -> tuple[AttendedState, Delibe
 
 
 def completion(text: str, **first_token: float) -> Completion:
-    return Completion(text, None, None, None, (Place(text, first_token),) if first_token else ())
+    return Completion(text, None, None, None, (TokenPosition(text, first_token),) if first_token else ())
 
 
 def test_every_row_has_four_letters_whose_velocities_rise() -> None:
@@ -113,7 +112,7 @@ def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> No
 
 def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
     likeliest = {"A": 0.9, "B": 0.1}, {"\n": 1.0}, {"C": 0.5, "B": 0.2, "A": 0.3}
-    places = tuple(Place(token, told) for token, told in zip(("A", "\n", "B"), likeliest, strict=True))
+    places = tuple(TokenPosition(token, told) for token, told in zip(("A", "\n", "B"), likeliest, strict=True))
     read = probabilities(Completion("A\nB", None, None, None, places), ["AB", "AB"])
     assert read == [pytest.approx({"A": 0.9, "B": 0.1}), pytest.approx({"A": 0.6, "B": 0.4})]
     # Of the second label no probabilities came: then the text counts, for both.
@@ -126,7 +125,9 @@ def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
 
 def test_a_single_label_is_read_where_it_should_stand_though_something_else_was_drawn() -> None:
     """ServerPool that cannot be held to the labels begin with a line's end, say."""
-    (told,) = probabilities(Completion("\n", None, None, None, (Place("\n", {"": 0.6, "A": 0.3, "B": 0.1}),)), ["AB"])
+    (told,) = probabilities(
+        Completion("\n", None, None, None, (TokenPosition("\n", {"": 0.6, "A": 0.3, "B": 0.1}),)), ["AB"]
+    )
     assert told == pytest.approx({"A": 0.75, "B": 0.25})
 
 
@@ -140,8 +141,8 @@ def test_a_certain_answer_leaves_no_label_without_a_bias() -> None:
 def test_a_low_temperature_is_undone() -> None:
     p = {"A": 0.6, "B": 0.3, "C": 0.1}
     cooled = {label: value**5 / sum(v**5 for v in p.values()) for label, value in p.items()}
-    assert Place("A", cooled).untempered(0.2).likeliest == pytest.approx(p)
-    assert Place("A", {}).untempered(0.2).likeliest == {}
+    assert TokenPosition("A", cooled).untempered(0.2).likeliest == pytest.approx(p)
+    assert TokenPosition("A", {}).untempered(0.2).likeliest == {}
 
 
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.verifier import verify
-from service.llm.answer_format import NoDecision
+from service.llm.answers import NoDecision
 from service.mission.mission import Mission
 from shared.actions import Action
 from shared.wire import MissionSpec

@@ -15,7 +15,7 @@ from fastapi.responses import JSONResponse, Response
 from service.deciding.attended_state import AttendedState
 from service.deciding.deadline import Deadline
 from service.deciding.llm_query import LlmAdvice, LlmQueries
-from service.llm.answer_format import constrain_labels
+from service.llm.request_bodies import constrain_labels
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt

@@ -18,7 +18,7 @@ from service.deciding.rollout_evaluator import RolloutState, judge
 from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
-from service.llm.completion import Completion
+from service.llm.answers import Completion
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import LlmServer
 from service.mission.mission import Mission

@@ -4,7 +4,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from service.learning.attention import Attention, top_k
+from service.learning.modules import Attention, top_k
 
 
 def reference(
@@ -61,7 +61,7 @@ def test_many_sensors_are_shared_among_cores_and_give_the_same_to_the_bit(
     with torch.no_grad():
         at_once = attention(x)
     for cores in (1, 2, 3, 16):
-        monkeypatch.setattr("service.learning.attention.usable_cores", lambda cores=cores: cores)
+        monkeypatch.setattr("service.learning.modules.usable_cores", lambda cores=cores: cores)
         with torch.inference_mode():
             shared = attention(x)
         assert torch.equal(shared[0], at_once[0])

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from service.learning.backpropagation import descend
 from service.learning.initial_weights import initial_weights
-from service.learning.learner import Learner
-from service.learning.modules import Modules
-from service.learning.sample import Sample
+from service.learning.learner import Learner, descend
+from service.learning.modules import Modules, Sample
 from shared.features import FEATURES
 from shared.reach import LEVEL_FEATURES
 from shared.wire import Features
@@ -93,7 +91,8 @@ def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
         adam.step()
         learner.update(sample(preset, seed), cost=0.3)
         assert torch.equal(
-            learner.score(sample(preset, 99).features)[0], modules.weights().score(sample(preset, 99).features)[0]
+            learner.weights.score(sample(preset, 99).features)[0],
+            modules.weights().score(sample(preset, 99).features)[0],
         )
     kept = learner.state_dict()
     for name, values in modules.state_dict().items():
@@ -127,20 +126,22 @@ def test_what_was_kept_goes_on_as_if_it_had_never_stopped() -> None:
     again.load_state_dict(first.state_dict())
     for seed in range(10, 20):
         again.update(sample("reach", seed), cost=0.3)
-    assert torch.equal(again.score(sample("reach").features)[0], through.score(sample("reach").features)[0])
+    assert torch.equal(
+        again.weights.score(sample("reach").features)[0], through.weights.score(sample("reach").features)[0]
+    )
     with pytest.raises(RuntimeError):
         Learner(Modules("paper", 15, seed=1).weights(), learning_rate=5e-3).load_state_dict(first.state_dict())
 
 
 def test_missions_share_modules_and_until_they_learn_the_pretrained_weights() -> None:
     one, other, alone = (Learner(initial_weights("pretrained", "reach", 15, n), learning_rate=5e-3) for n in range(3))
-    assert one._weights is other._weights
+    assert one.weights is other.weights
     for seed in range(20):
         one.update(sample("reach", seed), cost=0.3)
         other.update(sample("reach", 100 + seed), cost=1.3)
     for seed in range(20):
         alone.update(sample("reach", seed), cost=0.3)
-    scores = [learner.score(sample("reach").features)[0] for learner in (one, other, alone)]
+    scores = [learner.weights.score(sample("reach").features)[0] for learner in (one, other, alone)]
     assert torch.equal(scores[0], scores[2])
     assert not torch.equal(scores[0], scores[1])
     assert not torch.equal(scores[0], initial_weights("pretrained", "reach", 15, 0).score(sample("reach").features)[0])
@@ -149,7 +150,7 @@ def test_missions_share_modules_and_until_they_learn_the_pretrained_weights() ->
 def test_what_other_modules_learned_is_refused() -> None:
     learner = Learner(Modules("paper", 15, seed=0).weights(), learning_rate=5e-4)
     for other in (Modules("reach", 15, seed=0), Modules("paper", 9, seed=0)):
-        with pytest.raises(RuntimeError, match="other modules"):
+        with pytest.raises(RuntimeError, match="do not have the shapes"):
             learner.load_state_dict(Learner(other.weights(), learning_rate=5e-4).state_dict())
 
 
@@ -177,10 +178,10 @@ def test_a_decision_never_sees_half_a_step() -> None:
     learner = Learner(Modules("reach", 15, seed=1).weights(), learning_rate=0.1)
 
     def scores() -> Scores:
-        return tuple(learner.score(features)[0].tolist())
+        return tuple(learner.weights.score(features)[0].tolist())
 
     for seed in range(3):
-        in_hand, before = learner._weights, scores()
+        in_hand, before = learner.weights, scores()
         seen = at_every_line(partial(learner.update, sample("reach", seed), cost=0.3), scores)
         after = scores()
         assert before != after

@@ -25,8 +25,7 @@ from service.mission.events import Settled
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
 from service.prompting.unpruned_baseline import Uncompressed
-from service.storage.event_codec import decode, encode
-from service.storage.serialization import pack
+from service.storage.serialization import decode, encode, pack
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav

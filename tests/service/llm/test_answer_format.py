@@ -1,6 +1,7 @@
 import pytest
 
-from service.llm.answer_format import NoDecision, check_answer, constrain
+from service.llm.answers import NoDecision, check_answer
+from service.llm.request_bodies import constrain
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_nobody_waits_for_an_edge_that_ends() -> None:
         asked = pool.submit(httpx.get, f"{url}/readyz", timeout=PATIENCE_S)
         assert httpx.get(f"{url}/healthz", timeout=PATIENCE_S).status_code == 200
         assert not asked.done()
-        loading.give_up()
+        loading.open()
         answer = asked.result(timeout=PATIENCE_S)
     assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from service.learning.modules import Modules
-from service.learning.sample import Sample
+from service.learning.modules import Modules, Sample
 from service.training.reward import Reward, fleet_cost
 from service.training.rollout_examples import Batch, Example, Taught, replay
 from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error

@@ -14,7 +14,7 @@ import pytest
 from service.api.attention_weights import attention_of
 from service.config.settings import Settings
 from service.edge.learning_queue import LearningQueue
-from service.learning.attention import top_k
+from service.learning.modules import top_k
 from service.mission.mission import Mission
 from shared.features import FEATURES
 from shared.missions import MissionAttention
@@ -35,7 +35,7 @@ def test_the_same_features_have_the_same_scores(features: Features, n: int) -> N
     mission = Mission("test", MissionSpec(features=features), Settings(mode="value"))
     told = MissionAttention.model_validate_json(attention_of(mission).model_dump_json())
     x = np.random.default_rng(n).random((n, FEATURES[features]), dtype=np.float32)
-    expected, _ = mission.learner.score(x)
+    expected, _ = mission.learner.weights.score(x)
     scores = Attention.of(told).scores(x)
     assert scores.shape == (n,) and np.abs(scores - expected.numpy()).max() < 1e-5
     assert np.argsort(-scores, kind="stable")[:5].tolist() == top_k(expected, 5)

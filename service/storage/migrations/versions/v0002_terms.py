@@ -1,4 +1,4 @@
-"""The terms of the edges that had this store, one after the other."""
+"""The fencing terms of the edges that have used this store."""
 
 from __future__ import annotations
 

@@ -1,0 +1,111 @@
+"""An LLM server's answer: its text and token probabilities, the checks that it must pass, and its failures."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from shared.actions import Action
+from shared.wire import Reason
+
+_TWO_INTEGERS = re.compile(r"([0-9]{1,5}) ([0-9]{1,2})")
+
+
+class NoDecision(Exception):
+    """The LLM gave no decision.
+
+    Attributes:
+        reason: for the response and the metrics; ``str()`` has the details.
+    """
+
+    def __init__(self, reason: Reason, detail: str) -> None:
+        super().__init__(detail)
+        self.reason: Reason = reason
+
+
+class NotUnderstood(NoDecision):
+    """The server refused a field of the request."""
+
+
+class Unreachable(NoDecision):
+    """No server accepts connections at the address."""
+
+
+@dataclass(frozen=True, slots=True)
+class TokenPosition:
+    """One position of an answer.
+
+    Attributes:
+        token: the token drawn there.
+        likeliest: probabilities of the likeliest tokens there, without blanks around them.
+    """
+
+    token: str
+    likeliest: dict[str, float]
+
+    def untempered(self, temperature: float) -> TokenPosition:
+        """The same with the probabilities at temperature 1: ``q^T``, renormalised."""
+        raised = {token: q**temperature for token, q in self.likeliest.items()}
+        total = sum(raised.values())
+        return TokenPosition(self.token, {token: p / total for token, p in raised.items()} if total else {})
+
+
+@dataclass(frozen=True, slots=True)
+class Completion:
+    """A chat completion.
+
+    Attributes:
+        prompt_tokens: of the server's ``usage``, as ``cached_tokens`` and ``completion_tokens``; None if missing.
+        positions: of the text's tokens; empty where the server gives no probabilities.
+        model: name of the model that answered.
+    """
+
+    text: str
+    prompt_tokens: int | None
+    cached_tokens: int | None
+    completion_tokens: int | None
+    positions: tuple[TokenPosition, ...] = ()
+    model: str | None = None
+
+
+def check_answer(text: str, sensor_ids: Collection[int], velocities: int) -> Action:
+    """Sensor ID and velocity, from plain text or the JSON object of :func:`json_schema`.
+
+    Raises:
+        NoDecision: the text has another form, a sensor that was not offered, or a velocity that does not exist.
+    """
+    sensor, velocity = _two_integers(text)
+    if sensor not in sensor_ids:
+        raise NoDecision("answer_sensor", repr(text[:80]))
+    if not 0 <= velocity < velocities:
+        raise NoDecision("answer_velocity", repr(text[:80]))
+    return Action(sensor, velocity)
+
+
+def _two_integers(text: str) -> tuple[int, int]:
+    stripped = text.strip()
+    if plain := _TWO_INTEGERS.fullmatch(stripped):
+        return int(plain[1]), int(plain[2])
+    if stripped.startswith("{"):
+        try:
+            answer = json.loads(stripped)
+        except (ValueError, RecursionError):
+            raise NoDecision("answer_format", repr(text[:80])) from None
+        values = [answer.get(key) for key in ("sensor_id", "velocity")]
+        if len(answer) == 2 and all(type(value) is int for value in values):
+            return values[0], values[1]
+    raise NoDecision("answer_format", repr(text[:80]))
+
+
+def check_labels(text: str, lists: Sequence[Collection[str]]) -> list[str]:
+    """The label that a text names for each list, one a line.
+
+    Raises:
+        NoDecision: the text names more or fewer labels, or one that its list does not have.
+    """
+    labels = text.split()
+    if len(labels) != len(lists) or any(label not in offered for label, offered in zip(labels, lists, strict=True)):
+        raise NoDecision("answer_format", repr(text[:80]))
+    return labels
