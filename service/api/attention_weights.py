@@ -23,8 +23,8 @@ def attention_of(mission: Mission) -> MissionAttention:
     return MissionAttention(
         mission_id=mission.mission_id,
         features=mission.features,
-        belief=mission.decides_from,
-        top_k=min(mission.top_k, mission.scenario.sensors) if mission.attends else mission.scenario.sensors,
+        belief=mission.belief_source,
+        top_k=min(mission.top_k, mission.scenario.sensors) if mission.uses_attention else mission.scenario.sensors,
         updates=learner.updates,
         weights=arrays,
     )

@@ -130,7 +130,7 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")
-    mission.obey(body)
+    mission.answer_guidance(body)
     await engine.durable("answer")
     return mission.guidance.told(mission_id)
 

@@ -74,13 +74,13 @@ class Deliberation:
             state.uav_id,
             seed=mission.spec.seed,
             reserved=state.reserved,
-            course=None if mission.planner is None else mission.planner.course(),
-            guidance=mission.guidance.obeyed,
+            course=None if mission.planner is None else mission.planner.plans(),
+            guidance=mission.guidance.confirmed,
         )
         template = template_of(mission)
         return cls(
             candidates=candidates,
-            prompt=template.offer(candidates, state.state, mission.experiences, state.similar_experiences()),
+            prompt=template.offer(candidates, state.state, mission.experiences.block, state.similar_experiences()),
             advised={name: found.probabilities(candidates.actions) for name, found in preferences.items()},
             rollout=rollout,
         )

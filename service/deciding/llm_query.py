@@ -98,7 +98,7 @@ class LlmQueries:
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
-        if not mission.promptable:
+        if not mission.prompt_fits:
             return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
         template = template_of(mission)
         labels = [list(candidates.labels)]
@@ -112,7 +112,7 @@ class LlmQueries:
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
         able = self._llm.status == "ready" and uavs <= self._llm.most_together
-        return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
+        return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.holds(uavs)
 
     async def ask_for_fleet(
         self, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
@@ -129,7 +129,7 @@ class LlmQueries:
         similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())
         prompts = template.together(
             {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
-            mission.experiences,
+            mission.experiences.block,
             list(similar),
         )
         static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())

@@ -59,7 +59,7 @@ class Policy:
         """The template's prompt, by which tokens are accounted for in every mode."""
         mission = state.mission
         similar = state.similar_experiences()
-        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences, similar))
+        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences.block, similar))
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
         """Always the LLM-free policy's."""
@@ -88,7 +88,7 @@ class Llm(Policy):
         """The LLM's sensor and velocity."""
         if not state.rows:
             return Fallback("no_candidate")
-        if not state.mission.promptable:
+        if not state.mission.prompt_fits:
             return Fallback("llm_unavailable")
         completion: Completion | None = None
         levels = state.mission.scenario.max_velocity + 1
@@ -98,7 +98,7 @@ class Llm(Policy):
             finally:
                 task.watch.lap("llm")
             answer = Action(*check_answer(completion.text, state.kept_ids, levels))
-            if not state.mission.guidance.obeyed.allows(answer.velocity):
+            if not state.mission.guidance.confirmed.allows(answer.velocity):
                 raise NoDecision("answer_velocity", f"the operator forbids {answer.velocity} m/s")
             verify(state, answer)
         except NoDecision as error:
@@ -148,7 +148,7 @@ class Guided(Policy):
         if judgement is None:
             reason = advice.reason or "critic_timeout"
             return Fallback(reason, advice.completion, advice.model, evaluated_late=True)
-        reserved = mission.reserved(state.step, state.uav_id)
+        reserved = mission.reservations.of_others(state.step, state.uav_id)
         llm = advice.over(deliberation.candidates.actions)
         trust = mission.trust_in(advice.model)
         verdict = deliberation.conclude(trust, judgement, llm, calibrated=advice.calibrated, reserved=reserved)

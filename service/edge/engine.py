@@ -185,7 +185,7 @@ class Engine:
         if key is None:
             await made()
         else:
-            text = await mission.repeats.once(key, request.model_dump_json(), made, mission.record)
+            text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
             answers = answers or _ANSWERS.validate_json(text)
         began = time.perf_counter()
         stored = await self.journal.stored(min(_STORE_S, deadline.left()))

@@ -32,19 +32,19 @@ class Feedback:
         """Record an outcome, unless it is recorded already; raises as :meth:`Mission.find`."""
         result: Literal["applied", "duplicate"] = "duplicate"
         try:
-            found = mission.find(outcome)
+            found = mission.pending.find(outcome)
         except Conflict as error:
             self._metrics.feedback.labels("contradicted").inc()
             log.warning("mission %s: dropped: %s", mission.mission_id, error)
             raise
         if found == "pending":
             result = "applied"
-            if outcome.cost > mission.most_cost:
+            if outcome.cost > mission.pending.max_step_cost:
                 # Forged or mistaken: as the worst that can be, it spoils neither the modules nor the prompt.
                 self._metrics.costs_clipped.inc()
-                outcome = outcome.model_copy(update={"cost": mission.most_cost})
+                outcome = outcome.model_copy(update={"cost": mission.pending.max_step_cost})
             taught = not self._lessons.full
-            sample = mission.apply(outcome, taught=taught)
+            sample = mission.apply(outcome, for_training=taught)
             self._live.settled(mission, outcome)
             if sample is not None and taught:
                 self._lessons.add(Lesson(mission, sample, outcome.cost))

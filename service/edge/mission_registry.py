@@ -13,6 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.config.settings import Settings
 from service.errors import Conflict, NotFound, Unavailable
 from service.mission.mission import Mission
+from service.mission.report_checks import complete_report
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
 from service.storage.recovery import restore_mission
@@ -96,15 +97,17 @@ class MissionRegistry:
         """
         mission_id = request.mission_id
         mission = await self._find(mission_id, within_s)
-        if mission is not None and key is not None and mission.repeats.knows(key):
+        if mission is not None and key is not None and mission.idempotent_answers.knows(key):
             return mission, request
         if mission is None and not may_make:
             raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
         mission = mission or Mission(mission_id, MissionSpec(), self._settings)
         if isinstance(request, DecideRequest):
-            whole = mission.completed(request, request.step)
+            whole = complete_report(mission, request, request.step)
         else:
-            uavs = [mission.completed(u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)]
+            uavs = [
+                complete_report(mission, u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)
+            ]
             whole = request.model_copy(update={"uavs": uavs})
         self._add(mission)
         return mission, whole
@@ -121,7 +124,7 @@ class MissionRegistry:
             self.refuse_if_failing("mission_id")
             mission = Mission(mission_id, spec, self._settings)
             self._add(mission)
-        elif mission.asked_for != spec:
+        elif mission.requested_spec != spec:
             raise Conflict("mission_id", f"mission {mission_id} has another spec: DELETE it or choose another ID")
         return mission
 
@@ -175,7 +178,7 @@ class MissionRegistry:
         except ValueError as error:
             log.error("mission %s is damaged: %s", mission_id, error)
             raise Conflict("mission_id", f"what the store has of {mission_id} is damaged: DELETE it") from None
-        if not mission.promptable:
+        if not mission.prompt_fits:
             limit = self._settings.llm_context
             log.warning(
                 "mission %s: its prompt may need more than AICVDS_LLM_CONTEXT (%d): it flies on without the LLM",

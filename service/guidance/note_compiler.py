@@ -43,11 +43,11 @@ class NoteOwner(Protocol):
     scenario: Scenario
     guidance: OperatorGuidance
 
-    def understand(self, guidance: Guidance, model: str | None) -> None:
+    def propose_guidance(self, guidance: Guidance, model: str | None) -> None:
         """An LLM made this of the note."""
         ...
 
-    def misunderstand(self, why: str, model: str | None) -> None:
+    def fail_guidance(self, reason: str, model: str | None) -> None:
         """Nothing could be made of the note."""
         ...
 
@@ -83,7 +83,7 @@ class NoteCompiler:
                 await self._ready()
                 if mission.guidance.status != "compiling":
                     return
-                mission.understand(await understood(note, mission.scenario, self._llm), self._llm.model)
+                mission.propose_guidance(await understood(note, mission.scenario, self._llm), self._llm.model)
                 return
         except (BadOrders, Impossible, NoDecision) as error:
             why = str(error)
@@ -92,7 +92,7 @@ class NoteCompiler:
         except Exception as error:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             why = f"{type(error).__name__}: see the log"
-        mission.misunderstand(f"{why}; give `guidance` of your own", self._llm.model)
+        mission.fail_guidance(f"{why}; give `guidance` of your own", self._llm.model)
 
     async def _ready(self) -> None:
         """Wait while the LLM loads, or recovers."""

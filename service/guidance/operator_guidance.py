@@ -22,7 +22,7 @@ class OperatorGuidance:
     def __init__(self, note: str | None, scenario: Scenario) -> None:
         self.note = note
         self.status: GuidanceState = "none" if note is None else "compiling"
-        self.obeyed: Guidance = NO_GUIDANCE
+        self.confirmed: Guidance = NO_GUIDANCE
         self._scenario = scenario
         self._understood: Guidance | None = None
         self._origin: Literal["llm", "operator"] | None = None
@@ -58,7 +58,7 @@ class OperatorGuidance:
             )
         confirmed = answer.answer != "reject"
         self.status = "confirmed" if confirmed else "rejected"
-        self.obeyed = self._understood if confirmed else NO_GUIDANCE
+        self.confirmed = self._understood if confirmed else NO_GUIDANCE
 
     def told(self, mission_id: str) -> GuidanceStatus:
         """What ``GET /missions/{id}/guidance`` says."""
@@ -77,7 +77,7 @@ class OperatorGuidance:
         """Where it stands, as plain values."""
         return {
             "status": self.status,
-            "obeyed": self.obeyed.model_dump(),
+            "obeyed": self.confirmed.model_dump(),
             "understood": None if self._understood is None else self._understood.model_dump(),
             "origin": self._origin,
             "model": self._model,
@@ -87,7 +87,7 @@ class OperatorGuidance:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """As it stood when the state was taken."""
         self.status = state["status"]
-        self.obeyed = Guidance.model_validate(state["obeyed"])
+        self.confirmed = Guidance.model_validate(state["obeyed"])
         understood = state["understood"]
         self._understood = None if understood is None else Guidance.model_validate(understood)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]

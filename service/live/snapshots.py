@@ -30,7 +30,7 @@ def snapshot(mission: Mission, kept: list[RecentDecision], edge: str) -> bytes:
             "mission": {
                 "mission_id": mission.mission_id,
                 "mode": mission.mode,
-                "asks": mission.asks,
+                "asks": mission.spec.uses_llm,
                 "planner": mission.planner is not None,
                 "top_k": mission.top_k,
                 "note": mission.guidance.note,
@@ -84,7 +84,7 @@ def _moment(mission: Mission) -> dict[str, Any]:
         "queue": np.round(queue, 1).tolist(),
         "urgency": np.round(urgency(queue, belief.rate, mission.scenario), 3).tolist(),
         "heard": belief.heard.tolist(),
-        "visits": mission.visits.tolist(),
+        "visits": mission.records.visits.tolist(),
         "uavs": {uav: {"step": last.step, "position": last.position} for uav, last in belief.uavs.items()},
     }
 

@@ -34,10 +34,10 @@ def _play(mission: Mission, event: Event) -> None:
         case Decided(decision, attempt, counsel):
             mission.commit(decision, attempt, counsel)
         case Settled(outcome, taught):
-            sample = mission.apply(outcome, taught=taught)
+            sample = mission.apply(outcome, for_training=taught)
             if sample is not None and taught:
                 mission.learn(sample, outcome.cost)
         case Guided(state):
-            mission.reinstate(state)
+            mission.restore_guidance(state)
         case Answered():
-            mission.repeats.remember(event)
+            mission.idempotent_answers.remember(event)

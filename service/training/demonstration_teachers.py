@@ -60,7 +60,7 @@ def solutions(
             mission.observe(uav, uav.step)
             view = AttendedState.of(mission, uav, uav.step)
             if view.state.admissible.sum() > 1:
-                reserved = mission.reserved(uav.step, uav.uav_id)
+                reserved = mission.reservations.of_others(uav.step, uav.uav_id)
                 answer = teacher(step, view.state, mission.scenario, reserved)
                 if answer is not None and _collects(view.state, *answer):
                     demonstration = _demonstration(mission, uav, uav.step, answer)
@@ -83,9 +83,9 @@ def _demonstration(mission: Mission, uav: UavState, step: int, answer: Action) -
         {
             "uav": {**report, "progress_m": _rounded(uav.progress_m), "sensors": rounded},
             "step": step,
-            "visits": mission.visits.tolist(),
-            "rates": [round(rate, 2) for rate in mission.rates.tolist()],
-            "reserved": sorted(mission.reserved(step, uav.uav_id)),
+            "visits": mission.records.visits.tolist(),
+            "rates": [round(rate, 2) for rate in mission.records.rates.tolist()],
+            "reserved": sorted(mission.reservations.of_others(step, uav.uav_id)),
             "sensor_id": answer[0],
             "velocity": answer[1],
         }

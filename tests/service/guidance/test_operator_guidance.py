@@ -259,7 +259,7 @@ def test_a_note_that_the_context_cannot_hold_is_refused(edge: Edge) -> None:
 
 def guided_by(structure: Guidance, **spec: Any) -> Mission:
     made = mission(MissionSpec(**spec))
-    made.obey(GuidanceAnswer(guidance=structure))
+    made.answer_guidance(GuidanceAnswer(guidance=structure))
     return made
 
 

@@ -83,7 +83,7 @@ def test_the_static_block_stays_as_it_is_while_the_modules_learn() -> None:
         sample = m.apply(Outcome(decision_id=f"{step:032x}", cost=1.0))
         assert sample is not None
         m.learner.update(sample, 1.0)
-        assert m.template.prompt(view.state, view.shown(), m.experiences).static == before
+        assert m.template.prompt(view.state, view.shown(), m.experiences.block).static == before
 
 
 def test_a_slower_fleet_sees_no_velocity_past_its_limit() -> None:

@@ -314,7 +314,7 @@ def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path
         first = client.post("/decide", json=report()).json()
         body = report(step=1, outcome={"decision_id": first["decision_id"], "cost": 0.5})
         answer = client.post("/decide", json=body, headers={"Idempotency-Key": "k"}).json()
-        engine.missions.loaded[0]._applied.load_state_dict([])
+        engine.missions.loaded[0].pending.applied.load_state_dict([])
         again = client.post("/decide", json=body, headers={"Idempotency-Key": "k"})
         assert (again.status_code, again.json()["decision_id"]) == (200, answer["decision_id"])
         assert Outcome.model_validate(body["outcome"]).cost == 0.5
