@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 from service.config.settings import Settings
-from service.guidance.note_compiler import understood
-from service.guidance.note_orders import BadOrders, number_of, read, shown
+from service.guidance.note_compiler import compiled
+from service.guidance.note_orders import BadOrders, number_of, parse_orders, similar_examples
 from service.llm.answer_format import NoDecision
 from service.llm.server_pool import ServerPool
 from service.prompting.warm_up import warm_up
@@ -68,7 +68,7 @@ async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Und
             note, begun, why = str(row["note"]), time.monotonic(), ""
             llm: Guidance | None = None
             try:
-                llm = await understood(note, SCENARIOS["paper"], upstream)
+                llm = await compiled(note, SCENARIOS["paper"], upstream)
             except (BadOrders, Impossible, NoDecision, TimeoutError) as error:
                 why = str(error) or "late"
             took = time.monotonic() - begun
@@ -80,13 +80,13 @@ async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Und
 
 def control(note: str) -> Guidance | None:
     """The most similar example's orders with this note's numbers in their place; None where those do not fit."""
-    example, orders = shown(note, 1)[0]
+    example, orders = similar_examples(note, 1)[0]
     theirs, ours = numbers(example), numbers(note)
     if len(theirs) != len(ours):
         return None
     names = dict(zip(map(str, theirs), map(str, ours), strict=True))
     try:
-        return read(re.sub(r"[0-9]+", lambda found: names.get(found[0], found[0]), orders), note)
+        return parse_orders(re.sub(r"[0-9]+", lambda found: names.get(found[0], found[0]), orders), note)
     except BadOrders:
         return None
 

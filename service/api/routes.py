@@ -120,7 +120,7 @@ async def get_attention(mission_id: MissionId, engine: TheEngine, request: Reque
 @router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
     """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
-    return (await engine.missions.get(mission_id)).guidance.told(mission_id)
+    return (await engine.missions.get(mission_id)).guidance.report(mission_id)
 
 
 @router.post(
@@ -132,7 +132,7 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     engine.missions.refuse_if_failing("answer")
     mission.answer_guidance(body)
     await engine.durable("answer")
-    return mission.guidance.told(mission_id)
+    return mission.guidance.report(mission_id)
 
 
 @router.get("/healthz", tags=["operation"])

@@ -124,7 +124,7 @@ def test_orders_that_do_not_stand_up_are_drawn_again(edge: Edge) -> None:
         ("Look at sensor 42 every 3 steps", "visit sensor 42 every 3 steps", "sensor 42 is unknown"),
         ("Between 9 and 8 m/s", "fly at least 9 m/s, fly at most 8 m/s", "no velocity is left"),
         (NOTE, "", "is no order"),
-        ("Be careful", ORDERS, "names no number"),
+        ("Be careful", ORDERS, "has no number"),
     ],
 )
 def test_what_cannot_be_made_sense_of_fails_and_the_operators_own_still_counts(
