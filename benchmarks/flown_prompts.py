@@ -129,16 +129,20 @@ class Scribe(LocalPilot):
             return Put(mission.template.prompt(view.state, shown, mission.experiences.block, nearest), view.kept_ids)
         offer = candidates_of(view)
         self._note(mission, mission.template, view, offer)
-        return Put(mission.template.offer(offer, view.state, mission.experiences.block, nearest), view.kept_ids, offer)
+        return Put(
+            mission.template.choice_prompt(offer, view.state, mission.experiences.block, nearest), view.kept_ids, offer
+        )
 
     def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
         self._step[view.uav_id] = offer, view
         if len(self._step) == mission.scenario.uavs:
-            shares = template.together({u: (o, v.state) for u, (o, v) in self._step.items()}, mission.experiences.block)
+            shares = template.fleet_prompts(
+                {u: (o, v.state) for u, (o, v) in self._step.items()}, mission.experiences.block
+            )
             first = next(iter(shares.values()))
             state = "".join(share.state for share in shares.values())
-            whole = Prompt(template.static_together, first.experiences, state, first.uncompressed)
+            whole = Prompt(template.fleet_static, first.experiences, state, first.uncompressed)
             self.together.append(Together(view.step, whole, [list(o.labels) for o, _ in self._step.values()]))
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:

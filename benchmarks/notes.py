@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from service.config.settings import Settings
-from service.guidance.note_compiler import compiled
+from service.guidance.note_compiler import compile_note
 from service.guidance.note_orders import BadOrders, number_of, parse_orders, similar_examples
 from service.llm.answer_format import NoDecision
 from service.llm.server_pool import ServerPool
@@ -56,7 +56,7 @@ class Understood:
     seconds: float
 
 
-async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
+async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
     """The LLM's name and what was made of each note."""
     upstream = ServerPool(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
@@ -68,7 +68,7 @@ async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Und
             note, begun, why = str(row["note"]), time.monotonic(), ""
             llm: Guidance | None = None
             try:
-                llm = await compiled(note, SCENARIOS["paper"], upstream)
+                llm = await compile_note(note, SCENARIOS["paper"], upstream)
             except (BadOrders, Impossible, NoDecision, TimeoutError) as error:
                 why = str(error) or "late"
             took = time.monotonic() - begun
@@ -111,7 +111,7 @@ def facts(guidance: Guidance | None) -> set[tuple[str, int, float]]:
 def main(asked: Notes) -> None:
     """Run, print, write."""
     console = Console()
-    model, rows = asyncio.run(compiled(json.loads(asked.notes.read_text())))
+    model, rows = asyncio.run(understood(json.loads(asked.notes.read_text())))
     told = Table("", "note", "understood", title=str(model))
     for row in rows:
         right = facts(row.llm) == facts(row.meant) and row.llm is not None

@@ -161,7 +161,7 @@ class AttendedState:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            seen=self.mission.template.unknown(sensor_id) if row is None else cells(self.state, [row])[0],
+            seen=self.mission.template.unreported_row(sensor_id) if row is None else cells(self.state, [row])[0],
             sample=sample,
         )
 

@@ -80,7 +80,9 @@ class Deliberation:
         template = template_of(mission)
         return cls(
             candidates=candidates,
-            prompt=template.offer(candidates, state.state, mission.experiences.block, state.similar_experiences()),
+            prompt=template.choice_prompt(
+                candidates, state.state, mission.experiences.block, state.similar_experiences()
+            ),
             advised={name: found.probabilities(candidates.actions) for name, found in preferences.items()},
             rollout=rollout,
         )
@@ -176,4 +178,4 @@ def candidates_of(state: AttendedState) -> CandidateSet:
     if guidance is None:
         return candidates
     rows = {int(sensor): row for row, sensor in enumerate(state.state.ids)}
-    return candidates.flown_as(lambda sensor, velocity: guidance.nearest(rows[sensor], velocity))
+    return candidates.with_velocities(lambda sensor, velocity: guidance.nearest(rows[sensor], velocity))

@@ -127,12 +127,12 @@ class LlmQueries:
         if not asked:
             return {}
         similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())
-        prompts = template.together(
+        prompts = template.fleet_prompts(
             {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
             mission.experiences.block,
             list(similar),
         )
-        static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())
+        static, user = template.fleet_static, "".join(prompt.user for prompt in prompts.values())
         labels = [list(candidates.labels) for _, candidates in asked.values()]
         completion, by_label, reason = await self._query(mission, static, user, labels, deadline)
         self._note_lateness(len(asked), reason)
@@ -195,4 +195,4 @@ class LlmQueries:
 
 def by_action(candidates: CandidateSet, by_label: dict[str, float]) -> dict[Action, float]:
     """Probabilities of the candidates' labels as those of their actions."""
-    return dict(zip(candidates.actions, candidates.spread(by_label).tolist(), strict=True))
+    return dict(zip(candidates.actions, candidates.sum_by_action(by_label).tolist(), strict=True))

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 # The first answer is the likeliest one; the later ones are sampled.
 _ATTEMPTS = 5
 _TEMPERATURE = 0.7
-# For one answer, including the wait until no decision needs the LLM, and for the whole note, including the LLM's loading.
+# For one answer, including the wait while decisions use the LLM, and for the whole note, including the LLM's loading.
 _ANSWER_S = 60.0
 _TIMEOUT_S = 300.0
 _POLL_S = 0.2
@@ -83,7 +83,7 @@ class NoteCompiler:
                 await self._wait_for_llm()
                 if mission.guidance.status != "compiling":
                     return
-                mission.propose_guidance(await compiled(note, mission.scenario, self._llm), self._llm.model)
+                mission.propose_guidance(await compile_note(note, mission.scenario, self._llm), self._llm.model)
                 return
         except (BadOrders, Impossible, NoDecision) as error:
             reason = str(error)
@@ -102,7 +102,7 @@ class NoteCompiler:
             raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")
 
 
-async def compiled(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:
+async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:
     """The guidance of the first answer that passes every check.
 
     Raises:

@@ -20,7 +20,7 @@ from service.llm.answer_format import NoDecision
 from service.llm.calibration import calibrated, probabilities
 from service.llm.completion import Completion, Place
 from service.mission.mission import Mission
-from service.prompting.candidates import velocities
+from service.prompting.candidates import velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
 from shared.actions import Action
 from shared.reach import Reach
@@ -147,11 +147,11 @@ def test_a_low_temperature_is_undone() -> None:
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
     distance = np.full((15, 1), 50.0)
     reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
-    assert velocities(reach, 0, 4) == [0, 5, 9, 14]
-    assert velocities(reach, 0, 1) == [14]
+    assert velocity_options(reach, 0, 4) == [0, 5, 9, 14]
+    assert velocity_options(reach, 0, 1) == [14]
     distance[:3] = distance[12:] = 1e9
     reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
-    assert velocities(reach, 0, 4) == [3, 6, 8, 11]
+    assert velocity_options(reach, 0, 4) == [3, 6, 8, 11]
 
 
 def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None:
@@ -230,7 +230,7 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
         labels = made.candidates.labels
         worst = max(labels, key=lambda name: judgement.lost[labels[name]])
         told = worst if answer == "worst" else str(random.choice(list(labels)))
-        word = made.candidates.spread({name: float(name == told) for name in labels})
+        word = made.candidates.sum_by_action({name: float(name == told) for name in labels})
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None and verdict.action == plan
         assert set(verdict.report.trust) == {"llm", "planner", "value", "policy"}
@@ -243,7 +243,7 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
         view, made = deliberation(mission, step)
         judgement = made.evaluate()
         label = answer(made, judgement.lost)
-        word = made.candidates.spread({name: float(name == label) for name in made.candidates.labels})
+        word = made.candidates.sum_by_action({name: float(name == label) for name in made.candidates.labels})
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None
         decision_id = f"{step:032x}"
@@ -269,7 +269,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     judgement = made.evaluate()
     worst = max(made.candidates.labels, key=lambda name: judgement.lost[made.candidates.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
-    told = made.candidates.spread({name: float(name == worst) for name in made.candidates.labels})
+    told = made.candidates.sum_by_action({name: float(name == worst) for name in made.candidates.labels})
     verdict = made.conclude(mission.trust_in("stub"), judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]

@@ -24,7 +24,7 @@ from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
-from service.prompting.unpruned_baseline import Uncompressed
+from service.prompting.unpruned_baseline import UnprunedState
 from service.storage.event_codec import decode, encode
 from service.storage.serialization import pack
 from shared.wire import DecideResponse, Outcome, Tokens
@@ -293,7 +293,7 @@ def answer_of(decision_id: str, mission_id: str = "test") -> DecideResponse:
 
 
 def prompt_of(state: str) -> Prompt:
-    return Prompt("static", "", state, Uncompressed(attended(mission(), uav()).state, FORMATS["csv"].row))
+    return Prompt("static", "", state, UnprunedState(attended(mission(), uav()).state, FORMATS["csv"].row))
 
 
 def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
