@@ -1,4 +1,4 @@
-"""Bodies of requests: bounded in time, and in size before and after they are unpacked."""
+"""Request bodies: limits on the time to receive them, and on their size before and after decompression."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.problem_details import problem_response
 
-# Meanwhile a body keeps the place of a decision.
+# A body that is still on its way counts against the concurrency limit.
 _BODY_S = 10.0
 
 
 class _TooLarge(Exception):
-    """The body, or what it unpacks to, exceeds the limit."""
+    """The body exceeds the limit, before or after decompression."""
 
 
 class _Damaged(Exception):
-    """The body is not in the encoding that it claims."""
+    """The body does not match its Content-Encoding."""
 
 
 class RequestBody:
-    """Pure ASGI middleware: reads the body up to ``limit`` bytes and undoes ``Content-Encoding: gzip | zstd``.
+    """Pure ASGI middleware: reads the body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``.
 
-    Answers 413 past the limit, 408 to what has not come within 10 s, 415 for another encoding, 400 for a damaged one,
-    each as a problem document.
+    It answers 413 past the limit, 408 for a body that takes longer than 10 s, 415 for another encoding and 400 for a
+    damaged body, each as a problem document.
     """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
@@ -60,21 +60,21 @@ class RequestBody:
         await self.app(scope, _replay(body, receive), send)
 
     def _refusal(self, fault: Exception) -> Response:
-        """The problem; the connection ends where the rest of the body may still come."""
+        """The problem document; the connection ends where the rest of the body may still arrive."""
         match fault:
             case TimeoutError():
-                status, told = 408, f"not here within {_BODY_S:g} s"
+                status, problem = 408, f"not received within {_BODY_S:g} s"
             case _Damaged():
-                status, told = 400, str(fault)
+                status, problem = 400, str(fault)
             case _:
-                status, told = 413, f"larger than {self.limit} bytes"
-        response = problem_response(status, f"body: {told}", [{"field": "body", "problem": told}])
+                status, problem = 413, f"larger than {self.limit} bytes"
+        response = problem_response(status, f"body: {problem}", [{"field": "body", "problem": problem}])
         if status != 400:
             response.headers["Connection"] = "close"
         return response
 
     async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
-        """The body; None where the client hung up before its end."""
+        """The body; None where the client disconnected before its end."""
         if content_length.isdigit() and int(content_length) > self.limit:
             raise _TooLarge
         body = bytearray()
@@ -109,12 +109,12 @@ def _gunzip(body: bytes, limit: int) -> bytes:
     if not decoder.eof:
         raise _Damaged("gzip ends too early")
     if decoder.unused_data:
-        raise _Damaged("something follows the gzip member")
+        raise _Damaged("there is data after the gzip member")
     return plain
 
 
 def _unzstd(body: bytes, limit: int) -> bytes:
-    """The stream reader bounds what is unpacked but hides a missing end, the object sees the end but has no bound."""
+    """The stream reader limits the size but hides a missing end; the decompression object detects the end without a limit."""
     decompressor = zstandard.ZstdDecompressor(max_window_size=2**23)
     try:
         with decompressor.stream_reader(body) as reader:
@@ -127,7 +127,7 @@ def _unzstd(body: bytes, limit: int) -> bytes:
     if not decoder.eof:
         raise _Damaged("zstd ends too early")
     if decoder.unused_data:
-        raise _Damaged("something follows the zstd frame")
+        raise _Damaged("there is data after the zstd frame")
     return plain
 
 

@@ -47,7 +47,7 @@ RequestKey = Annotated[
     ),
 ]
 
-HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
+KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
 
 
 @router.post(
@@ -60,9 +60,9 @@ async def decide(body: DecideRequest, request: Request, key: RequestKey = None) 
     """Which sensor to collect from, and how fast to fly the next step."""
     engine: Engine = request.state.engine
     answer = await engine.decide(body, may_make=may_make_missions(request), key=key)
-    took = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
-    # As text at once: FastAPI would check and convert its own model's instance again.
-    return Response(answer.model_dump_json(), media_type="application/json", headers=took)
+    timing = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
+    # The response is text already, because FastAPI would validate and convert the model a second time.
+    return Response(answer.model_dump_json(), media_type="application/json", headers=timing)
 
 
 @router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
@@ -101,7 +101,7 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
         await engine.missions.delete(mission_id)
         engine.live.forget(mission_id)
     finally:
-        # One that is gone already may not yet be gone from the disk.
+        # A mission that is already deleted may still be on disk.
         await engine.durable("mission_id")
 
 
@@ -111,10 +111,12 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 422, 503)},
     tags=["missions"],
 )
-async def get_attention(mission_id: MissionId, engine: TheEngine, request: Request, held: HeldTag = None) -> Response:
+async def get_attention(
+    mission_id: MissionId, engine: TheEngine, request: Request, known_tags: KnownTags = None
+) -> Response:
     """The attention module's weights, with an ETag: to score the sensors on board, and report only the k best."""
     mission = await engine.missions.get(mission_id)
-    return attention_weights.told(mission, held, request.headers.get("Accept-Encoding", ""))
+    return attention_weights.attention_response(mission, known_tags, request.headers.get("Accept-Encoding", ""))
 
 
 @router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])

@@ -45,7 +45,7 @@ class Feedback:
                 outcome = outcome.model_copy(update={"cost": mission.pending.max_step_cost})
             taught = not self._lessons.full
             sample = mission.apply(outcome, for_training=taught)
-            self._live.settled(mission, outcome)
+            self._live.outcome_applied(mission, outcome)
             if sample is not None and taught:
                 self._lessons.add(Lesson(mission, sample, outcome.cost))
             elif sample is not None:

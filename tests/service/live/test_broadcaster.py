@@ -153,7 +153,7 @@ def test_listeners_are_bounded_and_take_no_decisions_place(edge: Edge, report: R
         refused = client.get("/missions/test/events")
         assert refused.status_code == 503
         assert refused.headers["retry-after"]
-        assert "pages are watching already" in refused.json()["detail"]
+        assert "pages listen already" in refused.json()["detail"]
         decided(client, report(step=1))
     # Those who left take no places any more.
     until(lambda: client.get("/missions/none/events").status_code == 404)
@@ -227,7 +227,7 @@ def test_the_page_is_open_and_what_it_shows_needs_a_key(
 ) -> None:
     # A key is looked at again at each event, and one comes soon.
     monkeypatch.setattr("service.live.broadcaster._HEARTBEAT_S", 0.05)
-    monkeypatch.setattr("service.api.live_routes._STILL_KNOWN_S", 0.0)
+    monkeypatch.setattr("service.api.live_routes._KEY_CHECK_S", 0.0)
     monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
     path = tmp_path / "keys.json"
     with editing(path) as known:
@@ -316,8 +316,8 @@ def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
 def test_a_decision_is_shown_with_its_outcome() -> None:
     history = RecentDecisions()
     history.decided((1.0, 2.0), prompt_of(""), answer_of("a" * 32))
-    history.settled(Outcome(decision_id="a" * 32, cost=1.0))
-    history.settled(Outcome(decision_id="b" * 32, cost=1.0))
+    history.outcome_applied(Outcome(decision_id="a" * 32, cost=1.0))
+    history.outcome_applied(Outcome(decision_id="b" * 32, cost=1.0))
     assert [(one.order, one.settled) for one in history.of("test")] == [(1, 2)]
 
 
