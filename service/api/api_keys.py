@@ -85,7 +85,7 @@ class KeyFile(BaseModel):
             raise BadKeys(f"{path}: {error.strerror or error}") from None
 
     def add(self, name: str, scopes: frozenset[Scope], per_minute: int) -> str:
-        """Add a key; returns the key itself, to be shown once. Raises ``BadKeys`` for a name in use, or too many keys."""
+        """Add a key; returns the key itself. Raises ``BadKeys`` for a name in use, or too many keys."""
         if any(key.name == name for key in self.keys):
             raise BadKeys(f"there is already a key {name}: remove it first, or choose another name")
         if len(self.keys) >= _MOST_KEYS:

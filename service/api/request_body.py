@@ -114,7 +114,7 @@ def _gunzip(body: bytes, limit: int) -> bytes:
 
 
 def _unzstd(body: bytes, limit: int) -> bytes:
-    """The stream reader limits the size but hides a missing end; the decompression object detects the end without a limit."""
+    """The stream reader limits the size but hides a missing end; the object detects the end but has no limit."""
     decompressor = zstandard.ZstdDecompressor(max_window_size=2**23)
     try:
         with decompressor.stream_reader(body) as reader:

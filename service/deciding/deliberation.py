@@ -26,7 +26,7 @@ import numpy as np
 
 from service.deciding.advisers import ADVISERS, SMOOTHING
 from service.deciding.attended_state import AttendedState
-from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
+from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
@@ -74,7 +74,7 @@ class Deliberation:
             state.uav_id,
             seed=mission.spec.seed,
             reserved=state.reserved,
-            course=None if mission.planner is None else mission.planner.plans(),
+            plans=None if mission.planner is None else mission.planner.plans(),
             guidance=mission.guidance.confirmed,
         )
         template = template_of(mission)
@@ -87,14 +87,14 @@ class Deliberation:
             rollout=rollout,
         )
 
-    def evaluate(self) -> Judgement:
+    def evaluate(self) -> Evaluation:
         """What the rollout evaluator expects of every candidate."""
-        return judge(self.rollout, self.candidates.actions)
+        return evaluate(self.rollout, self.candidates.actions)
 
     def conclude(
         self,
         trust: Trust,
-        judgement: Judgement,
+        evaluation: Evaluation,
         llm: FloatArray | None,
         *,
         calibrated: bool,
@@ -113,7 +113,7 @@ class Deliberation:
             heard[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
         weights = trust.among(heard)
         mixture = np.sum([weights[name] * p for name, p in heard.items()], axis=0)
-        regret = self._regret(judgement.lost)
+        regret = self._regret(evaluation.lost)
         score = np.log(mixture) - RATE * np.minimum(regret, CAP)
         free = ~np.isin([sensor for sensor, _ in self.candidates.actions], list(reserved))
         if not free.any():
@@ -123,7 +123,7 @@ class Deliberation:
         advice = Advice(
             regret={name: float(p @ np.minimum(regret, CAP)) for name, p in heard.items()},
             flown={name: float(p[best]) for name, p in heard.items()},
-            expected_cost=float(judgement.cost[best]),
+            expected_cost=float(evaluation.cost[best]),
         )
         report = Guided(
             trust={name: round(weight, 4) for name, weight in trust.weights.items()},

@@ -133,25 +133,25 @@ class Guided(Policy):
         deliberation, advice, mission = question.deliberation, task.advice, state.mission
         if deliberation is None:
             return Fallback("no_candidate")
-        evaluation = asyncio.get_running_loop().run_in_executor(self._evaluating, deliberation.evaluate)
+        result = asyncio.get_running_loop().run_in_executor(self._evaluating, deliberation.evaluate)
         try:
             if advice is None:
                 candidates, prompt = deliberation.candidates, deliberation.prompt
                 advice = await self._queries.ask(mission, candidates, prompt, task.deadline)
                 task.watch.lap("llm")
-            await asyncio.wait({evaluation}, timeout=task.evaluation_deadline.left())
-            judgement = evaluation.result() if evaluation.done() else None
+            await asyncio.wait({result}, timeout=task.evaluation_deadline.left())
+            evaluation = result.result() if result.done() else None
         finally:
             # An evaluation that still waits for a thread does not begin.
-            evaluation.cancel()
+            result.cancel()
         task.watch.lap("judge")
-        if judgement is None:
+        if evaluation is None:
             reason = advice.reason or "critic_timeout"
             return Fallback(reason, advice.completion, advice.model, evaluated_late=True)
         reserved = mission.reservations.of_others(state.step, state.uav_id)
         llm = advice.over(deliberation.candidates.actions)
         trust = mission.trust_in(advice.model)
-        verdict = deliberation.conclude(trust, judgement, llm, calibrated=advice.calibrated, reserved=reserved)
+        verdict = deliberation.conclude(trust, evaluation, llm, calibrated=advice.calibrated, reserved=reserved)
         if verdict is None:
             return Fallback("answer_reserved", advice.completion, advice.model)
         # Other UAVs may have every sensor that the LLM named by now.

@@ -14,7 +14,7 @@ from fastapi.responses import Response
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import Deliberation
-from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
+from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import LLM
 from service.llm.answer_format import NoDecision
 from service.llm.calibration import calibrated, probabilities
@@ -162,7 +162,7 @@ def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None
     state.sensors.y[0] = float(start[1])
     mission.observe(state, 0)
     situation = RolloutState.of(mission.belief, PAPER, 0, 0)
-    judged = judge(situation, [Action(0, 0), Action(1, 0)])
+    judged = evaluate(situation, [Action(0, 0), Action(1, 0)])
     assert judged.lost[1] > judged.lost[0] + 1
     # Sensor 1 was never reported: nothing can be collected from it.
     assert judged.cost[1] >= 1.0 > judged.cost[0]
@@ -178,7 +178,7 @@ def test_a_plan_is_judged_by_its_own_continuation_and_never_below_look_ahead() -
 
     def lost(course: list[Action] | None) -> float:
         plan = None if course is None else {0: course}
-        return float(judge(RolloutState.of(mission.belief, PAPER, 0, 0, course=plan), [Action(0, 0)]).lost[0])
+        return float(evaluate(RolloutState.of(mission.belief, PAPER, 0, 0, plans=plan), [Action(0, 0)]).lost[0])
 
     pairs = [(0, 0), (2, 0), (0, 0), (2, 0), (2, 14), (0, 14), (0, 7), (2, 14)]
     dwells = [Action(*pair) for pair in pairs]
@@ -213,7 +213,7 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
     place = made.candidates.actions.index(plan)
     losses = np.zeros(len(made.candidates.actions))
     losses[place] = lost
-    verdict = made.conclude(mission.trust_in("stub"), Judgement(losses, losses), None, calibrated=False)
+    verdict = made.conclude(mission.trust_in("stub"), Evaluation(losses, losses), None, calibrated=False)
     assert verdict is not None
     assert (verdict.action == plan) == flown
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.config.settings import Settings
 from service.deciding.deliberation import Deliberation
 from service.deciding.look_ahead import look_ahead
-from service.deciding.rollout_evaluator import RolloutState, judge
+from service.deciding.rollout_evaluator import RolloutState, evaluate
 from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
@@ -302,7 +302,7 @@ def test_the_critic_counts_what_the_operator_asks(asked: dict[str, Any]) -> None
     made.observe(uav(queue=[55.0, 59.0]), 0)
 
     def lost(guidance: Guidance) -> NDArray[np.float64]:
-        return judge(RolloutState.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
+        return evaluate(RolloutState.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
 
     before, after = lost(Guidance()), lost(Guidance(sensors=[SensorWish.model_validate({"sensor_id": 0, **asked})]))
     assert before[0] > before[1] and after[0] < after[1]

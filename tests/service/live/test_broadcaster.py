@@ -19,7 +19,7 @@ import pytest
 
 from service.api.api_keys import editing
 from service.api.live_routes import STATIC
-from service.live.broadcaster import MOST_LISTENERS
+from service.live.broadcaster import MAX_LISTENERS
 from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
 from service.prompting.prompt import Prompt
@@ -148,7 +148,7 @@ def test_listeners_are_bounded_and_take_no_decisions_place(edge: Edge, report: R
     client = edge(max_requests=1)
     decided(client, report())
     with ExitStack() as stack:
-        listeners = [stack.enter_context(watching(client)) for _ in range(MOST_LISTENERS)]
+        listeners = [stack.enter_context(watching(client)) for _ in range(MAX_LISTENERS)]
         assert {next(events)[0] for events in listeners} == {"snapshot"}
         refused = client.get("/missions/test/events")
         assert refused.status_code == 503
@@ -161,7 +161,7 @@ def test_listeners_are_bounded_and_take_no_decisions_place(edge: Edge, report: R
 
 def test_nobody_watches_a_mission_that_there_is_not(edge: Edge) -> None:
     client = edge()
-    for _ in range(MOST_LISTENERS + 1):
+    for _ in range(MAX_LISTENERS + 1):
         assert client.get("/missions/none/events").status_code == 404
     assert client.get("/missions/-/events").status_code == 422
 
