@@ -42,7 +42,7 @@ class Demonstrate:
 def main(argv: list[str]) -> int:
     """Choose and write; returns the exit code."""
     args = tyro.cli(Demonstrate, prog="aicvds demonstrate", args=argv)
-    # They import torch, which takes seconds; `--help` answers without it.
+    # These imports load torch, which takes seconds; `--help` answers without them.
     from service.prompting.demonstrations import Demonstrations
     from service.training.demonstration_teachers import TEACHERS, farthest_first, solutions
 
@@ -53,9 +53,9 @@ def main(argv: list[str]) -> int:
             raise ValueError(f"--count {args.count} is not at least 1")
         header, steps = read_rollouts(args.rollouts)
         total = header.missions * header.scenario.steps * header.scenario.uavs
-        told = track(steps, total=total, description="Solving", console=Console(stderr=True))
+        tracked = track(steps, total=total, description="Solving", console=Console(stderr=True))
         demonstrations, states = [], []
-        for demonstration, state in solutions(header, told, TEACHERS[args.teacher]):
+        for demonstration, state in solutions(header, tracked, TEACHERS[args.teacher]):
             demonstrations.append(demonstration)
             states.append(state)
         if not states:

@@ -62,11 +62,17 @@ class Options:
 
 
 def main(argv: list[str]) -> int:
-    """Do what the command line asks for; returns the exit code."""
+    """Run ``aicvds keys``; returns the exit code."""
     config = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
-    asked = tyro.cli(Options, prog="aicvds keys", args=argv, config=config).do
+    command = tyro.cli(Options, prog="aicvds keys", args=argv, config=config).do
     try:
-        return _add(asked) if isinstance(asked, Add) else _list(asked) if isinstance(asked, List) else _remove(asked)
+        return (
+            _add(command)
+            if isinstance(command, Add)
+            else _list(command)
+            if isinstance(command, List)
+            else _remove(command)
+        )
     except BadKeys as error:
         print(f"aicvds keys: {error}", file=sys.stderr)
     except ValidationError as error:
@@ -75,24 +81,24 @@ def main(argv: list[str]) -> int:
     return 2
 
 
-def _add(asked: Add) -> int:
-    with editing(asked.file) as known:
-        shown = known.add(asked.name, frozenset(asked.scopes), asked.per_minute)
-    print(f"Key {asked.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
+def _add(command: Add) -> int:
+    with editing(command.file) as known:
+        shown = known.add(command.name, frozenset(command.scopes), command.per_minute)
+    print(f"Key {command.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
     print(shown)
     return 0
 
 
-def _list(asked: List) -> int:
+def _list(command: List) -> int:
     table = Table("name", "scopes", "a minute")
-    for key in KeyFile.read(asked.file).keys:
+    for key in KeyFile.read(command.file).keys:
         table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute))
     Console().print(table)
     return 0
 
 
-def _remove(asked: Remove) -> int:
-    with editing(asked.file) as known:
-        known.remove(asked.name)
-    print(f"Key {asked.name} is removed", file=sys.stderr)
+def _remove(command: Remove) -> int:
+    with editing(command.file) as known:
+        known.remove(command.name)
+    print(f"Key {command.name} is removed", file=sys.stderr)
     return 0

@@ -242,7 +242,7 @@ class _RolloutBatch:
         self.overflow_in_reach: FloatArray = np.zeros(len(queue))
 
     def fly_first(self, first: NDArray[np.int64], collects: NDArray[np.bool_]) -> FloatArray:
-        """Fly the candidates' step, ``(B, 2)``, with the other UAVs' decisions, plans or policy; returns f, ``(B,)``."""
+        """Fly the candidates' step, ``(B, 2)``, with the others' decisions, plans or policy; returns f, ``(B,)``."""
         state, own = self._state, self._state.uav
         served = np.tile(state.reserved, (len(first), 1))
         failed: FloatArray = np.ones(len(first))

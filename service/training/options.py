@@ -1,4 +1,4 @@
-"""What ``aicvds pretrain`` can be asked for."""
+"""The options of ``aicvds pretrain``."""
 
 from __future__ import annotations
 

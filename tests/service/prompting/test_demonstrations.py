@@ -9,7 +9,7 @@ from service.commands.demonstrate import main
 from service.deciding.look_ahead import look_ahead
 from service.errors import Refused
 from service.prompting.demonstrations import packaged
-from service.training.demonstration_teachers import TEACHERS, farthest_first, likeness, solutions
+from service.training.demonstration_teachers import TEACHERS, farthest_first, point, solutions
 from shared.actions import Action
 from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
@@ -150,9 +150,9 @@ def test_the_farthest_comes_next() -> None:
 
 def test_what_is_alike_depends_on_the_answer() -> None:
     view = attended(mission(MissionSpec(features="reach")), uav())
-    one, other = likeness(view.state, 1, 7, PAPER), likeness(view.state, 3, 7, PAPER)
+    one, other = point(view.state, 1, 7, PAPER), point(view.state, 3, 7, PAPER)
     assert not np.allclose(one, other)
-    assert np.allclose(likeness(view.state, 1, 14, PAPER)[:-1], one[:-1])
+    assert np.allclose(point(view.state, 1, 14, PAPER)[:-1], one[:-1])
 
 
 def test_the_command_writes_what_a_mission_can_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
