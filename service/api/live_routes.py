@@ -21,7 +21,8 @@ from service.api.routes import TheEngine
 from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
 from shared.missions import DecisionPrompt, MissionLine, MissionList
-from shared.wire import DecisionId, MissionId, Reason
+from shared.reasons import LLM_NOT_ASKED
+from shared.wire import DecisionId, MissionId
 
 log = logging.getLogger(__name__)
 
@@ -37,9 +38,6 @@ _SECURITY_HEADERS = {
 }
 _MOST_LISTED = 200
 _KEY_CHECK_S = 1.0
-_UNASKED: frozenset[Reason] = frozenset(
-    ("mode_value", "mode_policy", "no_candidate", "llm_loading", "llm_unavailable", "llm_busy")
-)
 
 
 class Assets(StaticFiles):
@@ -136,7 +134,7 @@ async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: The
     prompt = decision.prompt
     return DecisionPrompt(
         decision_id=decision_id,
-        asked=decision.answer.reason not in _UNASKED,
+        asked=decision.answer.reason not in LLM_NOT_ASKED,
         static=prompt.static,
         experiences=prompt.experiences,
         state=prompt.state,

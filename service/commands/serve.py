@@ -80,8 +80,8 @@ def _serve(listener: socket.socket, host: str) -> int:
 
     if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
         return _refused(
-            f"anyone who reaches {host} could control this fleet. Make a key with `aicvds keys add NAME --file keys.json`, "
-            "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
+            f"anyone who reaches {host} could control this fleet. Make a key with "
+            "`aicvds keys add NAME --file keys.json`, set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
 
     from service.observability import logs

@@ -24,7 +24,7 @@ from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
-from shared.wire import Reason
+from shared.reasons import Reason
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from typing import Any, Literal
 
 from shared.actions import Action
-from shared.wire import Reason
+from shared.reasons import Reason
 
 Constraint = Literal["grammar", "structured_outputs", "json_schema", "none"]
 

@@ -71,8 +71,9 @@ def losses(modules: Modules, batch: Batch, temperature: float = 1.0) -> tuple[Te
     """Mean value regression, and mean cross-entropy that ranks the teacher's sensor, and a velocity for it, first.
 
     ``(s_j - r)^2 + (u_v - r)^2`` of the recorded decision, and
-    ``-ln softmax(s / temperature)_j* - ln softmax(u / temperature)_v*`` of the reference j*, v*: the first (ListNet's top-one probability, Cao et al., ICML 2007, with one relevant sensor)
-    only where j* can send something.
+    ``-ln softmax(s / temperature)_j* - ln softmax(u / temperature)_v*`` of the reference j*, v*.
+    The first term (ListNet's top-one probability, Cao et al., ICML 2007, with one relevant sensor) counts only where j*
+    can send something.
     """
     scores, z = modules.attention(batch.features, batch.admissible)
     everyone = torch.arange(len(batch))
