@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from limits import RateLimitItemPerMinute
 from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
-from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
@@ -41,12 +40,6 @@ def is_open(method: str, path: str) -> bool:
     """Whether the request needs no key."""
     # Other methods need a key: their bodies would be read for nothing.
     return method in READING and (path in _OPEN or path.startswith(_OPEN_PREFIX))
-
-
-def may_make_missions(request: Request) -> bool:
-    """Whether the request may make its mission where that does not exist: with keys, only scope ``admin`` may."""
-    scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
-    return scopes is None or "admin" in scopes
 
 
 class KeyAuthentication:

@@ -27,7 +27,10 @@ class ConcurrencyLimit:
         self._running = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_exempt(scope["method"], scope["path"]):
+        if scope["type"] != "http" or (
+            scope["method"] in READING
+            and (scope["path"] in _NEVER_REFUSED or _STREAMS.fullmatch(scope["path"]) is not None)
+        ):
             await self.app(scope, receive, send)
             return
         if self._running >= self._most:
@@ -41,7 +44,3 @@ class ConcurrencyLimit:
             await self.app(scope, receive, send)
         finally:
             self._running -= 1
-
-
-def _is_exempt(method: str, path: str) -> bool:
-    return method in READING and (path in _NEVER_REFUSED or _STREAMS.fullmatch(path) is not None)

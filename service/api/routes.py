@@ -9,7 +9,8 @@ from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
 from service.api import attention_weights
-from service.api.authentication import may_make_missions
+from service.api.api_keys import Scope
+from service.api.authentication import SCOPES
 from service.api.problem_details import documented
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
@@ -36,6 +37,12 @@ async def _engine(request: Request) -> Engine:
     return engine
 
 
+def _may_make_missions(request: Request) -> bool:
+    """Whether the request may make its mission where that does not exist: with keys, only scope ``admin`` may."""
+    scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
+    return scopes is None or "admin" in scopes
+
+
 TheEngine = Annotated[Engine, Depends(_engine)]
 RequestKey = Annotated[
     str | None,
@@ -59,7 +66,7 @@ KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000,
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
     """Which sensor to collect from, and how fast to fly the next step."""
     engine: Engine = request.state.engine
-    answer = await engine.decide(body, may_make=may_make_missions(request), key=key)
+    answer = await engine.decide(body, may_make=_may_make_missions(request), key=key)
     timing = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
     # The response is text already, because FastAPI would validate and convert the model a second time.
     return Response(answer.model_dump_json(), media_type="application/json", headers=timing)
@@ -70,7 +77,7 @@ async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
-    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make_missions(request), key=key))
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=_may_make_missions(request), key=key))
 
 
 @router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])

@@ -145,12 +145,14 @@ class Broadcaster:
     def decided(self, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
         """Show an answered decision with its prompt, whether an LLM received the prompt or not."""
         self.history.decided((uav.position[0], uav.position[1]), prompt, answer)
-        self._change(answer.mission_id)
+        if (stream := self._streams.get(answer.mission_id)) is not None:
+            stream.change()
 
     def outcome_applied(self, mission: Mission, outcome: Outcome) -> None:
         """Show an outcome that is applied."""
         self.history.outcome_applied(outcome)
-        self._change(mission.mission_id)
+        if (stream := self._streams.get(mission.mission_id)) is not None:
+            stream.change()
 
     def forget(self, mission_id: str) -> None:
         """Forget a deleted mission, and tell its listeners."""
@@ -205,10 +207,6 @@ class Broadcaster:
                 stream.close()
                 if self._streams.get(mission.mission_id) is stream:
                     del self._streams[mission.mission_id]
-
-    def _change(self, mission_id: str) -> None:
-        if (stream := self._streams.get(mission_id)) is not None:
-            stream.change()
 
 
 def _event(name: str, data: bytes) -> bytes:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from string import ascii_uppercase
 from typing import Self
 
@@ -28,7 +29,7 @@ _MOST_VELOCITIES = 4
 _NEARLY_BEST = 0.9
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Letters:
     """A mission's choice letters: the most ``rows`` that a prompt shows, and the ``velocities`` of each row."""
 
@@ -41,12 +42,12 @@ class Letters:
         velocities = max(1, min(_MOST_VELOCITIES, _MOST_LABELS // rows))
         return cls(min(rows, _MOST_LABELS // velocities), velocities)
 
-    @property
+    @cached_property
     def all(self) -> str:
         """Every letter that a prompt can offer."""
         return ascii_uppercase[: self.rows * self.velocities]
 
-    @property
+    @cached_property
     def first(self) -> str:
         """The first letter of each row, which the row shows."""
         return self.all[:: self.velocities]

@@ -46,6 +46,9 @@ _CONTENT_FREE = ("N/A", "?,?,?")
 class GuidedTemplate(Template):
     """The prompt of mode ``guided``; it has one format and no demonstrations.
 
+    Attributes:
+        labels: every choice letter of the mission's prompts.
+
     Args:
         scenario: the mission's world.
         rows: the most rows of a prompt.
@@ -59,6 +62,7 @@ class GuidedTemplate(Template):
     ) -> None:
         super().__init__(scenario, experiences=experiences, ranked=ranked)
         self.letters = Letters.of(rows)
+        self.labels = list(self.letters.all)
         order = "the most promising first" if ranked else "in no particular order"
         first_row = self.letters.of_row(0)
         letters = (
@@ -128,11 +132,6 @@ class GuidedTemplate(Template):
             "".join(_list(uav, "".join(f"{letter}?,{nothing}\n" for letter in letters)) for uav in uavs)
             for nothing in _CONTENT_FREE
         ]
-
-    @property
-    def labels(self) -> list[str]:
-        """Every choice letter of this mission's prompts."""
-        return list(self.letters.all)
 
 
 def _list(uav: int, rows: str) -> str:
