@@ -116,9 +116,9 @@ async def list_missions(engine: TheEngine) -> MissionList:
 # Not in the schema: it does not end, and describes itself by its first event.
 @router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_listener)])
 async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
-    """A mission as it flies: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
+    """A mission's events: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
 
-    As :mod:`service.live.snapshots` makes them. Comments come while nothing happens; who falls behind gets a snapshot.
+    :mod:`service.live.snapshots` makes them. Comments come while nothing happens; a slow listener gets a snapshot.
     """
     mission = await engine.missions.get(mission_id)
     still_known: Callable[[], bool] = request.scope.get(STILL_KNOWN, lambda: True)

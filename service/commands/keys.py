@@ -1,4 +1,4 @@
-"""``aicvds keys``: make, list and remove the keys that an edge asks for."""
+"""``aicvds keys``: make, list and remove an edge's API keys."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from service.api.api_keys import BadKeys, KeyFile, Scope, editing
 
 @dataclass(frozen=True)
 class Add:
-    """Make a key and show it: this once, the file keeps its hash alone.
+    """Make a key and show it once; the file has only its hash.
 
     Try it:  aicvds keys add fleet-1 --file keys.json --scopes decide admin
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """Whose it is, for messages and for `remove`: letters, digits, _ . -"""
+    """The key's name, for messages and for `remove`: letters, digits, _ . -"""
     file: Path
     """The file of keys, made if missing; AICVDS_KEYS names it to the edge, which notices changes within a second."""
     scopes: tuple[Scope, ...] = ("decide",)
-    """decide: ask for decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both."""
+    """decide: request decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both."""
     per_minute: int = 6000
     """Requests a minute; more are refused with 429 and Retry-After."""
 
 
 @dataclass(frozen=True)
 class List:
-    """Show whose keys there are, and what they may do."""
+    """Show the keys' names, scopes and limits."""
 
     file: Path
     """The file of keys."""
@@ -42,17 +42,17 @@ class List:
 
 @dataclass(frozen=True)
 class Remove:
-    """Take a key back: within a second nobody gets in with it."""
+    """Remove a key: within a second the edge refuses it."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Whose."""
+    """The key's name."""
     file: Path
     """The file of keys."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """The keys that an edge asks for, once AICVDS_KEYS names their file. Exit code: 0 done, 2 bad use."""
+    """The API keys of an edge, once AICVDS_KEYS names their file. Exit code: 0 done, 2 usage error."""
 
     do: (
         Annotated[Add, tyro.conf.subcommand("add")]

@@ -27,7 +27,7 @@ MAX_LISTENERS = 32
 _PERIOD_S = 0.1
 # The largest share of the event loop's time for updates: one for 10,000 sensors takes milliseconds.
 _SHARE = 0.05
-# Updates that are kept for a late listener, in number and in bytes.
+# The backlog of updates for late listeners, in number and in bytes.
 _MOST_FRAMES, _MOST_BYTES = 30, 1_000_000
 # Decisions in a snapshot.
 _SHOWN = 300

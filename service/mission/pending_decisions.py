@@ -18,7 +18,7 @@ _APPLIED_PER_UAV = 64
 class AppliedOutcomes:
     """The newest applied outcomes by decision: the cost, and whether the transmission failed.
 
-    They tell a duplicate of an outcome from an outcome that contradicts it.
+    They distinguish a duplicate of an outcome from an outcome that contradicts it.
 
     Args:
         most: the number of outcomes that are remembered.

@@ -39,7 +39,7 @@ def pretrain(args: Pretrain, console: Console) -> None:
     train = [example for n, mission in enumerate(missions) if n not in held_out for example in mission]
     test = [example for n in sorted(held_out) for example in missions[n]]
     if not train or not test:
-        raise ValueError(f"{args.rollouts} holds {len(missions)} missions; at least 2 are needed")
+        raise ValueError(f"{args.rollouts} has {len(missions)} missions; at least 2 are needed")
     levels = header.scenario.max_velocity + 1
     modules = fit(Batch.of(train, args.speed), Batch.of(test, args.speed), levels, args, console)
     console.print(_report(modules, test, args, levels))
