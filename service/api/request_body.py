@@ -41,7 +41,7 @@ class RequestBody:
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
         encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
-        if encoding not in _DECODERS:
+        if encoding not in _DECODERS and encoding not in _PLAIN:
             response = problem_response(415, f"Content-Encoding {encoding[:40]!r}: use gzip, zstd or none")
             response.headers["Accept-Encoding"] = "gzip, zstd"
             await response(scope, receive, send)
@@ -51,7 +51,8 @@ class RequestBody:
                 body = await self._read(receive, headers.get(b"content-length", b""))
             if body is None:
                 return
-            body = _DECODERS[encoding](body, self.limit)
+            if encoding in _DECODERS:
+                body = _DECODERS[encoding](body, self.limit)
         except (_TooLarge, TimeoutError, _Damaged) as fault:
             await self._refusal(fault)(scope, receive, send)
             return
@@ -131,14 +132,9 @@ def _unzstd(body: bytes, limit: int) -> bytes:
     return plain
 
 
-def _plain(body: bytes, limit: int) -> bytes:
-    return body
-
-
 _REWRITTEN = (b"content-encoding", b"content-length", b"transfer-encoding")
+_PLAIN = ("", "identity")
 _DECODERS: dict[str, Callable[[bytes, int], bytes]] = {
-    "identity": _plain,
-    "": _plain,
     "gzip": _gunzip,
     "zstd": _unzstd,
 }
