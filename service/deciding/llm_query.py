@@ -112,7 +112,7 @@ class LlmQueries:
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
         able = self._llm.status == "ready" and uavs <= self._llm.most_together
-        return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.holds(uavs)
+        return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
 
     async def ask_for_fleet(
         self, mission: Mission, states: Sequence[AttendedState], deadline: Deadline

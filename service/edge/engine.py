@@ -97,11 +97,11 @@ class Engine:
 
         Raises:
             Refused: the request does not fit its mission.
-            NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.checked`.
+            NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.resolve`.
         """
         watch, deadline = self._start(request)
         within_s = deadline.earlier_by(RESERVE_S).left()
-        mission, report = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+        mission, report = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
 
         async def make() -> list[Decided]:
             return [await self._decide_one(mission, report, watch, deadline)]
@@ -114,7 +114,7 @@ class Engine:
         """A fleet's decisions at one step in the order of its UAVs; arguments and errors as for :meth:`decide`."""
         watch, deadline = self._start(request)
         within_s = deadline.earlier_by(RESERVE_S).left()
-        mission, reports = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+        mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
 
         async def make() -> list[Decided]:
             # Every outcome is applied before the first decision: none is lost while the UAVs wait for the LLM.

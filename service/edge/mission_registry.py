@@ -78,7 +78,7 @@ class MissionRegistry:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
 
-    async def checked(
+    async def resolve(
         self, request: AnyRequest, *, may_make: bool, key: str | None, within_s: float
     ) -> tuple[Mission, AnyRequest]:
         """The mission of a request that fits it, and the request in full.

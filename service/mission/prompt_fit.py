@@ -52,13 +52,13 @@ class PromptFit:
     demonstrations: str
     context: int
 
-    def holds(self, uavs: int = 1) -> bool:
+    def fits(self, uavs: int = 1) -> bool:
         """Whether the context is large enough for a prompt about so many UAVs at once."""
         return self._needed(uavs) <= self.context
 
     def check(self) -> None:
         """Raises ``Refused`` where the context is too small for a prompt about one UAV."""
-        if self.holds():
+        if self.fits():
             return
         style = self.spec.prompt
         shown, lower = f"{style.experiences} experiences", "prompt.experiences"
