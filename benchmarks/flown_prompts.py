@@ -116,7 +116,7 @@ class Scribe(LocalPilot):
             if view.rows:
                 ways[way] = self._put(mission, view)
             if way == GUIDED:
-                reserved = mission.reserved(step, uav)
+                reserved = mission.reservations.of_others(step, uav)
                 situation = RolloutState.of(mission.belief, mission.scenario, step, uav, reserved=reserved)
             mission.commit(view.pending(name, Action(choice.sensor, choice.velocity)), attempt)
         if situation is not None and len(ways) == len(self._missions):
@@ -126,19 +126,23 @@ class Scribe(LocalPilot):
     def _put(self, mission: Mission, view: AttendedState) -> Put:
         shown, nearest = view.shown(), view.similar_experiences()
         if not isinstance(mission.template, GuidedTemplate):
-            return Put(mission.template.prompt(view.state, shown, mission.experiences, nearest), view.kept_ids)
+            return Put(mission.template.prompt(view.state, shown, mission.experiences.block, nearest), view.kept_ids)
         offer = candidates_of(view)
         self._note(mission, mission.template, view, offer)
-        return Put(mission.template.offer(offer, view.state, mission.experiences, nearest), view.kept_ids, offer)
+        return Put(
+            mission.template.choice_prompt(offer, view.state, mission.experiences.block, nearest), view.kept_ids, offer
+        )
 
     def _note(self, mission: Mission, template: GuidedTemplate, view: AttendedState, offer: CandidateSet) -> None:
         self._step = {uav: had for uav, had in self._step.items() if had[1].step == view.step}
         self._step[view.uav_id] = offer, view
         if len(self._step) == mission.scenario.uavs:
-            shares = template.together({u: (o, v.state) for u, (o, v) in self._step.items()}, mission.experiences)
+            shares = template.fleet_prompts(
+                {u: (o, v.state) for u, (o, v) in self._step.items()}, mission.experiences.block
+            )
             first = next(iter(shares.values()))
             state = "".join(share.state for share in shares.values())
-            whole = Prompt(template.static_together, first.experiences, state, first.uncompressed)
+            whole = Prompt(template.fleet_static, first.experiences, state, first.uncompressed)
             self.together.append(Together(view.step, whole, [list(o.labels) for o, _ in self._step.values()]))
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
@@ -168,7 +172,7 @@ def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
 def as_the_paper(mission: Mission) -> None:
     """Have a mission put its decisions as the paper does."""
     mission.template = PaperTemplate(mission.scenario)
-    mission.memory = Newest(EXPERIENCES, uavs=mission.scenario.uavs)
+    mission.experiences = Newest(EXPERIENCES, uavs=mission.scenario.uavs)
 
 
 def flown(scenario: Scenario, seed: int, policy: str = _POLICY) -> Scribe:

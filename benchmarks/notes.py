@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table
 
 from service.config.settings import Settings
-from service.guidance.note_compiler import understood
-from service.guidance.note_orders import BadOrders, number_of, read, shown
+from service.guidance.note_compiler import compile_note
+from service.guidance.note_orders import BadOrders, number_of, parse_orders, similar_examples
 from service.llm.answers import NoDecision
 from service.llm.server_pool import ServerPool
 from service.prompting.warm_up import warm_up
@@ -56,7 +56,7 @@ class Understood:
     seconds: float
 
 
-async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
+async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
     """The LLM's name and what was made of each note."""
     upstream = ServerPool(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
@@ -68,7 +68,7 @@ async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Und
             note, begun, why = str(row["note"]), time.monotonic(), ""
             llm: Guidance | None = None
             try:
-                llm = await understood(note, SCENARIOS["paper"], upstream)
+                llm = await compile_note(note, SCENARIOS["paper"], upstream)
             except (BadOrders, Impossible, NoDecision, TimeoutError) as error:
                 why = str(error) or "late"
             took = time.monotonic() - begun
@@ -80,13 +80,13 @@ async def compiled(notes: list[dict[str, object]]) -> tuple[str | None, list[Und
 
 def control(note: str) -> Guidance | None:
     """The most similar example's orders with this note's numbers in their place; None where those do not fit."""
-    example, orders = shown(note, 1)[0]
+    example, orders = similar_examples(note, 1)[0]
     theirs, ours = numbers(example), numbers(note)
     if len(theirs) != len(ours):
         return None
     names = dict(zip(map(str, theirs), map(str, ours), strict=True))
     try:
-        return read(re.sub(r"[0-9]+", lambda found: names.get(found[0], found[0]), orders), note)
+        return parse_orders(re.sub(r"[0-9]+", lambda found: names.get(found[0], found[0]), orders), note)
     except BadOrders:
         return None
 
@@ -111,7 +111,7 @@ def facts(guidance: Guidance | None) -> set[tuple[str, int, float]]:
 def main(asked: Notes) -> None:
     """Run, print, write."""
     console = Console()
-    model, rows = asyncio.run(compiled(json.loads(asked.notes.read_text())))
+    model, rows = asyncio.run(understood(json.loads(asked.notes.read_text())))
     told = Table("", "note", "understood", title=str(model))
     for row in rows:
         right = facts(row.llm) == facts(row.meant) and row.llm is not None

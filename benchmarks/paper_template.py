@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from service.prompting.experiences import Experiences
 from service.prompting.prompt import Prompt, Template
 from service.prompting.row_formats import UNKNOWN, Cells
-from service.prompting.unpruned_baseline import Uncompressed
+from service.prompting.unpruned_baseline import UnprunedState
 from shared.features import State
 from shared.scenario import Scenario
 
@@ -69,7 +69,7 @@ class PaperTemplate(Template):
         self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()
     ) -> Prompt:
         """The prompt for one decision; ``kept_rows`` and ``nearest`` are not heeded."""
-        whole = Uncompressed(state, lambda cells: _sentence(cells) + "\n", "Current state:\n")
+        whole = UnprunedState(state, lambda cells: _sentence(cells) + "\n", "Current state:\n")
         past = "Past decisions:\n" + "".join(experiences) if experiences else ""
         return Prompt(self.static, past, whole.text, whole)
 

@@ -35,7 +35,7 @@ from rich.progress import track
 from rich.table import Table
 
 from service.config.settings import Settings
-from service.deciding.rollout_evaluator import judge
+from service.deciding.rollout_evaluator import evaluate
 from service.llm.answers import NoDecision, check_answer
 from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
@@ -219,7 +219,7 @@ def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list
         levels = scenario.max_velocity + 1
         actions = [Action(sensor, v) for sensor in asked.ways[PAPER].sensors for v in range(levels)]
         said = {way: action(way, asked, one.answered, levels) for way, one in zip(answers, rows, strict=True)}
-        judgement = judge(asked.situation, [*actions, *(one for one in said.values() if one is not None)])
+        judgement = evaluate(asked.situation, [*actions, *(one for one in said.values() if one is not None)])
         best, drawn = judgement.lost.min(), judgement.lost[: len(actions)].mean()
         told = iter(judgement.lost[len(actions) :].tolist())
         for way, one in said.items():

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from shared.names import few_names
+from shared.reasons import Reason
 from shared.scenario import Scenario
 
 MAX_SENSORS = 10_000
@@ -45,24 +46,6 @@ Belief = Literal["fleet", "reported"]
 Selection = Literal["recent", "similar", "best"]
 Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]
-Reason = Literal[
-    "mode_value",
-    "mode_policy",
-    "no_candidate",
-    "llm_loading",
-    "llm_unavailable",
-    "llm_timeout",
-    "llm_status",
-    "llm_error",
-    "answer_format",
-    "answer_sensor",
-    "answer_velocity",
-    "answer_reserved",
-    "rule_reach",
-    "rule_battery",
-    "llm_busy",
-    "critic_timeout",
-]
 
 
 def _is_empty(column: list[float]) -> bool:

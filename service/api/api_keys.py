@@ -1,6 +1,6 @@
-"""API keys: who may ask the edge for what. ``aicvds keys`` makes them, and keeps their hashes in a file.
+"""API keys and their scopes. ``aicvds keys`` makes keys and writes their hashes to a file.
 
-A key is 256 random bits, so a plain SHA-256 of it tells nobody the key; it is shown once, when it is made.
+A key is 256 random bits, so its plain SHA-256 does not reveal it. The key itself is shown once, when it is made.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 log = logging.getLogger(__name__)
 
-# `decide`: ask for decisions, report outcomes, read. `admin`: make, guide and delete missions.
+# `decide`: request decisions, report outcomes, read. `admin`: make, guide and delete missions.
 Scope = Literal["decide", "admin"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 _PREFIX = "aicvds_"
-# A changed file counts after so many seconds.
+# Seconds between two checks whether the file has changed.
 _STALE_S = 1.0
 _MOST_KEYS = 1000
 
 
 class BadKeys(Exception):
-    """The file of keys cannot be used; the text says why, never what is in it."""
+    """The file of keys cannot be used; the message gives the reason and never the content."""
 
 
 class ApiKey(BaseModel):
-    """One key, without the key: its name, what it may do, how often a minute, and the hash that it is known by."""
+    """One key's record: its name, scopes, requests a minute, and hash."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -48,7 +48,7 @@ class ApiKey(BaseModel):
 
 
 class KeyFile(BaseModel):
-    """What is in the file."""
+    """The content of the file."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -56,7 +56,7 @@ class KeyFile(BaseModel):
 
     @classmethod
     def read(cls, path: Path) -> KeyFile:
-        """Raises ``BadKeys``."""
+        """Read the file; raises ``BadKeys``."""
         try:
             return cls.model_validate_json(path.read_bytes())
         except OSError as error:
@@ -67,9 +67,9 @@ class KeyFile(BaseModel):
             raise BadKeys(f"{path}: {at}: {fault['msg']}") from None
 
     def write(self, path: Path) -> None:
-        """Replace the file as a whole, readable by its owner alone; raises ``BadKeys``.
+        """Replace the file atomically, readable only by its owner; raises ``BadKeys``.
 
-        A file that is there keeps its owner, group and mode: the edge may be another user.
+        An existing file keeps its owner, group and mode, because the edge may run as another user.
         """
         part = path.with_name(f".{path.name}.{os.getpid()}")
         try:
@@ -85,17 +85,17 @@ class KeyFile(BaseModel):
             raise BadKeys(f"{path}: {error.strerror or error}") from None
 
     def add(self, name: str, scopes: frozenset[Scope], per_minute: int) -> str:
-        """A new key, to be shown to its owner once; raises ``BadKeys`` for a name that is taken, or too many."""
+        """Add a key; returns the key itself. Raises ``BadKeys`` for a name in use, or too many keys."""
         if any(key.name == name for key in self.keys):
-            raise BadKeys(f"there is a key {name} already: remove it first, or choose another name")
+            raise BadKeys(f"there is already a key {name}: remove it first, or choose another name")
         if len(self.keys) >= _MOST_KEYS:
-            raise BadKeys(f"there are {_MOST_KEYS} keys already")
+            raise BadKeys(f"there are already {_MOST_KEYS} keys")
         shown = _PREFIX + secrets.token_urlsafe(32)
         self.keys.append(ApiKey(name=name, scopes=scopes, per_minute=per_minute, sha256=hash_of(shown)))
         return shown
 
     def remove(self, name: str) -> None:
-        """Raises ``BadKeys`` where there is none of that name."""
+        """Remove the key of that name; raises ``BadKeys`` where there is none."""
         left = [key for key in self.keys if key.name != name]
         if len(left) == len(self.keys):
             raise BadKeys(f"there is no key {name}")
@@ -104,7 +104,7 @@ class KeyFile(BaseModel):
 
 @contextmanager
 def editing(path: Path) -> Iterator[KeyFile]:
-    """The file's keys to change, written at the end; one edits at a time. Raises ``BadKeys``."""
+    """The file's keys to change, under a lock, written at the end. Raises ``BadKeys``."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = path.with_name(f".{path.name}.lock").open("w")
@@ -123,23 +123,25 @@ def hash_of(key: str) -> str:
 
 
 class ApiKeys:
-    """The keys of a file, read again when it changes; while it cannot be read, those known before count.
+    """The keys of a file, which is read again when it changes; while it cannot be read, the previous keys apply.
 
     Raises:
-        BadKeys: at first it cannot be read, or holds none.
+        BadKeys: the file cannot be read at first, or has no key.
     """
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
         self._path, self._clock = path, clock
-        self._told = ""
-        self._changed = self._stamp()
+        self._last_error = ""
+        self._read_stamp = self._stamp()
         self._keys = KeyFile.read(path).keys
-        self._looked = clock()
+        self._checked_at = clock()
         if not self._keys:
-            raise BadKeys(f"{path} holds no key: nobody could ask. Make one with: aicvds keys add NAME --file {path}")
+            raise BadKeys(
+                f"{path} has no key, so every request would fail. Make one with: aicvds keys add NAME --file {path}"
+            )
 
     def find(self, presented: str) -> ApiKey | None:
-        """Whose key that is. Every key is compared, each in constant time."""
+        """The record of a presented key, if there is one. Every key is compared, each in constant time."""
         self._refresh()
         hashed = hash_of(presented)
         found = None
@@ -149,22 +151,22 @@ class ApiKeys:
         return found
 
     def _refresh(self) -> None:
-        if self._clock() - self._looked < _STALE_S:
+        if self._clock() - self._checked_at < _STALE_S:
             return
-        self._looked = self._clock()
+        self._checked_at = self._clock()
         stamp = self._stamp()
-        if stamp == self._changed:
+        if stamp == self._read_stamp:
             return
         try:
             self._keys = KeyFile.read(self._path).keys
         except BadKeys as error:
-            # Tried again every second, and told once.
-            if str(error) != self._told:
-                self._told = str(error)
-                log.error("the keys known before go on to count: %s", error)
+            # The file is tried again every second; the same error is logged once.
+            if str(error) != self._last_error:
+                self._last_error = str(error)
+                log.error("the previous keys still apply: %s", error)
         else:
-            self._changed, self._told = stamp, ""
-            log.info("%d keys read again", len(self._keys))
+            self._read_stamp, self._last_error = stamp, ""
+            log.info("read %d keys again", len(self._keys))
 
     def _stamp(self) -> tuple[int, int, int] | None:
         try:

@@ -31,7 +31,7 @@ from service.storage.store import Store
 
 
 class State(TypedDict):
-    """What every request finds in ``request.state``."""
+    """The content of ``request.state``."""
 
     engine: Engine
     llm: ServerPool
@@ -42,7 +42,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     """One edge service; its LLM begins to load when the application starts.
 
     Args:
-        store: where missions outlive the process, closed when the application ends; None: nowhere.
+        store: the missions' durable store, closed when the application ends; None keeps missions in memory only.
 
     Raises:
         BadKeys: the file of keys that the settings name cannot be used.
@@ -52,7 +52,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[State]:
-        # The modules are tiny: one thread computes them faster than it can wake others, and llama.cpp needs the rest.
+        # One thread computes the small modules faster than it can start others, and llama.cpp needs the other cores.
         torch.set_num_threads(1)
         metrics = Metrics()
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)

@@ -1,4 +1,4 @@
-"""The guard before the door: who asks, whether that key may, and how often."""
+"""Authentication by API key, with scopes and a rate limit for each key."""
 
 from __future__ import annotations
 
@@ -10,49 +10,42 @@ from collections.abc import Sequence
 from limits import RateLimitItemPerMinute
 from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
-from starlette.requests import Request
 from starlette.types import ASGIApp, Receive, Send
-from starlette.types import Scope as Asked
+from starlette.types import Scope as AsgiScope
 
 from service.api.api_keys import ApiKey, ApiKeys, Scope
 from service.api.concurrency_limit import READING
 from service.api.problem_details import problem_response
 
-# What says nothing of missions: probes of containers and load balancers carry no key.
+# Resources without mission data. Probes of containers and load balancers carry no key.
 _OPEN = frozenset(("/healthz", "/readyz", "/"))
-# The page's scripts and styles; what it shows it asks for with a key.
-_OPEN_BELOW = "/static/"
+# The page's scripts and styles; the page requests its data with a key.
+_OPEN_PREFIX = "/static/"
 _ATTENTION = re.compile(r"/missions/[^/]+/attention")
-# Where the guard leaves the key's scopes for the routes.
+# The ASGI scope's entry with the scopes of the request's key.
 SCOPES = "aicvds.scopes"
-# For answers that go on: where the guard leaves a function that says whether the key is known still.
+# The ASGI scope's entry for streams: a function that returns whether the key is still known.
 STILL_KNOWN = "aicvds.still_known"
 
 
 def scope_of(method: str, path: str) -> Scope | None:
-    """What a key must be allowed for a request; None where none is needed, or any will do for reading."""
+    """The scope that a key needs for a request; None where no key is needed, or any key may read."""
     if method in READING:
-        # What was learned is told to those who fly by it.
+        # UAVs that prune their reports need the weights, so the scope `decide` is required.
         return "decide" if _ATTENTION.fullmatch(path) else None
     return "admin" if path.startswith("/missions") else "decide"
 
 
 def is_open(method: str, path: str) -> bool:
-    """Whether no key is asked for."""
-    # Nothing else is done there: a stranger's body would only be waited for.
-    return method in READING and (path in _OPEN or path.startswith(_OPEN_BELOW))
-
-
-def may_make_missions(request: Request) -> bool:
-    """Whether who asks may make a mission by asking about one that there is not: with a key, only an admin."""
-    scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
-    return scopes is None or "admin" in scopes
+    """Whether the request needs no key."""
+    # Other methods need a key: their bodies would be read for nothing.
+    return method in READING and (path in _OPEN or path.startswith(_OPEN_PREFIX))
 
 
 class KeyAuthentication:
-    """Pure ASGI middleware. Answers 401 without a known key, 403 where it may not, 429 with ``Retry-After`` too often.
+    """Pure ASGI middleware: 401 without a known key, 403 without the scope, 429 with ``Retry-After`` past the rate.
 
-    Nothing of the body is read before. Keys come as ``Authorization: Bearer KEY``.
+    It answers before the body is read. Clients send keys as ``Authorization: Bearer KEY``.
     """
 
     def __init__(self, app: ASGIApp, keys: ApiKeys) -> None:
@@ -60,7 +53,7 @@ class KeyAuthentication:
         self._keys = keys
         self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
 
-    async def __call__(self, scope: Asked, receive: Receive, send: Send) -> None:
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or is_open(scope["method"], scope["path"]):
             await self.app(scope, receive, send)
             return
@@ -68,24 +61,24 @@ class KeyAuthentication:
         key = self._keys.find(presented)
         needed = scope_of(scope["method"], scope["path"])
         if key is None:
-            refusal = problem_response(401, "give a key that is known as `Authorization: Bearer KEY`")
+            refusal = problem_response(401, "send a known key as `Authorization: Bearer KEY`")
             refusal.headers["WWW-Authenticate"] = "Bearer"
         elif needed is not None and needed not in key.scopes:
-            refusal = problem_response(403, f"key {key.name} may not do this: it lacks the scope {needed}")
+            refusal = problem_response(403, f"key {key.name} lacks the scope {needed}")
         elif (wait_s := await self._wait(key)) is not None:
-            refusal = problem_response(429, f"key {key.name} may ask {key.per_minute} times a minute")
+            refusal = problem_response(429, f"key {key.name} has a limit of {key.per_minute} requests a minute")
             refusal.headers["Retry-After"] = str(wait_s)
         else:
             scope[SCOPES] = key.scopes
             scope[STILL_KNOWN] = lambda: self._keys.find(presented) is not None
             await self.app(scope, receive, send)
             return
-        # The rest of what is sent is not waited for.
+        # The connection ends, so that the server does not wait for the rest of the request.
         refusal.headers["Connection"] = "close"
         await refusal(scope, receive, send)
 
     async def _wait(self, key: ApiKey) -> int | None:
-        """Seconds until the key may ask again; None where it may now, which then counts."""
+        """Seconds until the key's next request is allowed; None where this one is, which then counts."""
         rate = RateLimitItemPerMinute(key.per_minute)
         if await self._rates.hit(rate, key.name):
             return None
@@ -94,7 +87,7 @@ class KeyAuthentication:
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:
-    """The bearer token, empty where there is none or more than one."""
+    """The bearer token; empty where the request has none or several."""
     given = [value for name, value in headers if name.lower() == b"authorization"]
     if len(given) != 1:
         return ""

@@ -1,4 +1,4 @@
-"""``GET /``, the page, and what it reads: the missions there are, one mission's events, and a decision's prompt."""
+"""``GET /``, the page, and its data: the list of missions, one mission's events, and a decision's prompt."""
 
 from __future__ import annotations
 
@@ -21,25 +21,23 @@ from service.api.routes import TheEngine
 from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
 from shared.missions import DecisionPrompt, MissionLine, MissionList
-from shared.wire import DecisionId, MissionId, Reason
+from shared.reasons import LLM_NOT_ASKED
+from shared.wire import DecisionId, MissionId
 
 log = logging.getLogger(__name__)
 
 router = APIRouter()
 
 STATIC = Path(live.__file__).parent / "static"
-# Nothing but the edge's own files; no inline scripts or styles, nothing framed, nothing sent elsewhere.
-_CAREFUL = {
+# Only the edge's own files are allowed: no inline scripts or styles, no frames, no requests to other hosts.
+_SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'; object-src 'none'",
-    # Asked for again every time, and answered with 304 where nothing changed.
+    # The browser validates each time, and gets 304 where nothing changed.
     "Cache-Control": "no-cache",
 }
 _MOST_LISTED = 200
-_STILL_KNOWN_S = 1.0
-_UNASKED: frozenset[Reason] = frozenset(
-    ("mode_value", "mode_policy", "no_candidate", "llm_loading", "llm_unavailable", "llm_busy")
-)
+_KEY_CHECK_S = 1.0
 
 
 class Assets(StaticFiles):
@@ -47,12 +45,12 @@ class Assets(StaticFiles):
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
-        response.headers.update(_CAREFUL)
+        response.headers.update(_SECURITY_HEADERS)
         return response
 
 
 class EventStream(StreamingResponse):
-    """Server-sent events to one listener; ends where it stops reading, or its key is known no more."""
+    """Server-sent events to one listener; they end when it stops reading or its key is removed."""
 
     media_type = "text/event-stream"
 
@@ -67,35 +65,35 @@ class EventStream(StreamingResponse):
                 await send(message)
 
         try:
-            # Closed at once, whatever ends it: nothing is made for a page that is gone.
+            # The events are closed at once, so that none are made for a closed page.
             async with aclosing(self._events):
                 await super().stream_response(in_time)
         except TimeoutError:
-            log.info("a page that stopped reading is left")
+            log.info("a page stopped reading; its stream is closed")
 
     async def _while_known(
         self, events: AsyncGenerator[bytes], still_known: Callable[[], bool]
     ) -> AsyncGenerator[bytes]:
-        asked = time.monotonic()
+        checked_at = time.monotonic()
         async with aclosing(events):
             async for event in events:
-                if time.monotonic() - asked > _STILL_KNOWN_S:
+                if time.monotonic() - checked_at > _KEY_CHECK_S:
                     if not still_known():
                         return
-                    asked = time.monotonic()
+                    checked_at = time.monotonic()
                 yield event
 
 
-async def _placed(engine: TheEngine) -> AsyncIterator[None]:
-    """A place among those who watch, until the answer has ended."""
-    with engine.live.place():
+async def _listener(engine: TheEngine) -> AsyncIterator[None]:
+    """A listener's slot until the response has ended."""
+    with engine.live.listener():
         yield
 
 
 @router.get("/", include_in_schema=False)
 async def page() -> FileResponse:
-    """The page; what it shows it asks for."""
-    return FileResponse(STATIC / "index.html", headers=_CAREFUL)
+    """The page, without data."""
+    return FileResponse(STATIC / "index.html", headers=_SECURITY_HEADERS)
 
 
 @router.get("/missions", tags=["missions"])
@@ -103,7 +101,7 @@ async def list_missions(engine: TheEngine) -> MissionList:
     """The missions that there are: the one that decided last first, those that are only in the store last."""
     missions = engine.missions
     loaded = {mission.mission_id: mission for mission in missions.loaded}
-    lately = [name for name in engine.live.history.newest_first() if name in loaded]
+    lately = [name for name in engine.live.history.missions() if name in loaded]
     names = list(dict.fromkeys((*lately, *reversed(loaded), *missions.stored)))
     lines = []
     for name in names[:_MOST_LISTED]:
@@ -116,11 +114,11 @@ async def list_missions(engine: TheEngine) -> MissionList:
 
 
 # Not in the schema: it does not end, and describes itself by its first event.
-@router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_placed)])
+@router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_listener)])
 async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
-    """A mission as it flies: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
+    """A mission's events: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
 
-    As :mod:`service.live.snapshots` makes them. Comments come while nothing happens; who falls behind gets a snapshot.
+    :mod:`service.live.snapshots` makes them. Comments come while nothing happens; a slow listener gets a snapshot.
     """
     mission = await engine.missions.get(mission_id)
     still_known: Callable[[], bool] = request.scope.get(STILL_KNOWN, lambda: True)
@@ -130,13 +128,13 @@ async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> 
 @router.get("/missions/{mission_id}/decisions/{decision_id}/prompt", responses=documented(404, 422), tags=["decisions"])
 async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: TheEngine) -> DecisionPrompt:
     """The prompt by which a decision was made; only those of the newest decisions are kept, and not over a restart."""
-    kept = engine.live.history.find(mission_id, decision_id)
-    if kept is None or kept.prompt is None:
-        raise NotFound("decision_id", f"the prompt of decision {decision_id} is not kept, or no longer")
-    prompt = kept.prompt
+    decision = engine.live.history.find(mission_id, decision_id)
+    if decision is None or decision.prompt is None:
+        raise NotFound("decision_id", f"the prompt of decision {decision_id} is unknown or forgotten")
+    prompt = decision.prompt
     return DecisionPrompt(
         decision_id=decision_id,
-        asked=kept.answer.reason not in _UNASKED,
+        asked=decision.answer.reason not in LLM_NOT_ASKED,
         static=prompt.static,
         experiences=prompt.experiences,
         state=prompt.state,

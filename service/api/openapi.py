@@ -28,23 +28,23 @@ def schema_of(app: FastAPI) -> dict[str, Any]:
         schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
         for path, methods in schema["paths"].items():
             for method, operation in methods.items():
-                _guard(operation, method.upper(), path)
-                _exemplify(operation, (method, path))
+                _add_security(operation, method.upper(), path)
+                _add_examples(operation, (method, path))
         app.openapi_schema = schema
     return app.openapi_schema
 
 
-def _guard(operation: dict[str, Any], method: str, path: str) -> None:
-    """What ``KeyAuthentication`` asks for, where the edge has keys, and answers without."""
+def _add_security(operation: dict[str, Any], method: str, path: str) -> None:
+    """Add the key that ``KeyAuthentication`` requires where the edge has keys, and its refusals."""
     if is_open(method, path):
         return
     operation["security"] = [{"key": []}, {}]
     statuses = (401, 403, 429) if scope_of(method, path) else (401, 429)
-    told = operation["responses"] | {str(s): response for s, response in documented(*statuses).items()}
-    operation["responses"] = dict(sorted(told.items()))
+    responses = operation["responses"] | {str(s): response for s, response in documented(*statuses).items()}
+    operation["responses"] = dict(sorted(responses.items()))
 
 
-def _exemplify(operation: dict[str, Any], route: tuple[str, str]) -> None:
+def _add_examples(operation: dict[str, Any], route: tuple[str, str]) -> None:
     if route in REQUESTS:
         operation["requestBody"]["content"][JSON]["examples"] = REQUESTS[route]
     for status, response in operation["responses"].items():

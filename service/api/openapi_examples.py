@@ -201,15 +201,15 @@ ANSWERS: dict[tuple[str, str], Any] = {
 # Status to the field at fault, if it is one's, and what is wrong with it.
 PROBLEMS: dict[int, tuple[str | None, str]] = {
     400: ("body", "There was an error parsing the body"),
-    401: (None, "give a key that is known as `Authorization: Bearer KEY`"),
-    403: (None, "key fleet-1 may not do this: it lacks the scope admin"),
+    401: (None, "send a known key as `Authorization: Bearer KEY`"),
+    403: (None, "key fleet-1 lacks the scope admin"),
     404: ("mission_id", "there is no mission patrol"),
-    408: ("body", "not here within 10 s"),
+    408: ("body", "not received within 10 s"),
     409: ("mission_id", "mission patrol has another spec: DELETE it or choose another ID"),
     413: ("body", "larger than 2000000 bytes"),
     415: ("body", "Content-Encoding 'br': use gzip, zstd or none"),
     422: ("mission_id", "String should match pattern '^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$'"),
-    429: (None, "key fleet-1 may ask 600 times a minute"),
+    429: (None, "key fleet-1 has a limit of 600 requests a minute"),
     503: ("mission_id", "the store fails: nothing was recorded, send it again"),
 }
 

@@ -17,26 +17,26 @@ from shared.wire import Problem
 
 log = logging.getLogger(__name__)
 
-# How pydantic names the branches of a union, which are no fields.
+# pydantic's names for the branches of a union, which are not fields.
 _UNION_TAGS = ("constrained-", "function-")
 
 CONTENT_TYPE = "application/problem+json"
-# A field that there is has a shorter name, wherever it stands; what is sent in the place of one is not sent back.
+# The name of a real field is shorter; a longer one is the client's text, which is not sent back.
 _MOST_NAME = 80
-# When to ask again what cannot be served now.
+# The `Retry-After` of a request that cannot be served now.
 _RETRY_S = 1
 
 
 def problem_response(
     status: int, detail: str, errors: Sequence[dict[str, str]] = (), kind: str = "about:blank"
 ) -> Response:
-    """An ``application/problem+json`` response of the type ``kind``; never echoes what was sent."""
+    """An ``application/problem+json`` response of the type ``kind``, which never repeats the request's content."""
     body = Problem(type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
     return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
 
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries for the problems that a route can answer."""
+    """OpenAPI entries for the problems of a route."""
     schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
     return {s: {"description": HTTPStatus(s).phrase, "content": {CONTENT_TYPE: schema}} for s in statuses}
 
@@ -54,7 +54,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: Request, error: RequestValidationError) -> Response:
-        # The deepest first: of a union's branches, the one that came nearest.
+        # The deepest fault comes first: it is of the branch of a union that nearly fits.
         faults = sorted(error.errors()[:20], key=lambda e: -len(e["loc"]))
         errors = [{"field": _path(e["loc"]), "problem": e["msg"]} for e in faults]
         return problem_response(422, f"{errors[0]['field']}: {errors[0]['problem']}", errors)
@@ -69,7 +69,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-        return problem_response(500, "the edge failed; its log says more")
+        return problem_response(500, "the edge failed; its log has the details")
 
 
 def _path(location: Sequence[int | str]) -> str:

@@ -1,4 +1,4 @@
-"""Bodies of requests: bounded in time, and in size before and after they are unpacked."""
+"""Request bodies: limits on the time to receive them, and on their size before and after decompression."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.problem_details import problem_response
 
-# Meanwhile a body keeps the place of a decision.
+# A body that is still on its way counts against the concurrency limit.
 _BODY_S = 10.0
 
 
 class _TooLarge(Exception):
-    """The body, or what it unpacks to, exceeds the limit."""
+    """The body exceeds the limit, before or after decompression."""
 
 
 class _Damaged(Exception):
-    """The body is not in the encoding that it claims."""
+    """The body does not match its Content-Encoding."""
 
 
 class RequestBody:
-    """Pure ASGI middleware: reads the body up to ``limit`` bytes and undoes ``Content-Encoding: gzip | zstd``.
+    """Pure ASGI middleware: reads the body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``.
 
-    Answers 413 past the limit, 408 to what has not come within 10 s, 415 for another encoding, 400 for a damaged one,
-    each as a problem document.
+    It answers 413 past the limit, 408 for a body that takes longer than 10 s, 415 for another encoding and 400 for a
+    damaged body, each as a problem document.
     """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
@@ -41,7 +41,7 @@ class RequestBody:
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
         encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
-        if encoding not in _DECODERS:
+        if encoding not in _DECODERS and encoding not in _PLAIN:
             response = problem_response(415, f"Content-Encoding {encoding[:40]!r}: use gzip, zstd or none")
             response.headers["Accept-Encoding"] = "gzip, zstd"
             await response(scope, receive, send)
@@ -51,7 +51,8 @@ class RequestBody:
                 body = await self._read(receive, headers.get(b"content-length", b""))
             if body is None:
                 return
-            body = _DECODERS[encoding](body, self.limit)
+            if encoding in _DECODERS:
+                body = _DECODERS[encoding](body, self.limit)
         except (_TooLarge, TimeoutError, _Damaged) as fault:
             await self._refusal(fault)(scope, receive, send)
             return
@@ -60,21 +61,21 @@ class RequestBody:
         await self.app(scope, _replay(body, receive), send)
 
     def _refusal(self, fault: Exception) -> Response:
-        """The problem; the connection ends where the rest of the body may still come."""
+        """The problem document; the connection ends where the rest of the body may still arrive."""
         match fault:
             case TimeoutError():
-                status, told = 408, f"not here within {_BODY_S:g} s"
+                status, problem = 408, f"not received within {_BODY_S:g} s"
             case _Damaged():
-                status, told = 400, str(fault)
+                status, problem = 400, str(fault)
             case _:
-                status, told = 413, f"larger than {self.limit} bytes"
-        response = problem_response(status, f"body: {told}", [{"field": "body", "problem": told}])
+                status, problem = 413, f"larger than {self.limit} bytes"
+        response = problem_response(status, f"body: {problem}", [{"field": "body", "problem": problem}])
         if status != 400:
             response.headers["Connection"] = "close"
         return response
 
     async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
-        """The body; None where the client hung up before its end."""
+        """The body; None where the client disconnected before its end."""
         if content_length.isdigit() and int(content_length) > self.limit:
             raise _TooLarge
         body = bytearray()
@@ -109,12 +110,12 @@ def _gunzip(body: bytes, limit: int) -> bytes:
     if not decoder.eof:
         raise _Damaged("gzip ends too early")
     if decoder.unused_data:
-        raise _Damaged("something follows the gzip member")
+        raise _Damaged("there is data after the gzip member")
     return plain
 
 
 def _unzstd(body: bytes, limit: int) -> bytes:
-    """The stream reader bounds what is unpacked but hides a missing end, the object sees the end but has no bound."""
+    """The stream reader limits the size but hides a missing end; the object detects the end but has no limit."""
     decompressor = zstandard.ZstdDecompressor(max_window_size=2**23)
     try:
         with decompressor.stream_reader(body) as reader:
@@ -127,18 +128,13 @@ def _unzstd(body: bytes, limit: int) -> bytes:
     if not decoder.eof:
         raise _Damaged("zstd ends too early")
     if decoder.unused_data:
-        raise _Damaged("something follows the zstd frame")
+        raise _Damaged("there is data after the zstd frame")
     return plain
 
 
-def _plain(body: bytes, limit: int) -> bytes:
-    return body
-
-
 _REWRITTEN = (b"content-encoding", b"content-length", b"transfer-encoding")
+_PLAIN = ("", "identity")
 _DECODERS: dict[str, Callable[[bytes, int], bytes]] = {
-    "identity": _plain,
-    "": _plain,
     "gzip": _gunzip,
     "zstd": _unzstd,
 }

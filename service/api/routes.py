@@ -9,7 +9,8 @@ from fastapi import APIRouter, Depends, Header, Request, Response
 from prometheus_client import generate_latest
 
 from service.api import attention_weights
-from service.api.authentication import may_make_missions
+from service.api.api_keys import Scope
+from service.api.authentication import SCOPES
 from service.api.problem_details import documented
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
@@ -36,6 +37,12 @@ async def _engine(request: Request) -> Engine:
     return engine
 
 
+def _may_make_missions(request: Request) -> bool:
+    """Whether the request may make its mission where that does not exist: with keys, only scope ``admin`` may."""
+    scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
+    return scopes is None or "admin" in scopes
+
+
 TheEngine = Annotated[Engine, Depends(_engine)]
 RequestKey = Annotated[
     str | None,
@@ -47,7 +54,7 @@ RequestKey = Annotated[
     ),
 ]
 
-HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
+KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, description="ETags of what is held")]
 
 
 @router.post(
@@ -59,10 +66,10 @@ HeldTag = Annotated[str | None, Header(alias="If-None-Match", max_length=1000, d
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
     """Which sensor to collect from, and how fast to fly the next step."""
     engine: Engine = request.state.engine
-    answer = await engine.decide(body, may_make=may_make_missions(request), key=key)
-    took = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
-    # As text at once: FastAPI would check and convert its own model's instance again.
-    return Response(answer.model_dump_json(), media_type="application/json", headers=took)
+    answer = await engine.decide(body, may_make=_may_make_missions(request), key=key)
+    timing = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
+    # The response is text already, because FastAPI would validate and convert the model a second time.
+    return Response(answer.model_dump_json(), media_type="application/json", headers=timing)
 
 
 @router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
@@ -70,7 +77,7 @@ async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
-    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_make_missions(request), key=key))
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=_may_make_missions(request), key=key))
 
 
 @router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
@@ -101,7 +108,7 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
         await engine.missions.delete(mission_id)
         engine.live.forget(mission_id)
     finally:
-        # One that is gone already may not yet be gone from the disk.
+        # A mission that is already deleted may still be on disk.
         await engine.durable("mission_id")
 
 
@@ -111,16 +118,18 @@ async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 422, 503)},
     tags=["missions"],
 )
-async def get_attention(mission_id: MissionId, engine: TheEngine, request: Request, held: HeldTag = None) -> Response:
+async def get_attention(
+    mission_id: MissionId, engine: TheEngine, request: Request, known_tags: KnownTags = None
+) -> Response:
     """The attention module's weights, with an ETag: to score the sensors on board, and report only the k best."""
     mission = await engine.missions.get(mission_id)
-    return attention_weights.told(mission, held, request.headers.get("Accept-Encoding", ""))
+    return attention_weights.attention_response(mission, known_tags, request.headers.get("Accept-Encoding", ""))
 
 
 @router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
     """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
-    return (await engine.missions.get(mission_id)).guidance.told(mission_id)
+    return (await engine.missions.get(mission_id)).guidance.report(mission_id)
 
 
 @router.post(
@@ -130,9 +139,9 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")
-    mission.obey(body)
+    mission.answer_guidance(body)
     await engine.durable("answer")
-    return mission.guidance.told(mission_id)
+    return mission.guidance.report(mission_id)
 
 
 @router.get("/healthz", tags=["operation"])

@@ -24,8 +24,8 @@ class Demonstrate:
 
     Then:  aicvds demonstrate runs/rollouts.jsonl.gz --out service/checkpoints/demonstrations.json
 
-    Every recorded decision with a choice of sensors and something in reach is answered by the teacher. The one in the
-    middle of all states comes first, then each time the one farthest from those chosen: so the first few differ most.
+    The teacher answers every recorded decision with a choice of sensors and something in reach. The decision in the
+    middle of all states comes first, then always the one farthest from those chosen, so that the first few differ most.
     """
 
     rollouts: Annotated[tyro.conf.Positional[Path], arg(metavar="FILE")]
@@ -33,16 +33,16 @@ class Demonstrate:
     out: Annotated[Path, arg(metavar="FILE")]
     """JSON file to write. The package's own is service/checkpoints/demonstrations.json."""
     count: Annotated[int, arg(metavar="N")] = 40
-    """Decisions to choose. A mission shows 20 at most, and leaves out those whose answer it could not give."""
+    """Decisions to choose. A mission shows at most 20, and leaves out decisions whose answer it could not give."""
     teacher: Annotated[str, arg(metavar="NAME")] = "planner"
-    """Whose answers they show: planner or clairvoyant, as `aicvds explore` recorded them, or look_ahead, one step of
-    look-ahead. A clairvoyant acts on arrivals that nobody who reads the prompt can know."""
+    """The teacher: planner or clairvoyant, as `aicvds explore` recorded them, or look_ahead, one step of look-ahead.
+    A clairvoyant acts on arrivals that are unknown at the decision."""
 
 
 def main(argv: list[str]) -> int:
     """Choose and write; returns the exit code."""
     args = tyro.cli(Demonstrate, prog="aicvds demonstrate", args=argv)
-    # They import torch, which takes seconds; `--help` answers without it.
+    # These imports load torch, which takes seconds; `--help` answers without them.
     from service.prompting.demonstrations import Demonstrations
     from service.training.demonstration_teachers import TEACHERS, farthest_first, solutions
 
@@ -53,16 +53,18 @@ def main(argv: list[str]) -> int:
             raise ValueError(f"--count {args.count} is not at least 1")
         header, steps = read_rollouts(args.rollouts)
         total = header.missions * header.scenario.steps * header.scenario.uavs
-        told = track(steps, total=total, description="Solving", console=Console(stderr=True))
+        tracked = track(steps, total=total, description="Solving", console=Console(stderr=True))
         demonstrations, states = [], []
-        for demonstration, state in solutions(header, told, TEACHERS[args.teacher]):
+        for demonstration, state in solutions(header, tracked, TEACHERS[args.teacher]):
             demonstrations.append(demonstration)
             states.append(state)
         if not states:
             fix = "record with aicvds explore --teacher both"
-            raise ValueError(f"{args.rollouts} holds no decision of {args.teacher}: {fix}")
+            raise ValueError(f"{args.rollouts} has no decision of {args.teacher}: {fix}")
         if len(states) < args.count:
-            raise ValueError(f"{args.rollouts} holds {len(states)} decisions with a choice; --count asks {args.count}")
+            raise ValueError(
+                f"{args.rollouts} has {len(states)} decisions with a choice; --count asks for {args.count}"
+            )
         chosen = [demonstrations[i] for i in farthest_first(np.stack(states), args.count)]
         args.out.parent.mkdir(parents=True, exist_ok=True)
         pool = Demonstrations(scenario=header.scenario, teacher=args.teacher, demonstrations=chosen)

@@ -1,4 +1,4 @@
-"""``aicvds keys``: make, list and remove the keys that an edge asks for."""
+"""``aicvds keys``: make, list and remove an edge's API keys."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from service.api.api_keys import BadKeys, KeyFile, Scope, editing
 
 @dataclass(frozen=True)
 class Add:
-    """Make a key and show it: this once, the file keeps its hash alone.
+    """Make a key and show it once; the file has only its hash.
 
     Try it:  aicvds keys add fleet-1 --file keys.json --scopes decide admin
     """
 
     name: Annotated[str, tyro.conf.Positional]
-    """Whose it is, for messages and for `remove`: letters, digits, _ . -"""
+    """The key's name, for messages and for `remove`: letters, digits, _ . -"""
     file: Path
     """The file of keys, made if missing; AICVDS_KEYS names it to the edge, which notices changes within a second."""
     scopes: tuple[Scope, ...] = ("decide",)
-    """decide: ask for decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both."""
+    """decide: request decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both."""
     per_minute: int = 6000
     """Requests a minute; more are refused with 429 and Retry-After."""
 
 
 @dataclass(frozen=True)
 class List:
-    """Show whose keys there are, and what they may do."""
+    """Show the keys' names, scopes and limits."""
 
     file: Path
     """The file of keys."""
@@ -42,17 +42,17 @@ class List:
 
 @dataclass(frozen=True)
 class Remove:
-    """Take a key back: within a second nobody gets in with it."""
+    """Remove a key: within a second the edge refuses it."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Whose."""
+    """The key's name."""
     file: Path
     """The file of keys."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """The keys that an edge asks for, once AICVDS_KEYS names their file. Exit code: 0 done, 2 bad use."""
+    """The API keys of an edge, once AICVDS_KEYS names their file. Exit code: 0 done, 2 usage error."""
 
     do: (
         Annotated[Add, tyro.conf.subcommand("add")]
@@ -62,11 +62,17 @@ class Options:
 
 
 def main(argv: list[str]) -> int:
-    """Do what the command line asks for; returns the exit code."""
+    """Run ``aicvds keys``; returns the exit code."""
     config = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
-    asked = tyro.cli(Options, prog="aicvds keys", args=argv, config=config).do
+    command = tyro.cli(Options, prog="aicvds keys", args=argv, config=config).do
     try:
-        return _add(asked) if isinstance(asked, Add) else _list(asked) if isinstance(asked, List) else _remove(asked)
+        return (
+            _add(command)
+            if isinstance(command, Add)
+            else _list(command)
+            if isinstance(command, List)
+            else _remove(command)
+        )
     except BadKeys as error:
         print(f"aicvds keys: {error}", file=sys.stderr)
     except ValidationError as error:
@@ -75,24 +81,24 @@ def main(argv: list[str]) -> int:
     return 2
 
 
-def _add(asked: Add) -> int:
-    with editing(asked.file) as known:
-        shown = known.add(asked.name, frozenset(asked.scopes), asked.per_minute)
-    print(f"Key {asked.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
+def _add(command: Add) -> int:
+    with editing(command.file) as known:
+        shown = known.add(command.name, frozenset(command.scopes), command.per_minute)
+    print(f"Key {command.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
     print(shown)
     return 0
 
 
-def _list(asked: List) -> int:
+def _list(command: List) -> int:
     table = Table("name", "scopes", "a minute")
-    for key in KeyFile.read(asked.file).keys:
+    for key in KeyFile.read(command.file).keys:
         table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute))
     Console().print(table)
     return 0
 
 
-def _remove(asked: Remove) -> int:
-    with editing(asked.file) as known:
-        known.remove(asked.name)
-    print(f"Key {asked.name} is removed", file=sys.stderr)
+def _remove(command: Remove) -> int:
+    with editing(command.file) as known:
+        known.remove(command.name)
+    print(f"Key {command.name} is removed", file=sys.stderr)
     return 0

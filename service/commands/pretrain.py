@@ -1,4 +1,4 @@
-"""``aicvds pretrain``: the attention and velocity modules' start, learned from recorded rollouts."""
+"""``aicvds pretrain``: initial weights of the attention and velocity modules, trained on recorded rollouts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def main(argv: list[str]) -> int:
     console = Console()
     try:
         _check(args)
-        # It imports torch, which takes seconds; `--help` and bad use answer without it.
+        # This import loads torch, which takes seconds; `--help` and usage errors answer without it.
         from service.training.training_loop import pretrain
 
         pretrain(args, console)

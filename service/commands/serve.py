@@ -48,11 +48,11 @@ def main(argv: list[str]) -> int:
         return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}")
     host = f"[{args.host}]" if ":" in args.host else args.host
     try:
-        # The system queues requests from here on. /healthz is answered at once, the others when torch is loaded.
+        # The system queues requests from here on. /healthz answers at once, the other routes once torch is loaded.
         print(
             f"aicvds serve: running on http://{host}:{listener.getsockname()[1]}, loading", file=sys.stderr, flush=True
         )
-        # Nearly all that is made while it loads stays: to look through it again and again takes a tenth of the time.
+        # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
         with listener:
             return _serve(listener, args.host)
@@ -80,8 +80,8 @@ def _serve(listener: socket.socket, host: str) -> int:
 
     if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
         return _refused(
-            f"whoever reaches {host} could fly this fleet. Make a key with `aicvds keys add NAME --file keys.json` and "
-            "set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
+            f"anyone who reaches {host} could control this fleet. Make a key with "
+            "`aicvds keys add NAME --file keys.json`, set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
 
     from service.observability import logs
@@ -109,11 +109,11 @@ def _application(settings: Settings) -> FastAPI:
     except BadKeys as error:
         raise _Unusable(f"AICVDS_KEYS: {error}") from None
     except StoreUnusable as error:
-        raise _Unusable(f"AICVDS_STORE: {error}. Give another, or `none` to keep nothing") from None
+        raise _Unusable(f"AICVDS_STORE: {error}. Give another, or `none` to store nothing") from None
 
 
 class _Unusable(Exception):
-    """What a setting names cannot be used."""
+    """A file or a store that a setting names cannot be used."""
 
 
 def _is_loopback(host: str) -> bool:

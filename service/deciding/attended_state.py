@@ -58,21 +58,25 @@ class AttendedState:
             watch: takes the times of the stages ``augment`` and ``attend``.
         """
         watch = watch or Stopwatch()
-        reserved, obeyed, scenario = mission.reserved(step, uav.uav_id), mission.guidance.obeyed, mission.scenario
+        reserved, obeyed, scenario = (
+            mission.reservations.of_others(step, uav.uav_id),
+            mission.guidance.confirmed,
+            mission.scenario,
+        )
         state = augment(
             uav,
             step,
             scenario,
-            visits=mission.visits,
-            rates=mission.rates,
+            visits=mission.records.visits,
+            rates=mission.records.rates,
             reserved=reserved,
             preset=mission.features,
-            belief=mission.belief if mission.decides_from == "fleet" else None,
+            belief=mission.belief if mission.belief_source == "fleet" else None,
         )
         guidance = None
         if obeyed:
             reach = state.reach_ahead(uav.uav_id, scenario)
-            guidance = StepGuidance.of(obeyed, state, reach, step, mission.visits, scenario)
+            guidance = StepGuidance.of(obeyed, state, reach, step, mission.records.visits, scenario)
         watch.lap("augment")
         admissible: list[int] = np.flatnonzero(state.admissible).tolist()
         features = state.features(scenario)
@@ -119,7 +123,7 @@ class AttendedState:
         """Past decisions most like the rows kept, for the prompt's last block, as the mission's selection has it."""
         if not self.rows:
             return []
-        return self.mission.memory.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
+        return self.mission.experiences.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
 
     def best_by_value(self) -> Action:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
@@ -156,7 +160,7 @@ class AttendedState:
             step=self.step,
             sensor_id=sensor_id,
             velocity=velocity,
-            seen=self.mission.template.unknown(sensor_id) if row is None else cells(self.state, [row])[0],
+            seen=self.mission.template.unreported_row(sensor_id) if row is None else cells(self.state, [row])[0],
             sample=sample,
         )
 
@@ -180,5 +184,5 @@ def _attend(
         # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
         added = guidance.worth[:, admissible].max(axis=0) / mission.scenario.queue_capacity
         scores = scores + torch.from_numpy(added.astype(np.float32))
-    kept = top_k(scores, mission.top_k) if mission.attends else list(range(len(admissible)))
+    kept = top_k(scores, mission.top_k) if mission.uses_attention else list(range(len(admissible)))
     return kept, scores.tolist(), contexts

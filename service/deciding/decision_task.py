@@ -12,7 +12,8 @@ from service.llm.answers import Completion
 from service.mission.mission import Mission
 from service.observability.stopwatch import Stopwatch
 from shared.actions import Action
-from shared.wire import Guided, Reason, Source, UavState
+from shared.reasons import Reason
+from shared.wire import Guided, Source, UavState
 
 _SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
 # Kept back of a deadline for the check, the answer and the way through the event loop.

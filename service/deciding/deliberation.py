@@ -26,7 +26,7 @@ import numpy as np
 
 from service.deciding.advisers import ADVISERS, SMOOTHING
 from service.deciding.attended_state import AttendedState
-from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
+from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
@@ -74,25 +74,27 @@ class Deliberation:
             state.uav_id,
             seed=mission.spec.seed,
             reserved=state.reserved,
-            course=None if mission.planner is None else mission.planner.course(),
-            guidance=mission.guidance.obeyed,
+            plans=None if mission.planner is None else mission.planner.plans(),
+            guidance=mission.guidance.confirmed,
         )
         template = template_of(mission)
         return cls(
             candidates=candidates,
-            prompt=template.offer(candidates, state.state, mission.experiences, state.similar_experiences()),
+            prompt=template.choice_prompt(
+                candidates, state.state, mission.experiences.block, state.similar_experiences()
+            ),
             advised={name: found.probabilities(candidates.actions) for name, found in preferences.items()},
             rollout=rollout,
         )
 
-    def evaluate(self) -> Judgement:
+    def evaluate(self) -> Evaluation:
         """What the rollout evaluator expects of every candidate."""
-        return judge(self.rollout, self.candidates.actions)
+        return evaluate(self.rollout, self.candidates.actions)
 
     def conclude(
         self,
         trust: Trust,
-        judgement: Judgement,
+        evaluation: Evaluation,
         llm: FloatArray | None,
         *,
         calibrated: bool,
@@ -111,7 +113,7 @@ class Deliberation:
             heard[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
         weights = trust.among(heard)
         mixture = np.sum([weights[name] * p for name, p in heard.items()], axis=0)
-        regret = self._regret(judgement.lost)
+        regret = self._regret(evaluation.lost)
         score = np.log(mixture) - RATE * np.minimum(regret, CAP)
         free = ~np.isin([sensor for sensor, _ in self.candidates.actions], list(reserved))
         if not free.any():
@@ -121,7 +123,7 @@ class Deliberation:
         advice = Advice(
             regret={name: float(p @ np.minimum(regret, CAP)) for name, p in heard.items()},
             flown={name: float(p[best]) for name, p in heard.items()},
-            expected_cost=float(judgement.cost[best]),
+            expected_cost=float(evaluation.cost[best]),
         )
         report = Guided(
             trust={name: round(weight, 4) for name, weight in trust.weights.items()},
@@ -176,4 +178,4 @@ def candidates_of(state: AttendedState) -> CandidateSet:
     if guidance is None:
         return candidates
     rows = {int(sensor): row for row, sensor in enumerate(state.state.ids)}
-    return candidates.flown_as(lambda sensor, velocity: guidance.nearest(rows[sensor], velocity))
+    return candidates.with_velocities(lambda sensor, velocity: guidance.nearest(rows[sensor], velocity))

@@ -23,7 +23,7 @@ from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
-from shared.wire import Reason
+from shared.reasons import Reason
 
 log = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ class LlmQueries:
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
-        if not mission.promptable:
+        if not mission.prompt_fits:
             return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
         template = template_of(mission)
         labels = [list(candidates.labels)]
@@ -111,7 +111,7 @@ class LlmQueries:
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
         able = self._llm.status == "ready" and uavs <= self._llm.max_uavs_per_call
-        return able and mission.mode == "guided" and uavs > 1 and mission.holds(uavs)
+        return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
 
     async def ask_for_fleet(
         self, mission: Mission, states: Sequence[AttendedState], deadline: Deadline
@@ -126,12 +126,12 @@ class LlmQueries:
         if not asked:
             return {}
         similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())
-        prompts = template.together(
+        prompts = template.fleet_prompts(
             {uav: (candidates, state.state) for uav, (state, candidates) in asked.items()},
-            mission.experiences,
+            mission.experiences.block,
             list(similar),
         )
-        static, user = template.static_together, "".join(prompt.user for prompt in prompts.values())
+        static, user = template.fleet_static, "".join(prompt.user for prompt in prompts.values())
         labels = [list(candidates.labels) for _, candidates in asked.values()]
         completion, by_label, reason = await self._query(mission, static, user, labels, deadline)
         self._note_lateness(len(asked), reason)
@@ -194,4 +194,4 @@ class LlmQueries:
 
 def by_action(candidates: CandidateSet, by_label: dict[str, float]) -> dict[Action, float]:
     """Probabilities of the candidates' labels as those of their actions."""
-    return dict(zip(candidates.actions, candidates.spread(by_label).tolist(), strict=True))
+    return dict(zip(candidates.actions, candidates.sum_by_action(by_label).tolist(), strict=True))

@@ -58,7 +58,7 @@ class Policy:
         """The template's prompt, by which tokens are accounted for in every mode."""
         mission = state.mission
         similar = state.similar_experiences()
-        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences, similar))
+        return Question(mission.template.prompt(state.state, state.shown(), mission.experiences.block, similar))
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
         """Always the LLM-free policy's."""
@@ -87,7 +87,7 @@ class Llm(Policy):
         """The LLM's sensor and velocity."""
         if not state.rows:
             return Fallback("no_candidate")
-        if not state.mission.promptable:
+        if not state.mission.prompt_fits:
             return Fallback("llm_unavailable")
         completion: Completion | None = None
         levels = state.mission.scenario.max_velocity + 1
@@ -97,7 +97,7 @@ class Llm(Policy):
             finally:
                 task.watch.lap("llm")
             answer = Action(*check_answer(completion.text, state.kept_ids, levels))
-            if not state.mission.guidance.obeyed.allows(answer.velocity):
+            if not state.mission.guidance.confirmed.allows(answer.velocity):
                 raise NoDecision("answer_velocity", f"the operator forbids {answer.velocity} m/s")
             verify(state, answer)
         except NoDecision as error:
@@ -132,25 +132,25 @@ class Guided(Policy):
         deliberation, advice, mission = question.deliberation, task.advice, state.mission
         if deliberation is None:
             return Fallback("no_candidate")
-        evaluation = asyncio.get_running_loop().run_in_executor(self._evaluating, deliberation.evaluate)
+        result = asyncio.get_running_loop().run_in_executor(self._evaluating, deliberation.evaluate)
         try:
             if advice is None:
                 candidates, prompt = deliberation.candidates, deliberation.prompt
                 advice = await self._queries.ask(mission, candidates, prompt, task.deadline)
                 task.watch.lap("llm")
-            await asyncio.wait({evaluation}, timeout=task.evaluation_deadline.left())
-            judgement = evaluation.result() if evaluation.done() else None
+            await asyncio.wait({result}, timeout=task.evaluation_deadline.left())
+            evaluation = result.result() if result.done() else None
         finally:
             # An evaluation that still waits for a thread does not begin.
-            evaluation.cancel()
+            result.cancel()
         task.watch.lap("judge")
-        if judgement is None:
+        if evaluation is None:
             reason = advice.reason or "critic_timeout"
             return Fallback(reason, advice.completion, advice.model, evaluated_late=True)
-        reserved = mission.reserved(state.step, state.uav_id)
+        reserved = mission.reservations.of_others(state.step, state.uav_id)
         llm = advice.over(deliberation.candidates.actions)
         trust = mission.trust_in(advice.model)
-        verdict = deliberation.conclude(trust, judgement, llm, calibrated=advice.calibrated, reserved=reserved)
+        verdict = deliberation.conclude(trust, evaluation, llm, calibrated=advice.calibrated, reserved=reserved)
         if verdict is None:
             return Fallback("answer_reserved", advice.completion, advice.model)
         # Other UAVs may have every sensor that the LLM named by now.

@@ -84,7 +84,7 @@ class Pipeline:
             return None
         # In mode `guided` the LLM, which comes after the plan, has as much time as the planner.
         seconds = min(self._planner_s, deadline.earlier_by(RESERVE_S).left() * share)
-        taken = mission.reserved(step, uavs[0])
+        taken = mission.reservations.of_others(step, uavs[0])
         task = asyncio.create_task(mission.planner.plan(uavs, taken, seconds, self._planning))
         self._plans.add(task)
         task.add_done_callback(self._plans.discard)
@@ -99,7 +99,7 @@ class Pipeline:
 def _without_llm(state: AttendedState) -> Action:
     """The plan's action, or one step of look-ahead where there is no plan."""
     mission = state.mission
-    reserved = mission.reserved(state.step, state.uav_id)
+    reserved = mission.reservations.of_others(state.step, state.uav_id)
     planned = mission.planner.action(state.uav_id, reserved) if mission.planner is not None else None
     if planned is not None:
         return planned
@@ -113,7 +113,7 @@ def _without_llm(state: AttendedState) -> Action:
 def _enforce(mission: Mission, choice: Choice) -> Choice:
     """The choice at a velocity that the operator's guidance allows, which may have been confirmed meanwhile."""
     levels = mission.scenario.max_velocity + 1
-    velocity = mission.guidance.obeyed.nearest(choice.action.velocity, levels)
+    velocity = mission.guidance.confirmed.nearest(choice.action.velocity, levels)
     return replace(choice, action=Action(choice.action.sensor_id, velocity))
 
 
@@ -124,5 +124,5 @@ def _commit(task: DecisionTask, state: AttendedState, prompt: Prompt, tokens: To
     pending = state.pending(decision_id, choice.action)
     task.watch.lap("check")
     task.mission.commit(pending, task.attempt, report)
-    task.mission.bases.hold(task.uav, task.step, decision_id)
+    task.mission.delta_reports.remember(task.uav, task.step, decision_id)
     return Decided(decision_id, task, state, prompt, tokens, choice, task.watch.total())

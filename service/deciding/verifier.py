@@ -22,7 +22,7 @@ def verify(state: AttendedState, answer: Action) -> None:
     A sensor out of reach breaks none while nothing that is admissible is in reach at any velocity.
     """
     mission, (sensor, velocity) = state.mission, answer
-    if sensor in mission.reserved(state.step, state.uav_id):
+    if sensor in mission.reservations.of_others(state.step, state.uav_id):
         raise NoDecision("answer_reserved", f"another UAV has sensor {sensor} meanwhile")
     if mission.spec.verify == "off":
         return

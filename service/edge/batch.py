@@ -14,15 +14,15 @@ from service.mission.mission import Mission
 from service.observability.stopwatch import Stopwatch
 from shared.wire import BatchRequest
 
-# Of a batch's time, the most that a query about all of its UAVs may take, and the least that is worth a query: the rest
-# is for weighing the candidates of one UAV after another, with a factor of two to be safe.
-_QUERY_MOST, _QUERY_LEAST = 0.75, 0.25
-# Seconds that a decision takes beside the LLM and the plan, until they are known, and the length of their average.
+# A query about all UAVs may take at most the first share of the batch's time, and is not worth sending with less than
+# the second. The rest is for the UAVs' own decisions one after another, with a safety factor of two.
+_MAX_QUERY_SHARE, _MIN_QUERY_SHARE = 0.75, 0.25
+# The initial estimate of the seconds that a decision takes besides the LLM and the plan, and the average's length.
 _OWN_S, _OWN_MEMORY = 0.03, 20
 
 
 class BatchDecider:
-    """Decides for the UAVs of a batch in their order; it knows how long a decision takes beside its waits."""
+    """Decides for the UAVs of a batch in their order; it estimates the time of a decision without its waits."""
 
     def __init__(self, pipeline: Pipeline, queries: LlmQueries) -> None:
         self._pipeline = pipeline
@@ -30,7 +30,7 @@ class BatchDecider:
         self._own_s = _OWN_S
 
     def note(self, decided: Decided) -> None:
-        """Learn from a decision how long one takes beside the LLM and the plan."""
+        """Update the average time that a decision takes besides the LLM and the plan."""
         waited_ms = decided.latency_ms.get("llm", 0.0) + decided.latency_ms.get("plan", 0.0)
         self._own_s += ((decided.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
 
@@ -43,8 +43,8 @@ class BatchDecider:
         UAV has an equal share of the time that is left.
         """
         step, uavs = request.step, [uav.uav_id for uav in request.uavs]
-        # Every report is known before the first decision. The number of an attempt is taken before the LLM is asked: a
-        # batch that is sent again meanwhile is the later attempt.
+        # Every report is observed before the first decision. Attempts are numbered before the query to the LLM, so that
+        # a repeated batch that arrives meanwhile is the later attempt.
         attempts = {uav.uav_id: mission.observe(uav, step) for uav in request.uavs}
         plan: asyncio.Task[None] | None = None
         advice: dict[int, LlmAdvice] = {}
@@ -62,7 +62,7 @@ class BatchDecider:
             plan = plan or self._pipeline.begin_plan(mission, uavs[index:], step, Deadline(now + share_s))
             deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
             mine = Deadline.after(deadline_ms, own.started).earlier_by(RESERVE_S)
-            # The evaluator may take more than its UAV's share, as long as the later UAVs have what they need.
+            # The evaluator may exceed its UAV's share, as long as enough time is left for the later UAVs.
             evaluation = max(mine, deadline.earlier_by(RESERVE_S + self._own_s * later))
             task = DecisionTask(
                 mission,
@@ -86,6 +86,6 @@ class BatchDecider:
         return decisions
 
     def _query_s(self, total_s: float, uavs: int) -> float | None:
-        """Seconds that the LLM may take for all UAVs at once; None where too few are left."""
-        seconds = min(_QUERY_MOST * total_s, total_s - 2 * uavs * self._own_s)
-        return seconds if seconds >= _QUERY_LEAST * total_s else None
+        """Seconds for a query about all UAVs at once; None where the batch has too little time."""
+        seconds = min(_MAX_QUERY_SHARE * total_s, total_s - 2 * uavs * self._own_s)
+        return seconds if seconds >= _MIN_QUERY_SHARE * total_s else None

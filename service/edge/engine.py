@@ -97,11 +97,11 @@ class Engine:
 
         Raises:
             Refused: the request does not fit its mission.
-            NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.checked`.
+            NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.resolve`.
         """
         watch, deadline = self._start(request)
         within_s = deadline.earlier_by(RESERVE_S).left()
-        mission, report = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+        mission, report = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
 
         async def make() -> list[Decided]:
             return [await self._decide_one(mission, report, watch, deadline)]
@@ -114,12 +114,12 @@ class Engine:
         """A fleet's decisions at one step in the order of its UAVs; arguments and errors as for :meth:`decide`."""
         watch, deadline = self._start(request)
         within_s = deadline.earlier_by(RESERVE_S).left()
-        mission, reports = await self.missions.checked(request, may_make=may_make, key=key, within_s=within_s)
+        mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
 
         async def make() -> list[Decided]:
-            # Every outcome, before the first decision: none is forgotten while the UAVs wait for the LLM.
+            # Every outcome is applied before the first decision: none is lost while the UAVs wait for the LLM.
             for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
-                self._feedback.take(mission, outcome)
+                self._feedback.apply_reported(mission, outcome)
             return await self._batches.decide(mission, reports, watch, deadline)
 
         return await self._respond(mission, request, key, make, deadline)
@@ -155,7 +155,7 @@ class Engine:
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
     ) -> Decided:
         if request.outcome is not None:
-            self._feedback.take(mission, request.outcome)
+            self._feedback.apply_reported(mission, request.outcome)
         attempt = mission.observe(request, request.step)
         plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, deadline)
         deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, deadline.earlier_by(RESERVE_S)
@@ -185,7 +185,7 @@ class Engine:
         if key is None:
             await made()
         else:
-            text = await mission.repeats.once(key, request.model_dump_json(), made, mission.record)
+            text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
             answers = answers or _ANSWERS.validate_json(text)
         began = time.perf_counter()
         stored = await self.journal.stored(min(_STORE_S, deadline.left()))
@@ -217,7 +217,7 @@ class Engine:
         )
 
     def _report(self, decided: Decided, answer: DecideResponse) -> None:
-        """Tell metrics, traces, the log and the mission page of an answer; nothing else tells them of a decision."""
+        """Report an answer to metrics, traces, the log and the mission page; nothing else reports decisions to them."""
         task, choice = decided.task, decided.choice
         self._metrics.record_decision(answer)
         self._metrics.overflow_risk.observe(decided.state.state.overflow_risk)

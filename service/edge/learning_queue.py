@@ -1,4 +1,4 @@
-"""The outcomes that are still to be learned from."""
+"""The queue of training samples from applied outcomes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from service.observability.metrics import Metrics
 
 log = logging.getLogger(__name__)
 
-# Outcomes waiting to be learned from, a fraction of a millisecond each.
-_MAX_LESSONS = 256
-_TELL_S = 10.0
+# Training tasks that may wait, a fraction of a millisecond each.
+_MAX_TASKS = 256
+# Seconds between two warnings about skipped outcomes.
+_WARNING_S = 10.0
 
 
-class Lesson(NamedTuple):
-    """What a mission's modules are to learn: that what they saw came to this cost."""
+class TrainingTask(NamedTuple):
+    """A training sample for a mission's modules, and the cost of its outcome."""
 
     mission: Mission
     sample: Sample
@@ -29,61 +30,61 @@ class Lesson(NamedTuple):
 
 
 class LearningQueue:
-    """Learns on the event loop, a few lessons a turn of it, in the order that the outcomes came.
+    """Trains on the event loop, a few tasks in each iteration, in the order of the outcomes.
 
-    A thread's lesson would take the interpreter from the decisions just as long, and the thread must be woken besides;
-    and a fleet that is flown again in the same order learns the same.
+    A thread would hold the interpreter just as long, and switching to it costs extra. The fixed order makes training
+    reproducible for a fleet that is flown again.
     """
 
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
-        self._waiting = deque[Lesson]()
-        self._missed, self._tell_at = 0, -math.inf
+        self._waiting = deque[TrainingTask]()
+        self._skipped, self._next_warning_at = 0, -math.inf
 
     @property
     def full(self) -> bool:
-        """Whether what comes now is not learned from."""
-        return len(self._waiting) >= _MAX_LESSONS
+        """Whether the queue takes no more tasks."""
+        return len(self._waiting) >= _MAX_TASKS
 
-    def add(self, lesson: Lesson) -> None:
-        """Learn two turns of the loop later: what the decision in hand asks of the LLM or the disk goes out first."""
+    def add(self, task: TrainingTask) -> None:
+        """Train two iterations of the event loop later, after the current decision's request to the LLM or the disk."""
         if not self._waiting:
-            self._loop.call_soon(self._loop.call_soon, self._turn)
-        self._waiting.append(lesson)
+            self._loop.call_soon(self._loop.call_soon, self._train_some)
+        self._waiting.append(task)
 
-    def _turn(self) -> None:
-        """A lesson, and a quarter of what waits besides: nobody waits for many, and as many are learned as come.
+    def _train_some(self) -> None:
+        """Train on one task and a quarter of the rest: no request waits long, and the queue keeps up with the arrivals.
 
-        In a turn of the loop in which 64 UAVs ask, 64 outcomes may come.
+        In an iteration in which 64 UAVs send requests, 64 outcomes may arrive.
         """
         for _ in range(min(len(self._waiting), 1 + len(self._waiting) // 4)):
-            self._learn(self._waiting.popleft())
+            self._train(self._waiting.popleft())
         if self._waiting:
-            self._loop.call_soon(self._turn)
+            self._loop.call_soon(self._train_some)
 
-    def miss(self) -> None:
-        """One line now and then: where learning falls behind, hundreds of outcomes a second are not learned from."""
-        self._missed += 1
-        if (now := time.monotonic()) >= self._tell_at:
-            log.warning("learning falls behind: %d outcomes are not learned from", self._missed)
-            self._missed, self._tell_at = 0, now + _TELL_S
+    def skip(self) -> None:
+        """Count an outcome that is not used for training; under overload hundreds a second share one warning."""
+        self._skipped += 1
+        if (now := time.monotonic()) >= self._next_warning_at:
+            log.warning("learning falls behind: %d outcomes are not used for training", self._skipped)
+            self._skipped, self._next_warning_at = 0, now + _WARNING_S
 
     def catch_up(self, mission: Mission) -> None:
-        """Learn what waits of one mission, now."""
+        """Finish one mission's waiting training now."""
         waiting, self._waiting = self._waiting, deque()
-        for lesson in waiting:
-            if lesson.mission is mission:
-                self._learn(lesson)
+        for task in waiting:
+            if task.mission is mission:
+                self._train(task)
             else:
-                self._waiting.append(lesson)
+                self._waiting.append(task)
 
     def finish(self) -> None:
-        """Learn what waits, now."""
+        """Finish all waiting training now."""
         while self._waiting:
-            self._learn(self._waiting.popleft())
+            self._train(self._waiting.popleft())
 
-    def _learn(self, lesson: Lesson) -> None:
-        if (loss := lesson.mission.learn(lesson.sample, lesson.cost)) is not None:
+    def _train(self, task: TrainingTask) -> None:
+        if (loss := task.mission.learn(task.sample, task.cost)) is not None:
             self._metrics.learner_loss.set(loss)
             self._metrics.learner_update_loss.observe(loss)

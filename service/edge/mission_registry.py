@@ -1,4 +1,4 @@
-"""The missions that one service holds: those in memory, and those that the store has from before."""
+"""The missions of one service: those in memory, and those that are only in the store."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.config.settings import Settings
 from service.errors import Conflict, NotFound, Unavailable
 from service.mission.mission import Mission
+from service.mission.report_checks import complete_report
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
 from service.storage.recovery import restore_mission
@@ -23,14 +24,14 @@ log = logging.getLogger(__name__)
 
 AnyRequest = TypeVar("AnyRequest", DecideRequest, BatchRequest)
 
-# The longest that who asks about a mission waits for its being read back; a decision no longer than its deadline.
+# The longest wait for a mission to load from the store; a decision waits no longer than its deadline.
 _LOAD_S = 10.0
 
 
 class MissionRegistry:
-    """Missions by ID, bounded in number; a request that is refused leaves no mission behind.
+    """Missions by ID, bounded in number; a refused request makes no mission.
 
-    One that the store has is read back when it is first asked about, so that a restart takes no longer for many.
+    A stored mission is loaded by its first request, so that many missions do not slow down a restart.
     """
 
     def __init__(
@@ -49,71 +50,73 @@ class MissionRegistry:
         self._missions: dict[str, Mission] = {}
         self._stored = set[str]() if store is None else set(store.missions())
         self._loading: dict[str, asyncio.Task[Mission]] = {}
-        # One after another, and apart from what decisions need: a store that hangs must not keep these waiting, and
-        # torch draws initial weights from one generator.
+        # A single thread of its own, so that a store that hangs delays no decision, and because torch draws initial
+        # weights from one generator.
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
         self._count()
 
     @property
     def loaded(self) -> list[Mission]:
-        """Those in memory."""
+        """The missions in memory."""
         return list(self._missions.values())
 
     @property
     def stored(self) -> list[str]:
-        """Names of those that are only in the store."""
+        """IDs of the missions that are only in the store."""
         return sorted(self._stored)
 
     async def get(self, mission_id: str) -> Mission:
-        """A mission, waited for where the store must be read.
+        """The mission, loaded from the store where it is not in memory.
 
         Raises:
-            NotFound: there is none.
-            Unavailable: the store cannot be read, or takes longer.
-            Conflict: what the store has of it is damaged.
+            NotFound: there is no such mission.
+            Unavailable: the store cannot be read, or loading takes too long.
+            Conflict: the stored mission is damaged.
         """
         mission = await self._find(mission_id, _LOAD_S)
         if mission is None:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
 
-    async def checked(
+    async def resolve(
         self, request: AnyRequest, *, may_make: bool, key: str | None, within_s: float
     ) -> tuple[Mission, AnyRequest]:
-        """The mission for a request that fits it, and the request with what it leaves out.
+        """The mission of a request that fits it, and the request in full.
 
-        One with scenario ``paper`` is made on first use, where one may.
+        A mission with scenario ``paper`` is made on first use, where ``may_make`` allows it.
 
         Args:
-            key: a request that was answered under it, or is being, fits already, and is left as it is.
+            key: the idempotency key; a request whose answer is remembered or in progress is returned unchanged.
+            within_s: the longest wait for the mission to load.
             within_s: to wait, at most, for a mission that must be read back.
 
         Raises:
             NotFound: there is no such mission, and none may be made.
             Unavailable, Conflict: as :meth:`get`.
-            Refused: a UAV's report does not fit the mission's world, or leaves out what is not held; nothing was
-                recorded.
+            Refused: as :func:`complete_report`; nothing is recorded.
         """
         mission_id = request.mission_id
         mission = await self._find(mission_id, within_s)
-        if mission is not None and key is not None and mission.repeats.knows(key):
+        if mission is not None and key is not None and mission.idempotent_answers.knows(key):
             return mission, request
         if mission is None and not may_make:
             raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
         mission = mission or Mission(mission_id, MissionSpec(), self._settings)
         if isinstance(request, DecideRequest):
-            whole = mission.completed(request, request.step)
+            full = complete_report(mission, request, request.step)
         else:
-            uavs = [mission.completed(u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)]
-            whole = request.model_copy(update={"uavs": uavs})
+            uavs = [
+                complete_report(mission, u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)
+            ]
+            full = request.model_copy(update={"uavs": uavs})
         self._add(mission)
-        return mission, whole
+        return mission, full
 
     async def put(self, mission_id: str, spec: MissionSpec) -> Mission:
-        """Make a mission, or find it made by the same spec.
+        """Make a mission, or return the one that was made with the same spec.
 
         Raises:
-            Conflict: the mission flies with another spec.
+            Conflict: the mission has another spec.
             Unavailable: the store fails.
         """
         mission = await self._find(mission_id, _LOAD_S)
@@ -121,7 +124,7 @@ class MissionRegistry:
             self.refuse_if_failing("mission_id")
             mission = Mission(mission_id, spec, self._settings)
             self._add(mission)
-        elif mission.asked_for != spec:
+        elif mission.requested_spec != spec:
             raise Conflict("mission_id", f"mission {mission_id} has another spec: DELETE it or choose another ID")
         return mission
 
@@ -143,7 +146,7 @@ class MissionRegistry:
             raise Unavailable(field, "the store fails: nothing was recorded, send it again")
 
     def close(self) -> None:
-        """Read no more."""
+        """Load no more missions."""
         self._reading.shutdown(wait=False, cancel_futures=True)
 
     async def _find(self, mission_id: str, within_s: float) -> Mission | None:
@@ -154,47 +157,49 @@ class MissionRegistry:
                 loading.add_done_callback(lambda _: self._loading.pop(mission_id, None))
             await asyncio.wait({loading}, timeout=max(0.0, within_s))
             if not loading.done():
-                raise Unavailable("mission_id", f"mission {mission_id} is being read back from the store")
-            # Raises what it raised. It may have been deleted since.
+                raise Unavailable("mission_id", f"mission {mission_id} is being loaded from the store")
+            # Raises the errors of loading. The mission may be deleted since.
             loading.result()
         return self._missions.get(mission_id)
 
     async def _load(self, mission_id: str) -> Mission:
-        """Read a mission back, beside the decisions for others."""
+        """Load a mission in the reader's thread, while decisions for others continue."""
         assert self._store is not None and isinstance(self._journal, Journal)
         store = self._store
         try:
             loop = asyncio.get_running_loop()
-            kept = await loop.run_in_executor(self._reading, store.load, mission_id)
-            if kept is None:
-                raise ValueError("it is gone from the store")
-            mission = await loop.run_in_executor(self._reading, restore_mission, mission_id, kept, self._settings)
+            stored = await loop.run_in_executor(self._reading, store.load, mission_id)
+            if stored is None:
+                raise ValueError("it is no longer in the store")
+            mission = await loop.run_in_executor(self._reading, restore_mission, mission_id, stored, self._settings)
         except SQLAlchemyError as error:
             log.error("mission %s: the store cannot be read: %s", mission_id, str(error).splitlines()[0])
-            raise Unavailable("mission_id", "the store cannot be read; its log says more") from None
+            raise Unavailable("mission_id", "the store cannot be read; the log has the details") from None
         except ValueError as error:
             log.error("mission %s is damaged: %s", mission_id, error)
-            raise Conflict("mission_id", f"what the store has of {mission_id} is damaged: DELETE it") from None
-        if not mission.promptable:
+            raise Conflict("mission_id", f"the stored mission {mission_id} is damaged: DELETE it") from None
+        if not mission.prompt_fits:
             limit = self._settings.llm_context
             log.warning(
-                "mission %s: its prompt may need more than AICVDS_LLM_CONTEXT (%d): it flies on without the LLM",
+                "mission %s: its prompt may exceed AICVDS_LLM_CONTEXT (%d); it continues without the LLM",
                 mission_id,
                 limit,
             )
-        self._journal.resume(mission, kept.seq, kept.events)
+        self._journal.resume(mission, stored.seq, stored.events)
         self._missions[mission_id] = mission
         self._stored.discard(mission_id)
         self._on_load(mission)
         return mission
 
     def _add(self, mission: Mission) -> None:
-        """Hold it, unless it is held; no other of its ID can have come between, for nothing was waited for."""
+        """Add the mission, unless it is there. There is no await since the look-up, so no other can have its ID."""
         if mission.mission_id in self._missions:
             return
         if len(self._missions) + len(self._stored) >= self._settings.max_missions:
             limit = self._settings.max_missions
-            raise Conflict("mission_id", f"{limit} missions are held already: DELETE one, or raise AICVDS_MAX_MISSIONS")
+            raise Conflict(
+                "mission_id", f"there are already {limit} missions: DELETE one, or raise AICVDS_MAX_MISSIONS"
+            )
         self._missions[mission.mission_id] = mission
         self._journal.begin(mission)
         self._count()

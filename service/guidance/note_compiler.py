@@ -1,12 +1,12 @@
-"""Compiling an operator's note: an LLM rewrites it as orders of a fixed form, once, and every order is checked here.
+"""Compiling an operator's note: an LLM rewrites it once as orders of a fixed form, and every order is checked here.
 
-The LLM is shown worked examples like the note as turns of a conversation, and held to the orders that the note's
-numbers allow where the server can. Its answer is read strictly whatever the server promised; one that does not stand up
-to the note, or that the fleet cannot obey, is refused and drawn again a few times. What a note means is the LLM's to
-say: without one nothing is compiled.
+The prompt is a conversation with worked examples that resemble the note. Where the server can constrain its answer, it
+is constrained to the orders that the note's numbers allow. The answer is parsed strictly in any case; an answer that
+does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
+LLM no note is compiled.
 
-It runs beside the decisions: none waits for it, and with the embedded model, which answers one question at a time, it
-gives way to them.
+Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
+time and serves decisions first.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import logging
 import time
 from typing import Protocol
 
-from service.guidance.note_orders import INSTRUCTION, BadOrders, read, shown
+from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
 from service.guidance.operator_guidance import OperatorGuidance
 from service.guidance.order_grammar import constrain_orders
 from service.llm.answers import NoDecision
@@ -27,41 +27,41 @@ from shared.scenario import Scenario
 
 log = logging.getLogger(__name__)
 
-# The first is the likeliest answer, the rest are drawn.
+# The first answer is the likeliest one; the later ones are sampled.
 _ATTEMPTS = 5
 _TEMPERATURE = 0.7
-# An answer and the wait for silence, and the whole of it, the LLM's loading included.
+# For one answer, including the wait while decisions use the LLM, and for the whole note, including the LLM's loading.
 _ANSWER_S = 60.0
 _TIMEOUT_S = 300.0
 _POLL_S = 0.2
 
 
 class NoteOwner(Protocol):
-    """A mission, as far as its operator's note goes."""
+    """The part of a mission that compiling its note needs."""
 
     mission_id: str
     scenario: Scenario
     guidance: OperatorGuidance
 
-    def understand(self, guidance: Guidance, model: str | None) -> None:
-        """An LLM made this of the note."""
+    def propose_guidance(self, guidance: Guidance, model: str | None) -> None:
+        """Propose the guidance that an LLM made of the note."""
         ...
 
-    def misunderstand(self, why: str, model: str | None) -> None:
-        """Nothing could be made of the note."""
+    def fail_guidance(self, reason: str, model: str | None) -> None:
+        """Note that the note was not compiled."""
         ...
 
 
 class NoteCompiler:
-    """Compiles the notes of a service's missions, one after another."""
+    """Compiles the notes of a service's missions, one at a time."""
 
     def __init__(self, llm: ServerPool) -> None:
         self._llm = llm
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self._tasks: dict[int, asyncio.Task[None]] = {}
 
     def compile(self, mission: NoteOwner) -> None:
-        """Begin, unless the mission has no note or its note is compiled or being compiled."""
+        """Begin to compile the mission's note, unless it has none or its note is compiled or being compiled."""
         key = id(mission.guidance)
         if mission.guidance.status != "compiling" or key in self._tasks:
             return
@@ -70,7 +70,7 @@ class NoteCompiler:
         task.add_done_callback(lambda _: self._tasks.pop(key, None))
 
     async def close(self) -> None:
-        """Give up compiling."""
+        """Cancel compiling."""
         tasks = list(self._tasks.values())
         for task in tasks:
             task.cancel()
@@ -79,46 +79,48 @@ class NoteCompiler:
     async def _compile(self, mission: NoteOwner) -> None:
         note = mission.guidance.note or ""
         try:
-            async with asyncio.timeout(_TIMEOUT_S), self._turn:
-                await self._ready()
+            async with asyncio.timeout(_TIMEOUT_S), self._lock:
+                await self._wait_for_llm()
                 if mission.guidance.status != "compiling":
                     return
-                mission.understand(await understood(note, mission.scenario, self._llm), self._llm.model)
+                mission.propose_guidance(await compile_note(note, mission.scenario, self._llm), self._llm.model)
                 return
         except (BadOrders, Impossible, NoDecision) as error:
-            why = str(error)
+            reason = str(error)
         except TimeoutError:
-            why = f"no answer in {_TIMEOUT_S:g} s"
+            reason = f"no answer in {_TIMEOUT_S:g} s"
         except Exception as error:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
-            why = f"{type(error).__name__}: see the log"
-        mission.misunderstand(f"{why}; give `guidance` of your own", self._llm.model)
+            reason = f"{type(error).__name__}: see the log"
+        mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.model)
 
-    async def _ready(self) -> None:
-        """Wait while the LLM loads, or recovers."""
+    async def _wait_for_llm(self) -> None:
+        """Wait while the LLM loads or recovers; raises ``NoDecision`` where it does neither and is not ready."""
         while self._llm.status != "ready" and self._llm.recovering:
             await asyncio.sleep(_POLL_S)
         if self._llm.status != "ready":
             raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")
 
 
-async def understood(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:
-    """The first of a few answers that stands up to every check.
+async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:
+    """The guidance of the first answer that passes every check.
 
     Raises:
-        BadOrders: none does, or the note has nothing to ask about; the first answer's fault.
-        Impossible: the same, where the first one asks for what the fleet cannot do.
+        BadOrders: no answer passes, and the first one does not match the note; or the note contains no order.
+        Impossible: no answer passes, and the first one orders something that the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
-    wanted = Rewriting(INSTRUCTION, shown(note), note, lambda constraint: constrain_orders(constraint, note))
+    rewriting = Rewriting(
+        INSTRUCTION, similar_examples(note), note, lambda constraint: constrain_orders(constraint, note)
+    )
     faults: list[BadOrders | Impossible] = []
     begun = time.monotonic()
     for attempt in range(_ATTEMPTS):
         temperature = _TEMPERATURE if attempt else 0.0
         async with asyncio.timeout(_ANSWER_S):
-            text = await llm.rewrite(wanted, temperature=temperature, seed=attempt)
+            text = await llm.rewrite(rewriting, temperature=temperature, seed=attempt)
         try:
-            guidance = read(text, note)
+            guidance = parse_orders(text, note)
             guidance.check(scenario)
         except (BadOrders, Impossible) as error:
             log.debug("note, attempt %d: %r: %s", attempt, text[:80], error)

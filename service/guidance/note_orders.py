@@ -1,8 +1,8 @@
-"""Orders: the fixed form in which an LLM puts an operator's note, how a server is held to it, and how it is read.
+"""Orders: the fixed form in which an LLM rewrites an operator's note, and the parser for them.
 
-An order is a few words with numbers in them, and a note becomes some orders with commas between them, or ``nothing``.
-Every number must occur in the note, as digits or as a word, and no two orders may use the same one: an LLM that makes
-things up is found out by its numbers.
+An order is a phrase with numbers. A note becomes a list of orders separated by commas, or ``nothing``. Every number of
+an order must occur in the note, as digits or as a word, and two orders may not use the same occurrence. This check
+detects an LLM that invents an order.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ INSTRUCTION = "Rewrite the operator's note as orders for the UAVs."
 NOTHING = "nothing"
 SEPARATOR = ", "
 MOST_ORDERS = 6
-# The most alike of the examples, the nearest last. A model of 135M parameters gets 22 of 30 held-out notes right with
-# them, where the nearest example's orders with this note's numbers are right 17 times (benchmarks/notes.py).
-_SHOWN = 8
+# The examples in the prompt. With 8 of them a model of 135M parameters compiles 22 of 30 held-out notes correctly. The
+# orders of the most similar example with the note's numbers are correct for 17 (benchmarks/notes.py).
+_EXAMPLES_SHOWN = 8
 
 VISIT, WEIGHT = "visit sensor # every # steps", "sensor # counts # times"
 FASTEST, SLOWEST, FORBIDDEN = "fly at most # m/s", "fly at least # m/s", "do not fly at # m/s"
@@ -44,50 +44,46 @@ _ORDINALS = [
 ]
 # fmt: on
 _NUMBER_WORDS = {word: value for words in (_CARDINALS, _ORDINALS) for value, word in enumerate(words)}
-# "Every other step" is every second one; what is ignored or left out counts 0 times.
+# "Every other step" is every second step. An ignored sensor, or one that is left out, counts 0 times.
 _NUMBER_WORDS |= {"twice": 2, "double": 2, "other": 2, "triple": 3, "ignore": 0, "ignored": 0, "leave": 0}
 _TOKEN = re.compile(r"[0-9]+|[a-z]+|m/s|:")
 
 
 class BadOrders(ValueError):
-    """Orders that do not stand up to the note; the message says why."""
+    """Orders that do not match the note; the message gives the reason."""
 
 
 def numbers_in(note: str) -> Counter[int]:
-    """The numbers that a note names, as digits or in words, and how often."""
+    """How often each number occurs in a note, as digits or in words."""
     named = [number_of(token) for token in _TOKEN.findall(note.lower())]
     return Counter(number for number in named if number is not None)
 
 
-def read(text: str, note: str) -> Guidance:
-    """The structure that orders are, from plain text or the JSON object of ``constrain_orders``.
+def parse_orders(text: str, note: str) -> Guidance:
+    """The guidance that the orders describe, from plain text or the JSON object of ``constrain_orders``.
 
     Raises:
-        BadOrders: extra text, an order given twice, or a number that the note does not name, or not so often.
+        BadOrders: extra text, a repeated order, or a number that occurs more often than in the note.
     """
     wishes: dict[int, dict[str, int]] = {}
     limits: dict[str, int] = {}
     forbidden: list[int] = []
-    for words, numbers in map(parsed, _listed(text)):
+    for words, numbers in map(parse_order, _orders_in(text)):
         if words in (VISIT, WEIGHT):
-            told, key, value = (
-                wishes.setdefault(numbers[0], {}),
-                "visit_every" if words == VISIT else "weight",
-                numbers[1],
-            )
+            target, value = wishes.setdefault(numbers[0], {}), numbers[1]
+            key = "visit_every" if words == VISIT else "weight"
         elif words == FORBIDDEN:
             forbidden.append(numbers[0])
             continue
         else:
-            told, key, value = limits, "max_velocity" if words == FASTEST else "min_velocity", numbers[0]
-        if key in told:
+            target, value = limits, numbers[0]
+            key = "max_velocity" if words == FASTEST else "min_velocity"
+        if key in target:
             raise BadOrders(f"{key} is ordered twice")
-        told[key] = value
+        target[key] = value
     used = Counter([*wishes, *forbidden, *limits.values(), *(v for wish in wishes.values() for v in wish.values())])
-    if made_up := used - numbers_in(note):
-        raise BadOrders(
-            f"the orders use the number {next(iter(made_up))}, which the note does not name, or not so often"
-        )
+    if invented := used - numbers_in(note):
+        raise BadOrders(f"the orders use the number {next(iter(invented))} more often than the note")
     try:
         sensors = [SensorWish.model_validate({"sensor_id": sensor, **wish}) for sensor, wish in wishes.items()]
         return Guidance.model_validate({"sensors": sensors, **limits, "forbidden_velocities": forbidden})
@@ -96,56 +92,56 @@ def read(text: str, note: str) -> Guidance:
         raise BadOrders(f"{first['loc'][-1] if first['loc'] else 'orders'}: {first['msg']}") from None
 
 
-def shown(note: str, count: int = _SHOWN) -> list[tuple[str, str]]:
-    """The worked examples most like a note, the nearest last: notes and their orders.
+def similar_examples(note: str, count: int = _EXAMPLES_SHOWN) -> list[tuple[str, str]]:
+    """The worked examples most similar to a note, the most similar last: notes and their orders.
 
-    Likeness is the cosine of the words and pairs of words that occur in both, rare ones counting more (tf-idf).
+    Similarity is the cosine of the tf-idf weights of words and pairs of words.
     """
-    likeness = [_likeness(_features(note), _features(example)) for example, _ in EXAMPLES]
-    order = sorted(range(len(EXAMPLES)), key=lambda i: likeness[i])
+    similarity = [_similarity(_features(note), _features(example)) for example, _ in EXAMPLES]
+    order = sorted(range(len(EXAMPLES)), key=lambda i: similarity[i])
     return [EXAMPLES[i] for i in order[-count:]]
 
 
 def number_of(token: str) -> int | None:
-    """The number that a word or digits name."""
+    """The value of digits or of a number word; None for any other token."""
     return int(token[:6]) if token.isdigit() else _NUMBER_WORDS.get(token)
 
 
-def parsed(order: str) -> tuple[str, list[int]]:
-    """Which order it is, and its numbers; raises ``BadOrders`` for what is none."""
+def parse_order(order: str) -> tuple[str, list[int]]:
+    """The order's phrase and its numbers; raises ``BadOrders`` for other text."""
     for words, pattern in _PATTERNS.items():
         if found := pattern.fullmatch(order):
             return words, [int(number) for number in found.groups()]
     raise BadOrders(f"{order[:80]!r} is no order")
 
 
-def _listed(text: str) -> list[str]:
+def _orders_in(text: str) -> list[str]:
     stripped = text.strip()
     if stripped.startswith("{"):
         try:
             orders = json.loads(stripped)["orders"]
         except (ValueError, KeyError, RecursionError):
-            raise BadOrders(f"{text[:80]!r} is not what was asked for") from None
+            raise BadOrders(f"{text[:80]!r} is not a JSON object with a list of orders") from None
         if not isinstance(orders, list) or not all(isinstance(order, str) for order in orders):
-            raise BadOrders(f"{text[:80]!r} is not what was asked for")
+            raise BadOrders(f"{text[:80]!r} is not a JSON object with a list of orders")
         return orders[:MOST_ORDERS]
     return [] if stripped == NOTHING else stripped.split(SEPARATOR)[:MOST_ORDERS]
 
 
 @lru_cache(maxsize=256)
 def _features(note: str) -> frozenset[str]:
-    """Words and pairs of words, every number alike."""
+    """Words and pairs of words; every number is the same word."""
     tokens = ["#" if number_of(token) is not None else token for token in _TOKEN.findall(note.lower())]
     return frozenset(tokens) | {" ".join(pair) for pair in zip(tokens, tokens[1:], strict=False)}
 
 
 @cache
 def _rarity() -> dict[str, float]:
-    seen = Counter(feature for example, _ in EXAMPLES for feature in _features(example))
-    return {feature: math.log(1 + len(EXAMPLES) / count) for feature, count in seen.items()}
+    counts = Counter(feature for example, _ in EXAMPLES for feature in _features(example))
+    return {feature: math.log(1 + len(EXAMPLES) / count) for feature, count in counts.items()}
 
 
-def _likeness(first: frozenset[str], second: frozenset[str]) -> float:
+def _similarity(first: frozenset[str], second: frozenset[str]) -> float:
     def total(features: frozenset[str]) -> float:
         return sum(_rarity().get(feature, math.log(1 + len(EXAMPLES))) for feature in features)
 

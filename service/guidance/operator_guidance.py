@@ -1,4 +1,4 @@
-"""One mission's operator guidance: the note, what was understood of it, and what is obeyed once the operator agrees."""
+"""One mission's operator's guidance: the note, the guidance proposed from it, and the confirmed guidance."""
 
 from __future__ import annotations
 
@@ -10,84 +10,84 @@ from shared.scenario import Scenario
 
 
 class OperatorGuidance:
-    """From a note to what is obeyed: compiling, then proposed or failed, then confirmed or rejected.
+    """The life of a note: compiling, then proposed or failed, then confirmed or rejected.
 
-    The operator's own structure is confirmed by being given, at any time; what an LLM makes of the note after that is
-    not heard.
+    The operator may give a structure at any time, which is confirmed at once. A proposal that an LLM makes afterwards
+    is ignored.
 
     Attributes:
-        obeyed: what planners and scores obey now; asks for nothing until something is confirmed.
+        confirmed: the guidance that planner and scores follow; empty until the operator confirms one.
     """
 
     def __init__(self, note: str | None, scenario: Scenario) -> None:
         self.note = note
         self.status: GuidanceState = "none" if note is None else "compiling"
-        self.obeyed: Guidance = NO_GUIDANCE
+        self.confirmed: Guidance = NO_GUIDANCE
         self._scenario = scenario
-        self._understood: Guidance | None = None
+        self._proposed: Guidance | None = None
         self._origin: Literal["llm", "operator"] | None = None
         self._model: str | None = None
         self._failure: str | None = None
 
     def propose(self, guidance: Guidance, model: str | None) -> None:
-        """An LLM made this of the note; nothing but the operator's word makes it obeyed."""
+        """Propose the guidance that an LLM made of the note; it has no effect until the operator confirms it."""
         if self.status == "compiling":
-            self.status, self._understood, self._origin, self._model = "proposed", guidance, "llm", model
+            self.status, self._proposed, self._origin, self._model = "proposed", guidance, "llm", model
 
-    def fail(self, why: str, model: str | None) -> None:
-        """Nothing could be made of the note."""
+    def fail(self, reason: str, model: str | None) -> None:
+        """Note that the note was not compiled."""
         if self.status == "compiling":
-            self.status, self._failure, self._model = "failed", why, model
+            self.status, self._failure, self._model = "failed", reason, model
 
     def answer(self, answer: GuidanceAnswer) -> None:
-        """The operator's word; it is obeyed from the next decision on.
+        """Apply the operator's answer, which takes effect with the next decision.
 
         Raises:
             Conflict: there is nothing to confirm or reject.
-            Refused: the operator's own structure cannot be obeyed; what was obeyed before still is.
+            Refused: the fleet cannot follow the operator's structure; the guidance stays as it is.
         """
         if answer.guidance is not None:
             try:
                 answer.guidance.check(self._scenario)
             except Impossible as error:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
-            self._understood, self._origin, self._failure = answer.guidance, "operator", None
-        elif self._understood is None:
+            self._proposed, self._origin, self._failure = answer.guidance, "operator", None
+        elif self._proposed is None:
             raise Conflict(
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
             )
-        confirmed = answer.answer != "reject"
-        self.status = "confirmed" if confirmed else "rejected"
-        self.obeyed = self._understood if confirmed else NO_GUIDANCE
+        rejected = answer.answer == "reject"
+        self.status = "rejected" if rejected else "confirmed"
+        self.confirmed = NO_GUIDANCE if rejected else self._proposed
 
-    def told(self, mission_id: str) -> GuidanceStatus:
-        """What ``GET /missions/{id}/guidance`` says."""
+    def report(self, mission_id: str) -> GuidanceStatus:
+        """The body of ``GET /missions/{id}/guidance``."""
         return GuidanceStatus(
             mission_id=mission_id,
             status=self.status,
             note=self.note,
-            guidance=self._understood,
-            in_words=None if self._understood is None else self._understood.in_words(),
+            guidance=self._proposed,
+            in_words=None if self._proposed is None else self._proposed.in_words(),
             origin=self._origin,
             model=self._model,
             failure=self._failure,
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Where it stands, as plain values."""
+        """Status, proposal and confirmed guidance, as plain values."""
         return {
             "status": self.status,
-            "obeyed": self.obeyed.model_dump(),
-            "understood": None if self._understood is None else self._understood.model_dump(),
+            "obeyed": self.confirmed.model_dump(),
+            "understood": None if self._proposed is None else self._proposed.model_dump(),
             "origin": self._origin,
             "model": self._model,
             "failure": self._failure,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """As it stood when the state was taken."""
+        """Restore a ``state_dict``."""
         self.status = state["status"]
-        self.obeyed = Guidance.model_validate(state["obeyed"])
-        understood = state["understood"]
-        self._understood = None if understood is None else Guidance.model_validate(understood)
+        self.confirmed = Guidance.model_validate(state["obeyed"])
+        proposed = state["understood"]
+        self._proposed = None if proposed is None else Guidance.model_validate(proposed)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]

@@ -1,4 +1,4 @@
-"""Worked examples for compiling an operator's note: notes as operators write them, and the orders that they mean."""
+"""Worked examples for compiling an operator's note: notes as operators write them, and their orders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The orders that a note's numbers allow, and how a server is held to them: by GBNF, a regular expression or JSON."""
+"""The orders that a note's numbers allow, as a constraint for the LLM server: GBNF, a regular expression or JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.guidance.note_orders import (
     WEIGHT,
     BadOrders,
     numbers_in,
-    parsed,
+    parse_order,
 )
 from service.llm.request_bodies import Constraint
 
@@ -28,24 +28,24 @@ _MOST_RULES = 60
 
 
 def admissible(note: str) -> list[str]:
-    """Every order that has only numbers of the note, none more often than the note, in the order of its words.
+    """Every order whose numbers occur in the note, each at most as often as there; ordered by phrase.
 
     Raises:
-        BadOrders: the note names too many numbers, or none.
+        BadOrders: the note has no number, or too many different ones.
     """
-    named = numbers_in(note)
-    numbers = list(named)
+    available = numbers_in(note)
+    numbers = list(available)
     if not numbers:
-        raise BadOrders("the note names no number, and no order goes without one: it stands in the prompt alone")
+        raise BadOrders("the note has no number, and every order needs one: only the prompt contains the note")
     if len(numbers) > _MOST_NUMBERS:
-        raise BadOrders(f"the note names more than {_MOST_NUMBERS} different numbers")
-    one = [_filled(words, (number,)) for words in (FASTEST, SLOWEST, FORBIDDEN) for number in numbers]
-    pairs = [(first, second) for first in numbers for second in numbers if first != second or named[first] > 1]
-    return [_filled(words, pair) for words in (VISIT, WEIGHT) for pair in pairs] + one
+        raise BadOrders(f"the note has more than {_MOST_NUMBERS} different numbers")
+    single = [_filled(words, (number,)) for words in (FASTEST, SLOWEST, FORBIDDEN) for number in numbers]
+    pairs = [(first, second) for first in numbers for second in numbers if first != second or available[first] > 1]
+    return [_filled(words, pair) for words in (VISIT, WEIGHT) for pair in pairs] + single
 
 
 def constrain_orders(constraint: Constraint, note: str) -> dict[str, Any]:
-    """The request fields that hold a server to orders that the note's numbers allow, or ``nothing``.
+    """The request fields that constrain a server to orders that the note's numbers allow, or ``nothing``.
 
     Raises:
         BadOrders: as :func:`admissible`.
@@ -72,51 +72,50 @@ def constrain_orders(constraint: Constraint, note: str) -> dict[str, Any]:
     return {}
 
 
-def _grammar(orders: Sequence[str], named: Counter[int]) -> str:
-    """GBNF in which no number is used more often than it is named, as ``read`` wants it.
+def _grammar(orders: Sequence[str], available: Counter[int]) -> str:
+    """GBNF in which no number is used more often than it is available, as ``parse_orders`` requires.
 
-    A rule is what may follow, where these numbers are left and these sensors have had an order; where a note has so
-    many numbers that there would be too many rules, a few fixed ones allow more, and ``read`` refuses it.
+    Each rule is a state: the numbers that are left and the sensors that are already named. A breadth-first search finds
+    the states. Where a note has so many numbers that there would be too many rules, a fixed grammar allows more orders,
+    and ``parse_orders`` refuses the wrong ones.
     """
-    places = {_State.at_first(named): 0}
-    rules = []
-    for state in (waiting := list(places)):
-        following: dict[_State, list[str]] = {}
+    start = _State(frozenset(available.items()))
+    index = {start: 0}
+    queue, rules = [start], []
+    # The loop extends the list that it iterates over.
+    for state in queue:
+        by_next: dict[_State, list[str]] = {}
         for order in orders:
             if (after := state.after(order)) is not None:
-                following.setdefault(after, []).append(f'"{order}"')
-        for after in following:
-            if after not in places and any(after.after(order) is not None for order in orders):
-                places[after] = len(places)
-                waiting.append(after)
-        if len(places) > _MOST_RULES:
-            words = " | ".join(f'"{order}"' for order in orders)
+                by_next.setdefault(after, []).append(f'"{order}"')
+        for after in by_next:
+            if after not in index and any(after.after(order) is not None for order in orders):
+                index[after] = len(index)
+                queue.append(after)
+        if len(index) > _MOST_RULES:
+            any_order = " | ".join(f'"{order}"' for order in orders)
             several = f'order ("{SEPARATOR}" order){{0,{MOST_ORDERS - 1}}}'
-            return f'root ::= "{NOTHING}" | {several}\norder ::= {words}'
-        ways = [
-            f"({' | '.join(told)})" + (f' ("{SEPARATOR}" s{places[after]})?' if after in places else "")
-            for after, told in following.items()
+            return f'root ::= "{NOTHING}" | {several}\norder ::= {any_order}'
+        alternatives = [
+            f"({' | '.join(quoted)})" + (f' ("{SEPARATOR}" s{index[after]})?' if after in index else "")
+            for after, quoted in by_next.items()
         ]
-        rules.append(f"s{places[state]} ::= {' | '.join(ways)}")
+        rules.append(f"s{index[state]} ::= {' | '.join(alternatives)}")
     return "\n".join([f'root ::= "{NOTHING}" | s0', *rules])
 
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """What orders so far leave: numbers and how often they may yet be used, and the sensors named."""
+    """The numbers that are left, with the uses left of each, and the sensors that the orders so far name."""
 
     left: frozenset[tuple[int, int]]
     sensors: frozenset[int] = frozenset()
 
-    @classmethod
-    def at_first(cls, named: Counter[int]) -> _State:
-        return cls(frozenset(named.items()))
-
     def after(self, order: str) -> _State | None:
-        """What one more order leaves; None where a number would be used too often."""
-        words, numbers = parsed(order)
+        """The state after one more order; None where the order uses a number too often."""
+        words, numbers = parse_order(order)
         sensors = frozenset(numbers[:1]) if words in (VISIT, WEIGHT) else frozenset[int]()
-        # A sensor may be named in several orders, of which each says something else about it.
+        # Several orders may name the same sensor, each with another property; its number is used once.
         used = Counter(numbers) - Counter(sensors & self.sensors)
         left = Counter(dict(self.left))
         if used - left:

@@ -1,4 +1,4 @@
-"""What confirmed guidance asks of one UAV's next step: velocities that it may fly, and what its sensors are worth."""
+"""Confirmed guidance for one UAV's next step: the allowed velocities, and the worth of each sensor."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from shared.scenario import Scenario
 
 @dataclass(frozen=True, slots=True)
 class StepGuidance:
-    """V velocity levels, J sensors in the order of the state.
+    """Guidance for V velocity levels and J sensors, in the order of the state.
 
     Attributes:
-        allowed: shape ``(V,)``, the levels that may be flown.
-        due: shape ``(V, J)``, whether the sensor must be visited in this step to be on time, and is in reach then.
-        worth: shape ``(V, J)``, packets on top of the LLM-free policy's: ``(w_j - 1) U_j packets``, and W where due,
-            which is more than anything else in reach. ``-inf`` where the level is not allowed.
+        allowed: shape ``(V,)``, whether the operator allows the level.
+        due: shape ``(V, J)``, whether a visit of the sensor is due in this step, and the level brings it in reach.
+        worth: shape ``(V, J)``, packets to add to the LLM-free policy's worth: ``(w_j - 1) U_j packets``, plus W where
+            due, which exceeds the worth of everything else in reach. ``-inf`` where the level is not allowed.
     """
 
     allowed: NDArray[np.bool_]
@@ -34,10 +34,10 @@ class StepGuidance:
     def of(
         cls, guidance: Guidance, state: State, reach: Reach, step: int, visits: NDArray[np.int64], scenario: Scenario
     ) -> Self:
-        """Of a UAV's state and its reach at a step.
+        """The guidance for a UAV's state and reach at a step.
 
         Args:
-            visits: step of each sensor's last visit, by sensor ID; -1 for never.
+            visits: the step of each sensor's last visit, by sensor ID; -1 for never.
         """
         allowed = guidance.allowed(scenario.max_velocity + 1)
         overdue = guidance.overdue(step, visits)[state.ids] > 0
@@ -47,10 +47,10 @@ class StepGuidance:
         return cls(allowed, due, np.where(allowed[:, None], worth, -np.inf))
 
     def nearest(self, row: int, level: int) -> int:
-        """The level to fly at for the sensor in that row, where another was wanted: the nearest that may be flown.
+        """The allowed level nearest to the given one, for the sensor in that row.
 
-        Where the sensor is due, of those that reach it in time. Nearest rather than best: values of levels were learned
-        with all of them, and without the fast ones a UAV that is told the best of the rest hovers.
+        Where the sensor is due, only levels that bring it in reach count. The nearest level is taken, not the best one:
+        the values of levels were learned with all levels, and the best of the slow ones alone makes a UAV hover.
         """
         choices = np.flatnonzero(self.due[:, row] if self.due[:, row].any() else self.allowed)
         return int(choices[np.abs(choices - level).argmin()])

@@ -1,4 +1,4 @@
-"""A mission as the page draws it, as JSON: all of it, or what changes from one moment to the next."""
+"""The page's JSON of a mission: a snapshot, or the changes since the last update."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from shared.scenario import Scenario
 from shared.trajectory import trajectories
 from shared.urgency import urgency
 
-# Points of a trajectory: a circle of 300 m is then off by less than half a metre.
+# Points of a trajectory. The error for a circle of 300 m is less than half a metre.
 _POINTS = 97
 
 
-def snapshot(mission: Mission, kept: list[RecentDecision], edge: str) -> bytes:
-    """All that the page needs to begin, decisions included.
+def snapshot(mission: Mission, decisions: list[RecentDecision], edge: str) -> bytes:
+    """The complete state of the page, with these decisions.
 
     Args:
-        edge: this process's own name: another's knows nothing of the decisions before.
+        edge: an ID of this process: after a restart the earlier decisions are unknown.
     """
     scenario = mission.scenario
     return _json(
@@ -30,7 +30,7 @@ def snapshot(mission: Mission, kept: list[RecentDecision], edge: str) -> bytes:
             "mission": {
                 "mission_id": mission.mission_id,
                 "mode": mission.mode,
-                "asks": mission.asks,
+                "asks": mission.spec.uses_llm,
                 "planner": mission.planner is not None,
                 "top_k": mission.top_k,
                 "note": mission.guidance.note,
@@ -39,30 +39,30 @@ def snapshot(mission: Mission, kept: list[RecentDecision], edge: str) -> bytes:
             "pipeline": scenario.pipeline if scenario.layout != "uniform" else (),
             "trajectories": _curves(scenario),
             "places": np.round(mission.belief.places, 1).tolist(),
-            "decisions": [one.told() for one in kept],
+            "decisions": [decision.summary() for decision in decisions],
             "outcomes": [],
             **_moment(mission),
         }
     )
 
 
-def update(mission: Mission, kept: list[RecentDecision], since: int) -> bytes:
-    """What has changed.
+def update(mission: Mission, decisions: list[RecentDecision], since: int) -> bytes:
+    """The changes since an order of the history.
 
     Args:
-        since: of the history's order: decisions after it are told in full, of earlier ones the outcomes after it.
+        since: later decisions are complete; of earlier ones only the later outcomes are included.
     """
     return _json(
         {
-            "decisions": [one.told() for one in kept if one.order > since],
-            "outcomes": [one.outcome for one in kept if one.order <= since < one.settled],
+            "decisions": [decision.summary() for decision in decisions if decision.order > since],
+            "outcomes": [d.outcome for d in decisions if d.order <= since < d.outcome_order],
             **_moment(mission),
         }
     )
 
 
-def named(mission: Mission) -> int:
-    """How many sensors' places are known: the page must draw them once."""
+def located_sensors(mission: Mission) -> int:
+    """The number of sensors whose position is known; the page draws each sensor once."""
     return int(np.isfinite(mission.belief.places[:, 0]).sum())
 
 
@@ -70,7 +70,7 @@ _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacit
 
 
 def _moment(mission: Mission) -> dict[str, Any]:
-    """What may differ every time: counts, and by sensor what the fleet believes now."""
+    """The volatile part: counts, and the fleet's belief of each sensor."""
     belief = mission.belief
     step = belief.newest or 0
     queue = belief.queue(step)
@@ -84,7 +84,7 @@ def _moment(mission: Mission) -> dict[str, Any]:
         "queue": np.round(queue, 1).tolist(),
         "urgency": np.round(urgency(queue, belief.rate, mission.scenario), 3).tolist(),
         "heard": belief.heard.tolist(),
-        "visits": mission.visits.tolist(),
+        "visits": mission.records.visits.tolist(),
         "uavs": {uav: {"step": last.step, "position": last.position} for uav, last in belief.uavs.items()},
     }
 
@@ -94,5 +94,5 @@ def _curves(scenario: Scenario) -> list[Any]:
 
 
 def _json(value: dict[str, Any]) -> bytes:
-    # A sensor that nobody has named has no place: NaN.
+    # The position of a sensor is NaN until a report names it.
     return to_json(value, inf_nan_mode="null")

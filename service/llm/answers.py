@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from shared.actions import Action
-from shared.wire import Reason
+from shared.reasons import Reason
 
 _TWO_INTEGERS = re.compile(r"([0-9]{1,5}) ([0-9]{1,2})")
 

@@ -27,7 +27,8 @@ from service.llm.request_bodies import (
     rewriting_body,
     warm_up_body,
 )
-from shared.wire import Readiness, Reason
+from shared.reasons import Reason
+from shared.wire import Readiness
 
 if TYPE_CHECKING:
     from service.llm.client import LLMClient

@@ -1,4 +1,4 @@
-"""What changes a mission: the journal keeps these, and a restart plays them again."""
+"""The events that change a mission: the journal writes them, and a restart applies them again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from shared.wire import Outcome, UavState
 class Pending:
     """A decision whose outcome is still to come.
 
-    ``seen`` is the sensor's row as it was then; ``sample`` is None where the modules had no part in the decision.
+    Attributes:
+        seen: the chosen sensor's row at the decision.
+        sample: the training sample; None where the modules had no part in the decision.
     """
 
     decision_id: str
@@ -29,11 +31,11 @@ class Pending:
     sample: Sample | None
 
     def state_dict(self) -> dict[str, Any]:
-        """As plain values and arrays."""
+        """Plain values and arrays."""
         sample = self.sample
-        told = None if sample is None else [sample.features, sample.chosen, sample.approach, sample.velocity]
+        fields = None if sample is None else [sample.features, sample.chosen, sample.approach, sample.velocity]
         names = ("decision_id", "uav_id", "step", "sensor_id", "velocity")
-        return {**{name: getattr(self, name) for name in names}, "seen": dict(self.seen), "sample": told}
+        return {**{name: getattr(self, name) for name in names}, "seen": dict(self.seen), "sample": fields}
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> Pending:
@@ -44,7 +46,7 @@ class Pending:
 
 @dataclass(frozen=True, slots=True)
 class AdviserReport:
-    """What the advisers said to a decision, of whom one was this LLM."""
+    """The advice of all advisers on a decision, of which this LLM is one."""
 
     model: str
     advice: Advice
@@ -52,7 +54,7 @@ class AdviserReport:
 
 @dataclass(frozen=True, slots=True)
 class Reported:
-    """A UAV said how things stand, and asks for its next decision."""
+    """A UAV reports its state and asks for its next decision."""
 
     step: int
     uav: UavState
@@ -60,24 +62,24 @@ class Reported:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """A UAV was told what to do, as the answer to this attempt."""
+    """A UAV has a decision, as the answer to this attempt."""
 
     decision: Pending
     attempt: int
-    counsel: AdviserReport | None
+    advice: AdviserReport | None
 
 
 @dataclass(frozen=True, slots=True)
 class Settled:
-    """What came of a decision, and whether the modules learn from it: under too heavy a load they do not."""
+    """A decision has its outcome. ``for_training`` is false under overload, when the modules do not learn from it."""
 
     outcome: Outcome
-    taught: bool
+    for_training: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Guided:
-    """The operator's guidance stands like this, as :meth:`OperatorGuidance.state_dict` has it."""
+    """The operator's guidance has changed; ``state`` is its :meth:`OperatorGuidance.state_dict`."""
 
     state: dict[str, Any]
 
@@ -85,5 +87,5 @@ class Guided:
 Event = Reported | Decided | Settled | Guided | Answered
 
 
-def unheard(event: Event) -> None:
-    """What hears of the events of a mission that nobody keeps."""
+def ignore_event(event: Event) -> None:
+    """The listener of a mission without a journal."""

@@ -1,4 +1,4 @@
-"""Requests sent again under the same key: the same answer, however often they come, and after a restart too."""
+"""Idempotency keys: a request that comes again under its key gets the same answer, even after a restart."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 from service.errors import Refused, Unavailable
 from shared.bounded import BoundedDict
 
-# Quotes within a text are escaped, so no text has this.
-_A_DECISION = '"decision_id":'
+# JSON escapes quotes within a text, so only the field's name matches.
+_DECISION_FIELD = '"decision_id":'
 
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """The answer to a request under a key; ``digest`` says which request that was."""
+    """The answer to a request under an idempotency key; ``digest`` is the request's SHA-256."""
 
     key: str
     digest: str
@@ -25,66 +25,66 @@ class Answered:
 
     @property
     def decisions(self) -> int:
-        """How many decisions it tells, at least one: those of a batch are one answer."""
-        return max(1, self.body.count(_A_DECISION))
+        """The number of decisions in the answer, at least 1; a batch has one answer for all."""
+        return max(1, self.body.count(_DECISION_FIELD))
 
 
 class IdempotentAnswers:
     """The newest answers by key, as JSON.
 
     Args:
-        most: how many decisions are remembered; of a single answer with more, all.
+        most: the number of decisions that are remembered. A single answer with more is remembered whole.
     """
 
     def __init__(self, most: int) -> None:
         self._answers = BoundedDict[str, Answered](most, lambda answered: answered.decisions)
-        self._underway: dict[str, tuple[str, asyncio.Future[str]]] = {}
+        self._in_progress: dict[str, tuple[str, asyncio.Future[str]]] = {}
 
     async def once(
         self, key: str, request: str, make: Callable[[], Awaitable[str]], record: Callable[[Answered], None]
     ) -> str:
-        """The answer under this key; made where there is none yet, else waited for or remembered.
+        """The answer under this key: remembered, in progress, or else made now.
 
         Args:
-            request: its canonical text; under one key there is one.
-            record: hears of an answer that was made.
+            request: the request's canonical text.
+            record: receives an answer that is made now.
 
         Raises:
-            Refused: the key was used for another request.
+            Refused: the key belongs to another request.
         """
         digest = hashlib.sha256(request.encode()).hexdigest()
-        underway = self._underway.get(key)
+        in_progress = self._in_progress.get(key)
         known = self._answers.get(key)
-        if (underway and underway[0] != digest) or (known and known.digest != digest):
+        if (in_progress and in_progress[0] != digest) or (known and known.digest != digest):
             raise Refused("Idempotency-Key", "this key was used for another request of this mission")
         if known is not None:
             return known.body
-        if underway is not None:
-            return await asyncio.shield(underway[1])
-        waiting: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._underway[key] = digest, waiting
+        if in_progress is not None:
+            return await asyncio.shield(in_progress[1])
+        answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._in_progress[key] = digest, answer
         try:
             body = await make()
         except BaseException as error:
-            # Whoever waits fails alike; nobody may be waiting.
-            gone = Unavailable("Idempotency-Key", "the request under this key was given up: send it again")
-            waiting.set_exception(error if isinstance(error, Exception) else gone)
-            waiting.exception()
+            # Requests that wait for this answer fail alike. There may be none, so the exception is marked as retrieved.
+            cancelled = Unavailable("Idempotency-Key", "the request under this key was cancelled: send it again")
+            answer.set_exception(error if isinstance(error, Exception) else cancelled)
+            answer.exception()
             raise
         finally:
-            del self._underway[key]
+            del self._in_progress[key]
         answered = Answered(key, digest, body)
         self.remember(answered)
         record(answered)
-        waiting.set_result(body)
+        answer.set_result(body)
         return body
 
     def knows(self, key: str) -> bool:
-        """Whether there is an answer under this key, or one is being made."""
-        return key in self._answers or key in self._underway
+        """Whether an answer under this key is remembered or in progress."""
+        return key in self._answers or key in self._in_progress
 
     def remember(self, answered: Answered) -> None:
-        """Keep an answer; the oldest of too many is forgotten."""
+        """Remember an answer; past the limit the oldest is forgotten."""
         self._answers[answered.key] = answered
 
     def state_dict(self) -> list[Any]:
@@ -92,7 +92,7 @@ class IdempotentAnswers:
         return [[a.key, a.digest, a.body] for a in self._answers.values()]
 
     def load_state_dict(self, state: list[Any]) -> None:
-        """As they were when the state was taken."""
+        """Restore a ``state_dict``."""
         self._answers.clear()
-        for told in state:
-            self.remember(Answered(*told))
+        for answered in state:
+            self.remember(Answered(*answered))

@@ -1,4 +1,4 @@
-"""A mission's spec in full: what its maker left open, settled by the service's settings and by its mode."""
+"""A mission's spec in full: the service's settings and the mission's mode decide what the request leaves open."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ResolvedPromptStyle(PromptStyle):
 
 
 class ResolvedSpec(MissionSpec):
-    """A spec in which nothing is left open. The store keeps it, so its fields are a file format."""
+    """A spec in which nothing is left open. The store writes it, so its fields are a file format."""
 
     mode: Mode
     top_k: int = Field(ge=1)
@@ -30,22 +30,32 @@ class ResolvedSpec(MissionSpec):
 
     @classmethod
     def of(cls, spec: MissionSpec, settings: Settings) -> Self:
-        """A spec with the service's settings, and what follows from its mode, where it says nothing."""
+        """The spec, with the service's settings and the defaults of its mode for what it leaves open."""
         mode = spec.mode or settings.mode
-        # The paper's method as it is written, unless asked otherwise.
-        written = mode == "llm"
-        told = spec.prompt.experiences
+        # Mode `llm` is the paper's method as the paper has it, unless the spec says otherwise.
+        as_published = mode == "llm"
+        experiences = spec.prompt.experiences
         prompt = {
-            "experiences": settings.experiences if told is None else told,
+            "experiences": settings.experiences if experiences is None else experiences,
             "selection": spec.prompt.selection or settings.selection,
         }
-        settled = {
+        resolved = {
             "mode": mode,
-            "features": spec.features or ("paper" if written else "reach"),
-            "belief": spec.belief or ("reported" if written else "fleet"),
+            "features": spec.features or ("paper" if as_published else "reach"),
+            "belief": spec.belief or ("reported" if as_published else "fleet"),
             "top_k": spec.top_k or settings.top_k,
             "planner": spec.planner or settings.planner,
             "verify": spec.verify or settings.verify,
             "prompt": ResolvedPromptStyle.model_validate(dict(spec.prompt) | prompt),
         }
-        return cls.model_validate(dict(spec) | settled)
+        return cls.model_validate(dict(spec) | resolved)
+
+    @property
+    def uses_llm(self) -> bool:
+        """Whether an LLM has a part in the decisions."""
+        return self.mode in ("llm", "guided")
+
+    @property
+    def uses_attention(self) -> bool:
+        """Whether attention prunes the state; mode ``value`` decides by its scores and always uses it."""
+        return self.attention == "on" or self.mode == "value"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.config.settings import Settings
+from shared.reasons import LLM_FAILURES
 from shared.wire import DecideResponse
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
-# Reasons that make the LLM's span an error. The other reasons are no failure, or mean that the LLM was not called.
-_FAILURES = ("llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity")
 
 
 def provider_from_environment(version: str) -> TracerProvider | None:
@@ -95,7 +94,7 @@ class Traces:
         if answer.tokens.server_prompt is not None:
             attributes["gen_ai.usage.input_tokens"] = answer.tokens.server_prompt
             attributes["gen_ai.usage.output_tokens"] = answer.tokens.completion or 0
-        if answer.reason in _FAILURES:
+        if answer.reason in LLM_FAILURES:
             attributes["error.type"] = answer.reason
         return attributes
 

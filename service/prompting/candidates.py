@@ -1,15 +1,16 @@
-"""Mode ``guided``: the sensor-velocity pairs to choose from, and how an LLM names one with a single token.
+"""Mode ``guided``: the candidate set of sensor-velocity pairs, each with choice letters of a single token.
 
-A candidate's label is a letter. A row of the prompt shows a sensor's first letter; the letters after it stand for
-its faster velocities. Always as many a row, so that the letters' places in the prompt, and with them what the LLM
-favours a letter or a place by, are the same for a mission's life. Where several UAVs are asked about at once, each
-has rows of its own whose letters begin with A, and the rows name the sensor, which two UAVs must not share.
+A row of the prompt shows a sensor's first letter; the letters after it are its faster velocity options. Every row has
+the same number of letters, so that the letters' positions in the prompt, and with them the LLM's bias towards letters
+and positions, stay the same for a mission's life. In a prompt about several UAVs each UAV has its own rows, whose
+letters begin with A. These rows name the sensor, because two UAVs may not share one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from string import ascii_uppercase
 from typing import Self
 
@@ -21,46 +22,49 @@ from shared.channel import FloatArray
 from shared.features import State
 from shared.reach import Reach
 
-# OpenAI and vLLM tell the probabilities of at most 20 tokens.
+# OpenAI and vLLM return the probabilities of at most 20 tokens.
 _MOST_LABELS = 20
 _MOST_VELOCITIES = 4
-# Velocities at which at least this much of the most that can be moved is moved are all as good for the sensor.
-_NEARLY = 0.9
+# Velocities that move at least this share of the most packets are equally good for the sensor.
+_NEARLY_BEST = 0.9
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Letters:
-    """A mission's letters: how many ``rows`` a prompt shows at most, and how many letters each has, for velocities."""
+    """A mission's choice letters: the most ``rows`` that a prompt shows, and the ``velocities`` of each row."""
 
     rows: int
     velocities: int
 
     @classmethod
     def of(cls, rows: int) -> Self:
-        """For as many of so many rows as there can be letters: 4 a row at the most, at least 1."""
+        """Letters for the rows: 1 to 4 for each, and fewer rows where 20 letters are too few."""
         velocities = max(1, min(_MOST_VELOCITIES, _MOST_LABELS // rows))
         return cls(min(rows, _MOST_LABELS // velocities), velocities)
 
-    @property
+    @cached_property
     def all(self) -> str:
         """Every letter that a prompt can offer."""
         return ascii_uppercase[: self.rows * self.velocities]
 
-    @property
+    @cached_property
     def first(self) -> str:
-        """Each row's first, the one that it shows."""
+        """The first letter of each row, which the row shows."""
         return self.all[:: self.velocities]
 
-    def at(self, row: int) -> str:
-        """A row's, slowest to fastest."""
+    def of_row(self, row: int) -> str:
+        """The letters of a row, slowest velocity first."""
         return self.all[row * self.velocities :][: self.velocities]
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """What there is to choose from: ``actions`` (sensor ID, velocity), each once, in the order of the rows.
+    """The actions to choose from.
 
-    ``labels`` names actions by index; several letters may name the same. ``rows`` is their text.
+    Attributes:
+        actions: each action once, in the order of the rows.
+        labels: the index of each letter's action; several letters may have the same action.
+        rows: the text of the rows.
     """
 
     actions: list[Action]
@@ -69,57 +73,54 @@ class CandidateSet:
 
     @classmethod
     def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters) -> Self:
-        """Of the rows of a state, in the order to show them; no more than there are letters for."""
+        """The candidates for these rows of a state, in this order, as far as there are letters for them."""
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
         text = []
-        kept = shown[: letters.rows]
-        for place, (row, known) in enumerate(zip(kept, cells(state, kept), strict=True)):
-            speeds = velocities(reach, row, letters.velocities)
-            named = letters.at(place)
-            for letter, velocity in zip(named, speeds, strict=True):
+        lettered = shown[: letters.rows]
+        for number, (row, texts) in enumerate(zip(lettered, cells(state, lettered), strict=True)):
+            options = velocity_options(reach, row, letters.velocities)
+            own = letters.of_row(number)
+            for letter, velocity in zip(own, options, strict=True):
                 labels[letter] = actions.setdefault(Action(int(state.ids[row]), velocity), len(actions))
-            text.append(f"{named[0]}{known['queue']},{known['age']},{_span(speeds)}\n")
+            # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
+            slowest, fastest = options[0], options[-1]
+            span = f"{slowest}-{fastest}" if 0 < slowest < fastest else str(fastest)
+            text.append(f"{own[0]}{texts['queue']},{texts['age']},{span}\n")
         return cls(list(actions), labels, "".join(text))
 
-    def flown_as(self, velocity: Callable[[int, int], int]) -> CandidateSet:
-        """With other velocities, told by sensor and velocity; labels may come to name the same action."""
+    def with_velocities(self, velocity: Callable[[int, int], int]) -> CandidateSet:
+        """The set with each action's velocity replaced by ``velocity(sensor, velocity)``; equal actions merge."""
         actions: dict[Action, int] = {}
-        places = [actions.setdefault(Action(s, velocity(s, v)), len(actions)) for s, v in self.actions]
-        return CandidateSet(list(actions), {label: places[i] for label, i in self.labels.items()}, self.rows)
+        index = [actions.setdefault(Action(s, velocity(s, v)), len(actions)) for s, v in self.actions]
+        return CandidateSet(list(actions), {label: index[i] for label, i in self.labels.items()}, self.rows)
 
     def with_actions(self, added: Sequence[Action]) -> CandidateSet:
-        """With more that no letter names."""
-        known = dict.fromkeys(self.actions)
-        return CandidateSet(list(known | dict.fromkeys(added)), self.labels, self.rows)
+        """The set with more actions, which have no letter."""
+        return CandidateSet(list(dict.fromkeys([*self.actions, *added])), self.labels, self.rows)
 
     def numbered_rows(self) -> str:
-        """The rows with the sensor's ID after the letter."""
+        """The rows, with the sensor's ID after the letter."""
         return "".join(
             f"{row[0]}{self.actions[self.labels[row[0]]][0]},{row[1:]}" for row in self.rows.splitlines(keepends=True)
         )
 
-    def spread(self, by_label: Mapping[str, float]) -> FloatArray:
-        """Probabilities of labels as those of actions, ``(n,)``."""
+    def sum_by_action(self, by_label: Mapping[str, float]) -> FloatArray:
+        """The probabilities of the letters, added up for each action, ``(n,)``."""
         probabilities = np.zeros(len(self.actions))
         for label, probability in by_label.items():
             probabilities[self.labels[label]] += probability
         return probabilities
 
 
-def velocities(reach: Reach, row: int, count: int) -> list[int]:
-    """The velocities worth offering for a sensor, slowest first, ``count`` of them with repetitions.
+def velocity_options(reach: Reach, row: int, count: int) -> list[int]:
+    """``count`` velocity options for a sensor, slowest first; options may repeat.
 
-    Evenly spaced over the span in which nearly all that can be moved is moved, its ends included: where a UAV is to be
-    for its next sensors is not to be read off this one. Of one, the best by worth.
+    They are evenly spaced over the velocities that move nearly the most packets, both ends included, because this
+    sensor does not determine where its UAV should be for the next ones. A single option is the velocity of most worth.
     """
     if count == 1:
         return [int(reach.best[row])]
     packets = reach.packets[:, row]
-    good = np.flatnonzero(packets >= _NEARLY * packets.max())
+    good = np.flatnonzero(packets >= _NEARLY_BEST * packets.max())
     return [int(level) for level in np.rint(np.linspace(good[0], good[-1], count))]
-
-
-def _span(speeds: Sequence[int]) -> str:
-    # Two tokens a row less where the slowest is 0, as for most.
-    return f"{speeds[0]}-{speeds[-1]}" if 0 < speeds[0] < speeds[-1] else str(speeds[-1])

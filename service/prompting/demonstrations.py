@@ -1,7 +1,7 @@
-"""Worked examples for the static block: decisions of training worlds, each as a teacher solved it.
+"""Worked examples for the static block: decisions of training worlds, each with a teacher's answer.
 
-They are kept as what the edge knew, not as text, so that one file serves every prompt format, feature preset and k:
-a mission shows each as it would show its own rows. ``aicvds demonstrate`` makes the file.
+The file has the edge's knowledge at each decision, not text. So one file serves every prompt format, feature preset and
+k: a mission shows each example in the format of its own rows. ``aicvds demonstrate`` makes the file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PACKAGED = "demonstrations.json"
 
 
 class Demonstration(Wire):
-    """One decision: what the UAV reported, what its mission knew, and the teacher's answer.
+    """One decision: the UAV's report, its mission's knowledge, and the teacher's answer.
 
     ``visits`` is the step of each sensor's last visit, -1 for never; ``rates`` packets a step; both by sensor ID.
     """
@@ -37,7 +37,7 @@ class Demonstration(Wire):
     velocity: int
 
     def state(self, scenario: Scenario, preset: Features) -> State:
-        """The augmented state, as it was."""
+        """The augmented state at the decision."""
         return augment(
             self.uav,
             self.step,
@@ -50,7 +50,7 @@ class Demonstration(Wire):
 
 
 class Demonstrations(Wire):
-    """The file: the world of every demonstration, who solved them, and the most telling first."""
+    """The file: the world of all demonstrations, the teacher's name, and the demonstrations, the most useful first."""
 
     scenario: Scenario
     teacher: str
@@ -59,7 +59,7 @@ class Demonstrations(Wire):
 
 @dataclass(frozen=True, slots=True)
 class Solved:
-    """A demonstration as a prompt shows it."""
+    """A demonstration in a prompt: its rows and the teacher's answer."""
 
     rows: Sequence[Cells]
     sensor_id: int
@@ -67,17 +67,16 @@ class Solved:
 
 
 def solved(spec: MissionSpec, features: Features, scenario: Scenario, weights: Weights, k: int | None) -> list[Solved]:
-    """As many demonstrations as the mission wants, with the rows that it would have offered, in its order.
+    """The demonstrations that the mission's spec asks for, with the rows that the mission would show, in its order.
 
-    One whose answer the mission could not give is left out: a sensor that its modules do not keep among the k, or a
-    velocity past its limit. So there are fewer where k is small or the modules are random.
+    A demonstration is left out where the mission could not give its answer: the modules do not keep the sensor among
+    the k, or the velocity exceeds the mission's limit. So there are fewer where k is small or the modules are random.
 
     Args:
-        spec: the mission's.
-        features: what its modules see.
-        scenario: its world.
-        weights: its modules'.
-        k: rows of each that these keep; None keeps every admissible one, in the request's order.
+        features: the preset of the mission's modules.
+        scenario: the mission's world.
+        weights: the modules' weights.
+        k: rows to keep of each; None keeps every admissible row, in the request's order.
     """
     found: list[Solved] = []
     if spec.prompt.demonstrations == 0:

@@ -1,19 +1,20 @@
-"""What a fleet remembers of its decisions, and which of them stand in the prompt.
+"""The experiences of a fleet: its past decisions, and the selection of them for the prompt.
 
-The block of experiences only grows between compactions, so that an LLM server's prefix cache keeps it; a choice is
-made at a compaction alone. Which experiences stay is the ``selection``:
+The block of experiences only grows between compactions, so that an LLM server's prefix cache stays valid. Only a
+compaction selects. The ``selection`` is one of:
 
-- ``recent``: every outcome is appended; past the limit the older half goes.
-- ``best``: every outcome is appended; past the limit half of the limit stays, ranked by outcome over all that is
-  remembered: the lowest costs, and for a quarter of the lines the highest, as warnings. The worst come first and the
-  best last. After the ranking of examples by Zhou et al., arXiv 2408.00214.
-- ``similar``: nearest neighbours, after their choice by state. After as many outcomes as the limit, half of the limit
-  is chosen: those nearest to the fleet's newest decisions, the nearest last. In between nothing is appended; instead
-  the one experience nearest to the rows at hand, if the block has it not, stands in the last block of the prompt,
-  which is never cached. That is one line a decision, as with the others.
+- ``recent``: every outcome is appended; past the limit the older half is dropped.
+- ``best``: every outcome is appended; past the limit the block is reduced to half of the limit, chosen by cost among
+  all remembered experiences: the lowest costs, and for a quarter of the lines the highest, as warnings. The worst come
+  first and the best last. After the ranking of examples by Zhou et al., arXiv 2408.00214.
+- ``similar``: nearest neighbours by state. After as many outcomes as the limit, the block becomes half of the limit:
+  the experiences nearest to the fleet's newest decisions, the nearest last. Between compactions nothing is appended.
+  Instead the last block of the prompt, which is never cached, has the one experience nearest to the current rows,
+  unless the block has it. That is one line a decision, as with the other selections.
 
 The distance of two experiences is the root mean square difference of the attention features of their chosen rows, each
-0..1: ``d(a, b) = |a - b| / sqrt(dim)``, so 0 is alike and 1 as far as can be. To several rows it is the least of them.
+0..1: ``d(a, b) = |a - b| / sqrt(dim)``. It is 0 for equal rows and at most 1. The distance to several rows is the least
+of the distances to each.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from numpy.typing import NDArray
 
 from shared.wire import Selection
 
-# Outcomes that a mission remembers to choose from: three missions of the paper's length.
+# Experiences to select from: three missions of the paper's length.
 _REMEMBERED = 270
-# Experiences in the last block with `similar`: more would take more new tokens a decision than `recent` does.
+# Experiences in the last block with `similar`. More would cost more new tokens a decision than `recent` does.
 NEAREST = 1
 
 
@@ -38,7 +39,7 @@ NEAREST = 1
 class Experience:
     """A past decision: its line in the prompt, its cost, and the chosen row's attention features ``(d,)``, each 0..1.
 
-    ``features`` is None where the modules had no part in the decision; such a one is like no other.
+    ``features`` is None where the modules had no part in the decision; `similar` ignores such an experience.
     """
 
     line: str
@@ -47,12 +48,12 @@ class Experience:
 
 
 class Experiences:
-    """One mission's memory; with ``recent`` the block is all of it.
+    """One mission's experiences; with ``recent`` only those in the block are remembered.
 
     Args:
-        limit: the most lines of the block; 0 keeps none.
-        selection: which stay when there are too many.
-        uavs: how many of the newest decisions are the fleet's present state.
+        limit: the most lines of the block; with 0 nothing is remembered.
+        selection: the rule that a compaction selects by.
+        uavs: the number of the newest decisions that describe the fleet's present state.
     """
 
     def __init__(self, limit: int, selection: Selection = "recent", uavs: int = 1) -> None:
@@ -62,50 +63,50 @@ class Experiences:
         self.compactions = 0
         self._uavs = uavs
         self._remembered: deque[Experience] = deque(maxlen=max(_REMEMBERED, limit))
-        self._since = 0
+        self._since_compaction = 0
 
     def remember(self, experience: Experience) -> None:
-        """Append the experience to the block, or compact it; what is in the block stays until the next compaction."""
+        """Append the experience to the block, or compact the block."""
         if self.limit == 0:
             return
         if self.selection != "recent":
             self._remembered.append(experience)
-        self._since += 1
+        self._since_compaction += 1
         if self.selection != "similar":
             self.block.append(experience.line)
-        elif self._since < self.limit:
+        elif self._since_compaction < self.limit:
             return
         if self.selection == "similar" or len(self.block) > self.limit:
-            self.block = self._chosen(max(1, self.limit // 2))
+            self.block = self._selected(max(1, self.limit // 2))
             self.compactions += 1
-            self._since = 0
+            self._since_compaction = 0
 
     def nearest(self, rows: NDArray[np.float32]) -> list[str]:
-        """Lines for the last block: with ``similar`` the experience nearest to any of the rows ``(n, d)``.
+        """Lines for the prompt's last block: with ``similar`` the experience nearest to any of the rows ``(n, d)``.
 
-        Empty with another selection, with no rows, and where the block has the nearest already.
+        Empty with another selection, without rows, and where the block has the nearest one.
         """
         if self.selection != "similar" or not len(rows):
             return []
         return [line for line in self._nearest(rows, NEAREST) if line not in self.block]
 
     def state_dict(self) -> dict[str, Any]:
-        """All that is remembered, as copies."""
+        """The block and all remembered experiences, as copies."""
         return {
             "block": list(self.block),
             "compactions": self.compactions,
-            "since": self._since,
+            "since": self._since_compaction,
             "remembered": [[e.line, e.cost, e.features] for e in self._remembered],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """As it was when the state was taken."""
-        self.block, self.compactions, self._since = state["block"], state["compactions"], state["since"]
+        """Restore a ``state_dict``."""
+        self.block, self.compactions, self._since_compaction = state["block"], state["compactions"], state["since"]
         self._remembered.clear()
         if self.selection != "recent":
             self._remembered.extend(Experience(*remembered) for remembered in state["remembered"])
 
-    def _chosen(self, keep: int) -> list[str]:
+    def _selected(self, keep: int) -> list[str]:
         if self.selection == "recent":
             return self.block[-keep:]
         if self.selection == "best":
@@ -114,7 +115,7 @@ class Experiences:
         return self._nearest(np.stack(present), keep) if present else []
 
     def _ranked(self, keep: int) -> list[str]:
-        """The highest costs, then the lowest, best last; of equals the newest."""
+        """Lines of the highest costs, then of the lowest, best last; the newest of equal ones."""
         newest_first = reversed(self._remembered)
         by_cost = sorted(newest_first, key=lambda experience: experience.cost)
         lines = _distinct(experience.line for experience in by_cost)
@@ -123,7 +124,7 @@ class Experiences:
         return [*reversed(worst), *reversed(best)]
 
     def _nearest(self, rows: NDArray[np.float32], keep: int) -> list[str]:
-        """The nearest to any of the rows, nearest last; of equals the newest."""
+        """Lines of the experiences nearest to any of the rows, nearest last; the newest of equal ones."""
         known = [(e.line, e.features) for e in reversed(self._remembered) if e.features is not None]
         if not known:
             return []
@@ -134,5 +135,5 @@ class Experiences:
 
 
 def _distinct(lines: Iterable[str]) -> list[str]:
-    """Each line once, in the order of the first time."""
+    """Each line once, in order of its first occurrence."""
     return list(dict.fromkeys(lines))

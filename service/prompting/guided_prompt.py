@@ -1,13 +1,14 @@
-"""The prompt of mode ``guided``: rows of sensors that begin with letters, of which the LLM is to name one."""
+"""The prompt of mode ``guided``: rows of sensors with choice letters, one of which is the LLM's answer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from service.prompting.candidates import CandidateSet, Letters
 from service.prompting.prompt import Prompt, Template, note_block
 from service.prompting.row_formats import FORMATS, Cells
-from service.prompting.unpruned_baseline import Uncompressed
+from service.prompting.unpruned_baseline import UnprunedState
 from shared.features import State
 from shared.scenario import Scenario
 
@@ -38,19 +39,22 @@ _TOGETHER = {
 }
 
 _EXPERIENCES = "Past decisions are queue,age>velocity:cost, where 0 is the best cost.\n\n"
-# Rows that say nothing of any sensor.
+# Rows without information about any sensor.
 _CONTENT_FREE = ("N/A", "?,?,?")
 
 
 class GuidedTemplate(Template):
     """The prompt of mode ``guided``; it has one format and no demonstrations.
 
+    Attributes:
+        labels: every choice letter of the mission's prompts.
+
     Args:
         scenario: the mission's world.
-        rows: the most that a prompt shows.
-        experiences: the most that it may hold; with 0 the static block does not speak of them.
-        ranked: whether the rows come best first.
-        note: the operator's.
+        rows: the most rows of a prompt.
+        experiences: the most experiences of a prompt; with 0 the static block does not mention them.
+        ranked: whether the rows are ordered best first.
+        note: the operator's note.
     """
 
     def __init__(
@@ -58,15 +62,16 @@ class GuidedTemplate(Template):
     ) -> None:
         super().__init__(scenario, experiences=experiences, ranked=ranked)
         self.letters = Letters.of(rows)
+        self.labels = list(self.letters.all)
         order = "the most promising first" if ranked else "in no particular order"
-        named = self.letters.at(0)
+        first_row = self.letters.of_row(0)
         letters = (
-            f"In the row that begins with {named[0]}, the letters {', '.join(named)} are its velocities, slowest to "
-            "fastest; so in the other rows."
+            f"In the row that begins with {first_row[0]}, the letters {', '.join(first_row)} are its velocities, "
+            "slowest to fastest; so in the other rows."
             if self.letters.velocities > 1
             else "The letter is the sensor at its fastest velocity."
         )
-        said = {
+        fields = {
             "step_s": scenario.step_s,
             "capacity": scenario.queue_capacity,
             "order": order,
@@ -74,64 +79,59 @@ class GuidedTemplate(Template):
             "note": note_block(note),
             "experiences": _EXPERIENCES if experiences else "",
         }
-        self.static = _STATIC.format(**said, **_ALONE)
-        self.static_together = _STATIC.format(**said, **_TOGETHER)
+        self.static = _STATIC.format(**fields, **_ALONE)
+        self.fleet_static = _STATIC.format(**fields, **_TOGETHER)
 
     def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
-        """Such as ``52,3>7:0``, the cost in tenths."""
+        """A line such as ``52,3>7:0``, with the cost in tenths."""
         return f"{seen['queue']},{seen['age']}>{velocity}:{min(99, round(10 * cost))}\n"
 
-    def offer(
-        self, offer: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()
+    def choice_prompt(
+        self, candidates: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()
     ) -> Prompt:
-        """The prompt for one decision, the offer's rows in their order."""
+        """The prompt for one decision; the parameters are those of :meth:`Template.prompt`."""
         last = "".join(nearest)
         return Prompt(
             static=self.static,
             experiences="".join(experiences),
-            state=last + offer.rows,
-            uncompressed=_whole(state).under(last),
+            state=last + candidates.rows,
+            uncompressed=UnprunedState(state, FORMATS["csv"].row, last),
         )
 
-    def together(
-        self, offers: Mapping[int, tuple[CandidateSet, State]], experiences: Sequence[str], nearest: Sequence[str] = ()
+    def fleet_prompts(
+        self, uavs: Mapping[int, tuple[CandidateSet, State]], experiences: Sequence[str], nearest: Sequence[str] = ()
     ) -> dict[int, Prompt]:
-        """Each UAV's share of one prompt about several, by number.
+        """One prompt about several UAVs, as each UAV's share of it by UAV.
 
-        The static block and the experiences are the first one's; the user message is the shares' in order.
+        The first share has the static block and the experiences. The user message joins the shares' user messages.
         """
-        shares = {
-            uav: Prompt("", "", _list(uav, offer.numbered_rows()), _whole(state).under(_list(uav, "")))
-            for uav, (offer, state) in offers.items()
-        }
+        shares = {}
+        for uav, (candidates, state) in uavs.items():
+            unpruned = UnprunedState(state, FORMATS["csv"].row, _list(uav, ""))
+            shares[uav] = Prompt("", "", _list(uav, candidates.numbered_rows()), unpruned)
         uav, first = next(iter(shares.items()))
         last = "".join(nearest)
         shares[uav] = Prompt(
-            static=self.static_together,
+            static=self.fleet_static,
             experiences="".join(experiences),
             state=last + first.state,
-            uncompressed=first.uncompressed.under(last),
+            uncompressed=replace(first.uncompressed, head=last + first.uncompressed.head),
         )
         return shares
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
-        """User messages with as many rows as there can be, none of which says anything; of several UAVs, by number."""
-        heads = self.letters.first
+        """Content-free user messages with the most rows that a prompt can have, to calibrate the LLM's bias.
+
+        Args:
+            uavs: the UAVs of a prompt about several; empty for a prompt about one.
+        """
+        letters = self.letters.first
         if not uavs:
-            return ["".join(f"{letter}{nothing}\n" for letter in heads) for nothing in _CONTENT_FREE]
+            return ["".join(f"{letter}{nothing}\n" for letter in letters) for nothing in _CONTENT_FREE]
         return [
-            "".join(_list(uav, "".join(f"{letter}?,{nothing}\n" for letter in heads)) for uav in uavs)
+            "".join(_list(uav, "".join(f"{letter}?,{nothing}\n" for letter in letters)) for uav in uavs)
             for nothing in _CONTENT_FREE
         ]
-
-    @property
-    def labels(self) -> list[str]:
-        """Every letter that a prompt of this mission can offer."""
-        return list(self.letters.all)
-
-
-def _whole(state: State) -> Uncompressed:
-    return Uncompressed(state, FORMATS["csv"].row)
 
 
 def _list(uav: int, rows: str) -> str:

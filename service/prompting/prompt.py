@@ -1,8 +1,8 @@
 """The prompt, in three blocks ordered for prefix caching: static, experiences, current task.
 
-The static block is byte-identical for a mission's life and the experiences only grow between compactions, so an
-LLM server with a prefix cache reads only the last block anew. Nothing volatile stands before it. The columns' names
-are part of the static block: they never change, and there they cost nothing after the first decision.
+The static block is byte-identical for a mission's life, and the experiences only grow between compactions. So an LLM
+server with a prefix cache processes only the last block anew, and no volatile text precedes that block. The column
+names are part of the static block: they never change, and cost nothing after the first decision.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from service.prompting.demonstrations import Solved
 from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
-from service.prompting.unpruned_baseline import Uncompressed
+from service.prompting.unpruned_baseline import UnprunedState
 from shared.features import State
 from shared.scenario import Scenario
 from shared.wire import Features, PromptStyle
@@ -36,7 +36,7 @@ fast when the sensor is near or there is little to collect.
 
 
 def note_block(note: str | None) -> str:
-    """The operator's note as the static block has it; nothing without one."""
+    """The static block's text for the operator's note; empty without a note."""
     return f"The operator's note, to be obeyed: {note}\n\n" if note else ""
 
 
@@ -45,15 +45,17 @@ _EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
 
 @dataclass(frozen=True, slots=True)
 class Prompt:
-    """One prompt. ``uncompressed`` is the last block as it would be without attention and masks.
+    """One prompt.
 
-    Experiences retrieved for this decision alone stand in the last block, in both: they are never cached.
+    Attributes:
+        state: the last block. It includes experiences that are retrieved for this decision alone, which are not cached.
+        uncompressed: the last block without pruning by attention and without masks, with the same experiences.
     """
 
     static: str
     experiences: str
     state: str
-    uncompressed: Uncompressed
+    uncompressed: UnprunedState
 
     @property
     def user(self) -> str:
@@ -62,16 +64,16 @@ class Prompt:
 
 
 class Template:
-    """One mission's way of putting a decision to the LLM.
+    """The template of one mission's prompts.
 
     Args:
         scenario: the mission's world.
-        style: the rows' format. Their order is the caller's; ``ranked`` says whether it is best first.
-        features: preset that decides on a row's columns.
-        experiences: the most that a prompt may hold; with 0 the static block does not speak of them.
-        ranked: whether the rows come best first.
+        style: the rows' format; the caller orders the rows.
+        features: the preset, which determines a row's columns.
+        experiences: the most experiences of a prompt; with 0 the static block does not mention them.
+        ranked: whether the rows are ordered best first.
         demonstrations: worked examples for the static block.
-        note: the operator's.
+        note: the operator's note.
     """
 
     def __init__(
@@ -107,8 +109,8 @@ class Template:
         """One line of the experiences: the chosen sensor's row, the decision, and its cost."""
         return self._format.experience(seen, f"{sensor_id} {velocity}", f"{cost:.1f}")
 
-    def unknown(self, sensor_id: int) -> Cells:
-        """The row of a sensor that was not reported."""
+    def unreported_row(self, sensor_id: int) -> Cells:
+        """The row of a sensor that the report lacks."""
         return {**dict.fromkeys(self._columns, UNKNOWN), "sensor_id": str(sensor_id)}
 
     def prompt(
@@ -117,9 +119,9 @@ class Template:
         """The prompt for one decision.
 
         Args:
-            kept_rows: of the state's rows those to show, in this order.
-            experiences: the block's lines.
-            nearest: lines that follow them in this prompt alone.
+            kept_rows: the rows of the state to show, in this order.
+            experiences: the lines of the block of experiences.
+            nearest: lines of experiences for this prompt alone.
         """
         header = self._format.experience_header(self._columns)
         retrieved = "".join(nearest)
@@ -130,7 +132,7 @@ class Template:
             static=self.static,
             experiences=(header if experiences else "") + "".join(experiences),
             state=last + self._table(cells(state, kept_rows)),
-            uncompressed=Uncompressed(state, self._format.row, last + self._format.header(full_columns(state))),
+            uncompressed=UnprunedState(state, self._format.row, last + self._format.header(full_columns(state))),
         )
 
     def _demonstration(self, solved: Solved) -> str:

@@ -1,4 +1,4 @@
-"""How a sensor stands in the prompt: its columns, and a row as CSV, as JSON or in a Markdown table."""
+"""A sensor's row in the prompt: its columns, written as CSV, as JSON or in a Markdown table."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from shared.features import State
 from shared.wire import Features
 
-# A column's name and the text of a whole number, or UNKNOWN.
+# The text of each column, by name: a whole number or UNKNOWN.
 Cells = Mapping[str, str]
 
 UNKNOWN = "?"
-# The columns that need no beacon.
+# Columns that are known without a beacon.
 ALWAYS_KNOWN = ("sensor_id", "age", "distance")
 
 _MEANINGS = {
@@ -39,14 +39,14 @@ def columns(features: Features) -> tuple[str, ...]:
 
 
 def meanings(features: Features) -> str:
-    """What each column means, in one line."""
+    """The meaning of each column, in one line."""
     return " ".join(f"{name}: {meaning}." for name, meaning in _meanings(features).items())
 
 
 def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[str, str]]:
-    """The sensors kept, in this order.
+    """The texts of these rows, in this order.
 
-    No battery: a sensor that cannot send is masked before, so that the LLM need not judge it.
+    There is no battery column: the mask excludes a sensor that cannot send.
     """
     columns, which = _columns_of(state), np.asarray(rows, dtype=np.int64)
     texts = [[str(round(number)) for number in column[which].tolist()] for column in columns.values()]
@@ -54,9 +54,9 @@ def cells(state: State, rows: Sequence[int] | NDArray[np.int64]) -> list[dict[st
 
 
 def full_columns(state: State) -> dict[str, NDArray[Any]]:
-    """Every sensor as an LLM would have to see it if nothing were pruned or masked for it, by column ``(J,)``.
+    """Every sensor without pruning and masks, by column ``(J,)``, with the battery.
 
-    With the battery; what is not in ``ALWAYS_KNOWN`` means nothing for a sensor never heard.
+    For a sensor that was never heard, only the columns of ``ALWAYS_KNOWN`` are meaningful.
     """
     known = _columns_of(state)
     return {"sensor_id": known["sensor_id"], "queue": known["queue"], "battery": state.battery, **known}
@@ -76,27 +76,27 @@ def _columns_of(state: State) -> dict[str, NDArray[Any]]:
 
 
 class Format(ABC):
-    """One way of writing rows; one whose rows need no header, unless it says so."""
+    """A format of rows; by default its rows need no header."""
 
-    # What divides the experiences from the rows after them.
+    # The separator between the experiences and the rows.
     gap = ""
-    # How the static block says what a row is, before the names of its numbers, and what stands between those.
+    # The static block's description of a row, before the names of its numbers, and the separator of those names.
     row_note: str
     between_names = ", "
-    # How the static block says what an experience is.
+    # The static block's description of an experience.
     experience_note: str
 
     def introduction(self, names: tuple[str, ...], order: str) -> str:
-        """How the static block says what a row is, and what its numbers are called."""
-        told = self.row_note.format(order=order, count=_NUMERALS[len(names)])
-        return f"{told}:\n{self.between_names.join(names)}"
+        """The static block's description of a row, with the names of its numbers."""
+        note = self.row_note.format(order=order, count=_NUMERALS[len(names)])
+        return f"{note}:\n{self.between_names.join(names)}"
 
     def header(self, names: Iterable[str]) -> str:
-        """What must stand above the rows each time; empty where the static block has said it."""
+        """The header above the rows of every prompt; empty where the static block has it."""
         return ""
 
     def experience_header(self, names: tuple[str, ...]) -> str:
-        """What must stand above the experiences."""
+        """The header above the experiences."""
         return ""
 
     @abstractmethod
@@ -105,11 +105,11 @@ class Format(ABC):
 
     @abstractmethod
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
-        """One past decision's line: the chosen sensor's row without its ID, the answer, and its cost."""
+        """The line of a past decision: the chosen sensor's row without its ID, the answer, and its cost."""
 
 
 class Csv(Format):
-    """Comma-separated numbers; the header stands in the static block, where it costs nothing after the first time."""
+    """Comma-separated numbers; the header is part of the static block, where it costs nothing after the first time."""
 
     row_note = "Each row is one sensor, {order}, with {count} numbers"
     between_names = ","
@@ -118,16 +118,16 @@ class Csv(Format):
     )
 
     def row(self, cells: Cells) -> str:
-        """Such as ``3,52,-90,2,140``."""
+        """A line such as ``3,52,-90,2,140``."""
         return ",".join(cells.values()) + "\n"
 
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
-        """Such as ``52,-90,2,140 > 3 7: 0.0``."""
+        """A line such as ``52,-90,2,140 > 3 7: 0.0``."""
         return f"{','.join(_without_id(cells).values())} > {answer}: {cost}\n"
 
 
 class Json(Format):
-    """JSON Lines: an object a line, so that experiences can grow by appending."""
+    """JSON Lines: one object a line, so that experiences can grow by appending."""
 
     row_note = "Each line is one sensor, {order}, a JSON object with {count} numbers"
     experience_note = (
@@ -136,16 +136,16 @@ class Json(Format):
     )
 
     def row(self, cells: Cells) -> str:
-        """Such as ``{"sensor_id":3,"queue":52,"gain":-90,"age":2,"distance":140}``."""
+        """A line such as ``{"sensor_id":3,"queue":52,"gain":-90,"age":2,"distance":140}``."""
         return f"{_json(cells)}\n"
 
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
-        """Such as ``{"queue":52,"gain":-90,"age":2,"distance":140,"answer":"3 7","cost":0.0}``."""
+        """A line such as ``{"queue":52,"gain":-90,"age":2,"distance":140,"answer":"3 7","cost":0.0}``."""
         return f'{_json(_without_id(cells))[:-1]},"answer":"{answer}","cost":{cost}}}\n'
 
 
 class Markdown(Format):
-    """A table; it is none without its header, so that stands above the rows each time."""
+    """A table, which needs its header above the rows of every prompt."""
 
     gap = "\n"
     row_note = "Each row of the table is one sensor, {order}, with {count} numbers"
@@ -164,11 +164,11 @@ class Markdown(Format):
         return self.header((*names[1:], "answer", "cost"))
 
     def row(self, cells: Cells) -> str:
-        """Such as ``| 3 | 52 | -90 | 2 | 140 |``."""
+        """A line such as ``| 3 | 52 | -90 | 2 | 140 |``."""
         return _piped(cells.values())
 
     def experience(self, cells: Cells, answer: str, cost: str) -> str:
-        """Such as ``| 52 | -90 | 2 | 140 | 3 7 | 0.0 |``."""
+        """A line such as ``| 52 | -90 | 2 | 140 | 3 7 | 0.0 |``."""
         return _piped((*_without_id(cells).values(), answer, cost))
 
 

@@ -1,4 +1,4 @@
-"""Token accounting: how long each block of a prompt is, offline, and what it costs."""
+"""Token accounting: the length of each block of a prompt, counted offline, and its price."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class TokenCounter:
 
     def __init__(self, cache_dir: Path) -> None:
         self._encoding = encoding(cache_dir)
-        # The static block and the experiences come back decision after decision; the state never does.
+        # The static block and the experiences recur with every decision; the state never does.
         self.count_repeated = lru_cache(maxsize=256)(self.count)
 
     def count(self, text: str) -> int:
@@ -27,7 +27,7 @@ class TokenCounter:
         return len(self._encoding.encode_ordinary(text))
 
     def account(self, prompt: Prompt) -> Tokens:
-        """How long a prompt is, block by block, and how long it would be with nothing pruned."""
+        """The length of each block of a prompt, and the prompt's length without pruning."""
         static = self.count_repeated(prompt.static)
         experiences = sum(self.count_repeated(line) for line in prompt.experiences.splitlines(keepends=True))
         state = self.count(prompt.state)
@@ -45,7 +45,7 @@ class TokenCounter:
 
 
 def with_usage(tokens: Tokens, completion: Completion | None, settings: Settings) -> Tokens:
-    """The account with what the server said of one call, and its price."""
+    """The account, with the server's own counts for the call and the call's price."""
     if completion is None or completion.prompt_tokens is None:
         return tokens
     cached = completion.cached_tokens or 0
@@ -59,6 +59,6 @@ def with_usage(tokens: Tokens, completion: Completion | None, settings: Settings
 
 
 def price_usd(settings: Settings, prompt: int, cached: int, completion: int) -> float:
-    """US dollars for one call: fresh and cached prompt tokens, and completion tokens."""
+    """The price of one call in US dollars: fresh and cached prompt tokens, and completion tokens."""
     fresh = (prompt - cached) * settings.price_input
     return (fresh + cached * settings.price_cached + completion * settings.price_output) / 1e6

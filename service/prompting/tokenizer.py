@@ -1,4 +1,4 @@
-"""tiktoken's vocabulary, from a package instead of the network."""
+"""tiktoken's vocabulary, taken from a package instead of the network."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ import msgpack
 import tiktoken
 
 ENCODING = "o200k_base"
-# The name under which tiktoken caches the vocabulary (the SHA-1 of its address), and what it must hold.
+# The file name in tiktoken's cache (the SHA-1 of the vocabulary's address), and the SHA-256 of its content.
 _CACHED_AS = "fb374d419588a4632f3f557e76b4b70aebbca790"
 _SHA256 = "446a9538cb6c348e3516120d7c08b09f57c36495e2acfffe59a5bf8b0cfb1a2d"
 
 
 class VocabularyDamaged(RuntimeError):
-    """The packaged vocabulary is not the one that tiktoken expects."""
+    """The packaged vocabulary differs from the one that tiktoken expects."""
 
 
 def ensure_vocabulary(cache_dir: Path) -> Path:
-    """Put tiktoken's vocabulary where it looks, so that it never asks the network; returns its folder.
+    """Write tiktoken's vocabulary to its cache, so that tiktoken never uses the network; returns the cache's folder.
 
     Raises:
         VocabularyDamaged: the package's copy has another SHA-256.
@@ -40,7 +40,9 @@ def ensure_vocabulary(cache_dir: Path) -> Path:
 
 
 def encoding(cache_dir: Path) -> tiktoken.Encoding:
-    """``o200k_base``; read from what an earlier start packed, for tiktoken takes five times as long to parse its file.
+    """The encoding ``o200k_base``, read from the file that an earlier start packed.
+
+    tiktoken takes five times as long to parse its own file.
 
     Raises:
         VocabularyDamaged: as :func:`ensure_vocabulary`.
@@ -53,26 +55,26 @@ def encoding(cache_dir: Path) -> tiktoken.Encoding:
 
         parts = o200k_base()
         content: bytes = msgpack.packb(parts)
-        # A folder that cannot be written to costs time at the next start, no more.
+        # A read-only folder only costs time at the next start.
         with suppress(OSError):
             _write(packed, hashlib.sha256(content).digest() + content)
     return tiktoken.Encoding(**parts)
 
 
 def _unpacked(path: Path) -> dict[str, Any] | None:
-    """What :func:`encoding` packed; None where it is not there, or damaged."""
+    """The file that :func:`encoding` packed; None where it is missing or damaged."""
     try:
-        told = path.read_bytes()
+        content = path.read_bytes()
     except OSError:
         return None
-    if hashlib.sha256(told[32:]).digest() != told[:32]:
+    if hashlib.sha256(content[32:]).digest() != content[:32]:
         return None
-    parts: dict[str, Any] = msgpack.unpackb(told[32:], strict_map_key=False)
+    parts: dict[str, Any] = msgpack.unpackb(content[32:], strict_map_key=False)
     return parts
 
 
 def _write(path: Path, content: bytes) -> None:
-    """All of it or nothing: several processes may start at once."""
+    """Write the file atomically, because several processes may start at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".{os.getpid()}")
     partial.write_bytes(content)

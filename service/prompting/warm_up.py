@@ -1,4 +1,4 @@
-"""The first question to an LLM server, under the static block that a mission has unless its maker says otherwise."""
+"""The warm-up request of an LLM server, with the static block of a mission of default settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.scenario import SCENARIOS
 
 
 def warm_up(settings: Settings) -> WarmUp:
-    """The question in the service's mode."""
+    """The request in the service's mode; it fills the server's prefix cache."""
     paper = SCENARIOS["paper"]
     if settings.mode == "guided":
         guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)

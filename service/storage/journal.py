@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 from zlib import crc32
 
-from service.mission.events import Decided, Event, unheard
+from service.mission.events import Decided, Event, ignore_event
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.group_commit import GroupCommit
@@ -84,7 +84,7 @@ class Journal:
 
     def begin(self, mission: Mission) -> None:
         """Record a new mission, and every event of it from now on."""
-        self._commits.add(Made(mission.mission_id, mission.asked_for, mission.spec))
+        self._commits.add(Made(mission.mission_id, mission.requested_spec, mission.spec))
         # Missions that begin together and fly alike must not all need a checkpoint at the same time.
         self._record(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS)
 
@@ -115,7 +115,7 @@ class Journal:
         if (mission_log := self._logs.pop(mission_id, None)) is not None:
             mission_log.deleted = True
             # The mission and `record` refer to each other: the mission would stay in memory until a collection.
-            mission_log.mission.record = unheard
+            mission_log.mission.record = ignore_event
         self._commits.add(Deleted(mission_id))
 
     def due(self, mission: Mission, least: int = _EVENTS) -> MissionLog | None:

@@ -34,10 +34,10 @@ def _replay(mission: Mission, event: Event) -> None:
         case Decided(decision, attempt, report):
             mission.commit(decision, attempt, report)
         case Settled(outcome, used_for_training):
-            sample = mission.apply(outcome, taught=used_for_training)
+            sample = mission.apply(outcome, for_training=used_for_training)
             if sample is not None and used_for_training:
                 mission.learn(sample, outcome.cost)
         case Guided(state):
-            mission.reinstate(state)
+            mission.restore_guidance(state)
         case Answered():
-            mission.repeats.remember(event)
+            mission.idempotent_answers.remember(event)

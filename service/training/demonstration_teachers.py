@@ -1,4 +1,4 @@
-"""Recorded decisions as a teacher solves them, and which of them differ most: for ``aicvds demonstrate``."""
+"""The teachers' answers to recorded decisions, and a diverse selection of them, for ``aicvds demonstrate``."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from shared.rollouts import Header, RolloutStep
 from shared.scenario import Scenario
 from shared.wire import MissionSpec, Outcome, UavState
 
-# Given a recorded decision, the state as the edge saw it, the scenario and the sensors that are taken: a sensor and a
-# velocity, or None where it has no answer.
+# A function of a recorded decision, the edge's state, the scenario and the reserved sensors. It returns an action, or
+# None where the teacher has no answer.
 Teacher = Callable[[RolloutStep, State, Scenario, Collection[int]], Action | None]
 
 
@@ -46,10 +46,10 @@ TEACHERS: dict[str, Teacher] = {
 def solutions(
     header: Header, steps: Iterable[RolloutStep], teacher: Teacher
 ) -> Iterator[tuple[Demonstration, FloatArray]]:
-    """Each decision with a choice of sensors as the teacher solves it, and what it is like (:func:`likeness`).
+    """The teacher's answer to each decision with several admissible sensors, with the decision's :func:`point`.
 
-    Where the teacher has no answer, or collects nothing as far as the UAV knows, so that its sensor means nothing, the
-    decision is left out. Visiting records, arrival rates and reservations are those of the flight that was recorded.
+    A decision is left out where the teacher has no answer, or where its answer collects nothing as far as the UAV knows
+    and its sensor is therefore arbitrary. Visiting records, arrival rates and reservations are the recorded flight's.
     """
     settings = Settings(mode="value")
     spec = MissionSpec(scenario=header.scenario, features="reach", belief="reported", planner="off", init="random")
@@ -58,14 +58,14 @@ def solutions(
         for number, step in enumerate(group):
             uav, decision_id = step.request, f"{number:032x}"
             mission.observe(uav, uav.step)
-            view = AttendedState.of(mission, uav, uav.step)
-            if view.state.admissible.sum() > 1:
-                reserved = mission.reserved(uav.step, uav.uav_id)
-                answer = teacher(step, view.state, mission.scenario, reserved)
-                if answer is not None and _collects(view.state, *answer):
+            state = AttendedState.of(mission, uav, uav.step)
+            if state.state.admissible.sum() > 1:
+                reserved = mission.reservations.of_others(uav.step, uav.uav_id)
+                answer = teacher(step, state.state, mission.scenario, reserved)
+                if answer is not None and _collects(state.state, *answer):
                     demonstration = _demonstration(mission, uav, uav.step, answer)
-                    yield demonstration, likeness(view.state, *answer, mission.scenario)
-            mission.commit(view.pending(decision_id, Action(step.sensor_id, step.velocity)))
+                    yield demonstration, point(state.state, *answer, mission.scenario)
+            mission.commit(state.pending(decision_id, Action(step.sensor_id, step.velocity)))
             mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
 
 
@@ -83,9 +83,9 @@ def _demonstration(mission: Mission, uav: UavState, step: int, answer: Action) -
         {
             "uav": {**report, "progress_m": _rounded(uav.progress_m), "sensors": rounded},
             "step": step,
-            "visits": mission.visits.tolist(),
-            "rates": [round(rate, 2) for rate in mission.rates.tolist()],
-            "reserved": sorted(mission.reserved(step, uav.uav_id)),
+            "visits": mission.records.visits.tolist(),
+            "rates": [round(rate, 2) for rate in mission.records.rates.tolist()],
+            "reserved": sorted(mission.reservations.of_others(step, uav.uav_id)),
             "sensor_id": answer[0],
             "velocity": answer[1],
         }
@@ -93,15 +93,15 @@ def _demonstration(mission: Mission, uav: UavState, step: int, answer: Action) -
 
 
 def _rounded(value: float | None) -> float | None:
-    """Whole steps, packets and IDs as they are, the rest to a tenth."""
+    """Integers unchanged, other numbers to a tenth."""
     return round(value, 1) if isinstance(value, float) else value
 
 
-def likeness(state: State, sensor_id: int, velocity: int, scenario: Scenario) -> FloatArray:
-    """A decision as a point: states that ask for the same lie near each other.
+def point(state: State, sensor_id: int, velocity: int, scenario: Scenario) -> FloatArray:
+    """A decision as a point, ``(3 d + 1,)``; similar decisions are near each other.
 
-    The features of the sensor decided for, their mean and their greatest over the admissible sensors, and the velocity,
-    each 0..1: ``(3 d + 1,)``.
+    The point has the chosen sensor's features, the mean and the maximum of the features over the admissible sensors,
+    and the velocity, each 0..1.
     """
     features = state.features(scenario)
     chosen = features[int(np.flatnonzero(state.ids[state.admissible] == sensor_id)[0])]
@@ -110,10 +110,10 @@ def likeness(state: State, sensor_id: int, velocity: int, scenario: Scenario) ->
 
 
 def farthest_first(points: FloatArray, count: int) -> list[int]:
-    """Indices of ``count`` of the points ``(n, d)``, the one nearest to their mean first.
+    """Indices of ``count`` of the points ``(n, d)``; the point nearest to the mean comes first.
 
-    Each next one is the farthest from those before it: the greedy k-center of Gonzalez, Theoretical Computer Science 38
-    (1985), whose every prefix covers the points within twice the least radius possible.
+    Each next point is the farthest from those before it: the greedy k-center of Gonzalez, Theoretical Computer
+    Science 38 (1985), whose every prefix covers the points within twice the least radius possible.
     """
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)

@@ -1,4 +1,4 @@
-"""What ``aicvds pretrain`` can be asked for."""
+"""The options of ``aicvds pretrain``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Pretrain:
     Then:  aicvds pretrain runs/rollouts.jsonl.gz --features reach --out runs/reach.pt
 
     Target `return`: value regression as online, but of the discounted cost over several steps, since the loss of a bad
-    decision comes after it; and s_j and u_v shall rank the teacher's sensor and a velocity for it first (cross-entropy
-    of their softmax).
-    Target `immediate` is the paper's: regression of what this one step cost, and no teacher.
+    decision comes after it; and s_j and u_v learn to rank the teacher's sensor and a velocity for it first
+    (cross-entropy of their softmax).
+    Target `immediate` is the paper's: regression of this one step's cost, without a teacher.
 
-    Every eleventh mission is held out. On these are printed the loss, and beside random weights and the
-    package's own checkpoint: how often each teacher's sensor is among the k best scored, and how near its velocity
-    they come. The same command writes the same weights.
+    Every eleventh mission is held out. The command prints the loss on these missions. For the trained weights, random
+    weights and the package's own checkpoint it also prints how often each teacher's sensor is among the k best, and how
+    near the velocity is to the teacher's. The same command writes the same weights.
     """
 
     rollouts: Annotated[tyro.conf.Positional[Path], arg(metavar="FILE")]
@@ -36,12 +36,12 @@ class Pretrain:
     out: Annotated[Path, arg(metavar="FILE")]
     """Checkpoint to write. The package's own are service/checkpoints/paper.pt and reach.pt, one a feature preset."""
     features: Features = "paper"
-    """What the modules see: the paper's five numbers a sensor, or also what the trajectory brings in reach."""
+    """The modules' inputs: the paper's five numbers a sensor, or also the reach along the trajectory."""
     belief: Belief | None = None
-    """What that is made from: `fleet`, all that the edge was told, or `reported`, what the UAV itself last heard.
+    """The source of the inputs: `fleet`, all reports to the edge, or `reported`, the UAV's own latest beacons.
     Default: reported for paper, fleet for reach, as missions have it."""
     target: Target = "return"
-    """What they learn: the return over several steps and the teachers' ranking, or the paper's immediate cost."""
+    """The target: the return over several steps and the teachers' ranking, or the paper's immediate cost."""
     epochs: int = 8
     """Passes over the rollouts."""
     horizon: int = 8
@@ -52,7 +52,7 @@ class Pretrain:
     """Weight of the ranking against the value regression; 0 is none. Target immediate has none."""
     speed: Speed = "look_ahead"
     """The velocity that is ranked first: the best of one step of look-ahead for the teacher's sensor, or the teacher's
-    own. A planner hovers or races as its whole plan asks; who learns that from one view hovers for good."""
+    own. A planner hovers or races as its whole plan requires; modules that learn this from one state hover."""
     temperature: float = 0.05
     """Of the softmax that ranks: about the difference between good and bad values, so that they keep r's scale."""
     learning_rate: float = 2e-3

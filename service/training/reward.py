@@ -1,4 +1,4 @@
-"""What pretraining aims at: what a decision is worth, and which velocity is ranked first."""
+"""The targets of pretraining: a decision's reward, and the velocity that is ranked first."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Speed = Literal["teacher", "look_ahead"]
 
 @dataclass(frozen=True)
 class Reward:
-    """What a decision is worth.
+    """The reward of a decision.
 
     ``return``: minus :func:`fleet_cost`, its mean over ``horizon`` steps with weights ``discount^n``; a mean, so that
     it has the scale of the online updates' r = -c. ``immediate``: that r, the UAV's own cost of one step.
@@ -28,7 +28,7 @@ class Reward:
     discount: float = 0.9
 
     def of(self, steps: Sequence[RolloutStep], scenario: Scenario) -> list[float | None]:
-        """One of each of a UAV's steps in order; None where the mission ends before the horizon does."""
+        """The reward of each of a UAV's steps, in order; None where the mission ends before the horizon."""
         if self.target == "immediate":
             return [-step.cost for step in steps]
         costs = np.array([fleet_cost(step, scenario) for step in steps])
@@ -38,8 +38,8 @@ class Reward:
 
 
 def fleet_cost(step: RolloutStep, scenario: Scenario) -> float:
-    """``f + lost / (W I)``: a UAV's failure and its share of all that the fleet lost in the step.
+    """``f + lost / (W I)``: a UAV's failure and its share of the fleet's losses in the step.
 
-    Its own c would teach it to hover: what overflows out of its reach costs it nothing.
+    The UAV's own c would teach it to hover, because overflows out of its reach cost it nothing.
     """
     return float(step.failed) + step.fleet_lost / (scenario.queue_capacity * scenario.uavs)

@@ -1,4 +1,4 @@
-"""What the modules are pretrained on: recorded rollouts, seen again through the edge's own features."""
+"""Training examples for the modules: recorded rollouts, with the edge's own features."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from shared.wire import Belief, Features, MissionSpec, Outcome
 
 
 @dataclass(frozen=True, slots=True)
-class Taught:
-    """A teacher's decision, as the modules would have seen it.
+class TeacherDecision:
+    """A teacher's decision, as a sample of the modules' inputs.
 
-    ``reaches`` is false where its sensor cannot send it a packet after the step: the sensor then means nothing.
-    ``best_velocity`` is that of one step of look-ahead for the sensor (see :attr:`Reach.best`).
+    ``reaches`` is false where the sensor cannot send a packet after the step; the sensor is then arbitrary.
+    ``best_velocity`` is the velocity of one step of look-ahead for the sensor (see :attr:`Reach.best`).
     """
 
     teacher: str
@@ -39,20 +39,21 @@ class Taught:
     best_velocity: int
 
     def ranked(self, speed: Speed) -> Sample:
-        """The decision to be ranked first, with the teacher's velocity or the best by look-ahead."""
+        """The sample to be ranked first, with the teacher's velocity or the best by look-ahead."""
         return self.sample if speed == "teacher" else replace(self.sample, velocity=self.best_velocity)
 
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """A decision as the modules saw it, the reward that followed (minus the cost), and the teacher's.
+    """A decision's sample, its reward (minus the cost), and the teacher's decision.
 
-    ``taught`` is None where the teacher's sensor was masked. Where none was recorded, the look-ahead policy teaches.
+    ``taught`` is None where the teacher's sensor was masked. Without a recorded teacher, the look-ahead policy is the
+    teacher.
     """
 
     sample: Sample
     reward: float
-    taught: Taught | None
+    taught: TeacherDecision | None
 
 
 def replay(
@@ -62,10 +63,10 @@ def replay(
     features: Features = "paper",
     belief: Belief | None = None,
 ) -> Iterator[list[Example]]:
-    """Each mission's examples, by the same visiting records, arrival rates and features as online.
+    """Each mission's examples, with the same visiting records, arrival rates and features as online.
 
     Args:
-        belief: what the features are made from; by default what missions with these features decide from by default.
+        belief: the source of the features; by default the one that missions with these features have.
     """
     settings = Settings(mode="value")
     known: Belief = belief or ("reported" if features == "paper" else "fleet")
@@ -81,9 +82,9 @@ def replay(
         for number, step in enumerate(logged):
             decision_id = f"{number:032x}"
             mission.observe(step.request, step.request.step)
-            view = AttendedState.of(mission, step.request, step.request.step)
-            taught = _taught(mission, view, step.reference)
-            mission.commit(view.pending(decision_id, Action(step.sensor_id, step.velocity)))
+            state = AttendedState.of(mission, step.request, step.request.step)
+            taught = _taught(mission, state, step.reference)
+            mission.commit(state.pending(decision_id, Action(step.sensor_id, step.velocity)))
             sample = mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
             worth = next(rewards[step.request.uav_id])
             if sample is not None and worth is not None:
@@ -91,21 +92,21 @@ def replay(
         yield examples
 
 
-def _taught(mission: Mission, view: AttendedState, reference: Reference | None) -> Taught | None:
+def _taught(mission: Mission, state: AttendedState, reference: Reference | None) -> TeacherDecision | None:
     if reference is None:
-        sensor_id, velocity = look_ahead(view.state, view.reach, view.reserved)
+        sensor_id, velocity = look_ahead(state.state, state.reach, state.reserved)
         teacher = "look_ahead"
     else:
         sensor_id, velocity, teacher = reference.sensor_id, reference.velocity, reference.teacher
-    sample = view.pending("reference", Action(sensor_id, velocity)).sample
+    sample = state.pending("reference", Action(sensor_id, velocity)).sample
     if sample is None:
         return None
-    reach = _reach(view.state, view.uav_id, sensor_id, mission.scenario)
-    return Taught(teacher, sample, bool(reach.packets[velocity, 0] >= 1), best_velocity=int(reach.best[0]))
+    reach = _reach(state.state, state.uav_id, sensor_id, mission.scenario)
+    return TeacherDecision(teacher, sample, bool(reach.packets[velocity, 0] >= 1), best_velocity=int(reach.best[0]))
 
 
 def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
-    """Of that sensor alone, in any feature preset."""
+    """The reach of that sensor alone, in any feature preset."""
     row = np.flatnonzero(state.ids == sensor_id)[:1]
     distance = distances_ahead(uav, state.position, state.progress_m, state.places[row], scenario)
     return Reach.of(distance, state.queue[row], state.urgency[row], scenario)
@@ -113,7 +114,7 @@ def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """B decisions: the row chosen ``(B,)``, its approach ``(B, ...)`` and the velocity level ``(B,)``."""
+    """B decisions: the chosen row ``(B,)``, its approach ``(B, ...)`` and the velocity level ``(B,)``."""
 
     chosen: Tensor
     approach: Tensor
@@ -121,7 +122,7 @@ class Choices:
 
     @classmethod
     def of(cls, samples: Sequence[Sample]) -> Self:
-        """Samples one after another."""
+        """One decision for each sample."""
         return cls(
             chosen=torch.tensor([sample.chosen for sample in samples]),
             approach=torch.from_numpy(np.stack([sample.approach for sample in samples])),
@@ -134,11 +135,11 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """B examples in one: ``features`` ``(B, n, d)`` of as many sensors as the widest has, padded with zeros.
+    """B examples: ``features`` ``(B, n, d)`` of as many sensors as the largest example has, padded with zeros.
 
-    ``admissible`` ``(B, n)`` tells sensors from padding, ``reward`` ``(B,)``, ``taught`` ``(B,)`` whether there is a
-    teacher's choice and ``reaches`` ``(B,)`` whether its sensor means something; where there is no choice, ``teacher``
-    repeats ``logged``.
+    ``admissible`` ``(B, n)`` distinguishes sensors from padding. ``taught`` ``(B,)`` is true where there is a teacher's
+    choice, and ``reaches`` ``(B,)`` where its sensor is not arbitrary. Without a choice ``teacher`` repeats ``logged``.
+    ``reward`` is ``(B,)``.
     """
 
     features: Tensor
@@ -151,7 +152,7 @@ class Batch:
 
     @classmethod
     def of(cls, examples: Sequence[Example], speed: Speed = "look_ahead") -> Self:
-        """Examples one after another, at least one; ``speed`` tells which velocity is the teacher's choice."""
+        """A batch of at least one example; ``speed`` selects the velocity of the teacher's choice."""
         padded = torch.nn.utils.rnn.pad_sequence(
             [torch.from_numpy(example.sample.features) for example in examples], batch_first=True
         )

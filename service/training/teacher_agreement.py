@@ -1,4 +1,4 @@
-"""How near modules come to a teacher: whether attention keeps its sensor, and whether they would fly as fast."""
+"""The agreement of modules with a teacher: on the sensors that attention keeps, and on the velocity."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from service.learning.modules import Weights, top_k
-from service.training.rollout_examples import Example, Taught
+from service.training.rollout_examples import Example, TeacherDecision
 
 
-def references(examples: Sequence[Example]) -> dict[str, list[Taught]]:
-    """By teacher, the references whose sensor can send something."""
-    found: dict[str, list[Taught]] = {}
+def references(examples: Sequence[Example]) -> dict[str, list[TeacherDecision]]:
+    """The references whose sensor can send something, by teacher."""
+    found: dict[str, list[TeacherDecision]] = {}
     for taught in (example.taught for example in examples if example.taught is not None):
         if taught.reaches:
             found.setdefault(taught.teacher, []).append(taught)
     return dict(sorted(found.items()))
 
 
-def recall(weights: Weights, references: Sequence[Taught], k: int) -> float:
-    """How often the teacher's sensor is among the k best scored, of the decisions with more than k candidates."""
+def recall(weights: Weights, references: Sequence[TeacherDecision], k: int) -> float:
+    """The share of decisions with the teacher's sensor among the k best, of those with more than k candidates."""
     hits = [
         taught.sample.chosen in top_k(weights.score(taught.sample.features)[0], k)
         for taught in references
@@ -29,17 +29,17 @@ def recall(weights: Weights, references: Sequence[Taught], k: int) -> float:
     return float(np.mean(hits)) if hits else float("nan")
 
 
-def velocity_error(weights: Weights, references: Sequence[Taught]) -> float:
-    """Mean difference from the teacher's velocity, m/s, of the velocity valued highest for the teacher's sensor."""
-    return float(np.mean([abs(_fastest(weights, taught) - taught.sample.velocity) for taught in references]))
+def velocity_error(weights: Weights, references: Sequence[TeacherDecision]) -> float:
+    """The mean distance, in m/s, of the velocity valued highest for the teacher's sensor from the teacher's."""
+    return float(np.mean([abs(_best_velocity(weights, taught) - taught.sample.velocity) for taught in references]))
 
 
-def velocity_agreement(weights: Weights, references: Sequence[Taught]) -> float:
-    """How often the velocity valued highest for the teacher's sensor is the teacher's."""
-    return float(np.mean([_fastest(weights, taught) == taught.sample.velocity for taught in references]))
+def velocity_agreement(weights: Weights, references: Sequence[TeacherDecision]) -> float:
+    """The share of decisions where the velocity valued highest for the teacher's sensor is the teacher's."""
+    return float(np.mean([_best_velocity(weights, taught) == taught.sample.velocity for taught in references]))
 
 
-def _fastest(weights: Weights, taught: Taught) -> int:
+def _best_velocity(weights: Weights, taught: TeacherDecision) -> int:
     sample = taught.sample
     _, z = weights.score(sample.features)
     return int(weights.velocities(z[sample.chosen], sample.approach).argmax())

@@ -22,24 +22,24 @@ from shared.rollouts import read_rollouts
 
 
 def pretrain(args: Pretrain, console: Console) -> None:
-    """Train, print how good it is, and write the checkpoint.
+    """Train, print the quality of the modules, and write the checkpoint.
 
     Raises:
         OSError: the rollouts cannot be read, or the checkpoint cannot be written.
-        ValueError: the rollouts are not what they should be, or too few.
+        ValueError: the rollouts are invalid, or too few.
     """
-    # More threads sum in another order, and are no faster with modules this small.
+    # More threads sum in another order, and are not faster with such small modules.
     torch.set_num_threads(1)
     header, steps = read_rollouts(args.rollouts)
     reward = Reward(args.target, args.horizon, args.discount)
     replayed = replay(header, steps, reward, args.features, args.belief)
     missions = list(track(replayed, "Replaying the rollouts", header.missions, console=console))
-    # Every eleventh: of teachers that take turns, each has its share.
+    # Every eleventh mission: teachers alternate, and each gets its share this way.
     held_out = set(range(10, len(missions), 11)) or {len(missions) - 1}
     train = [example for n, mission in enumerate(missions) if n not in held_out for example in mission]
     test = [example for n in sorted(held_out) for example in missions[n]]
     if not train or not test:
-        raise ValueError(f"{args.rollouts} holds {len(missions)} missions; at least 2 are needed")
+        raise ValueError(f"{args.rollouts} has {len(missions)} missions; at least 2 are needed")
     levels = header.scenario.max_velocity + 1
     modules = fit(Batch.of(train, args.speed), Batch.of(test, args.speed), levels, args, console)
     console.print(_report(modules, test, args, levels))
@@ -48,9 +48,9 @@ def pretrain(args: Pretrain, console: Console) -> None:
 
 
 def _report(modules: Modules, test: Sequence[Example], args: Pretrain, levels: int) -> Table:
-    """Each teacher's held-out references against these modules, the shipped ones and random ones."""
+    """The agreement of these modules, the shipped ones and random ones with each teacher on the held-out missions."""
     ranked = {"random": Modules(args.features, levels, args.seed).weights()}
-    # There may be none yet, or of another shape: then this command makes the first.
+    # The shipped checkpoint may be missing or of another shape, before this command makes it.
     with suppress(OSError, RuntimeError):
         ranked["shipped"] = initial_weights("pretrained", args.features, levels, args.seed)
     ranked["trained"] = modules.weights()
@@ -70,9 +70,10 @@ def _report(modules: Modules, test: Sequence[Example], args: Pretrain, levels: i
 def losses(modules: Modules, batch: Batch, temperature: float = 1.0) -> tuple[Tensor, Tensor]:
     """Mean value regression, and mean cross-entropy that ranks the teacher's sensor, and a velocity for it, first.
 
-    ``(s_j - r)^2 + (u_v - r)^2`` of what was done; ``-ln softmax(s / temperature)_j* - ln softmax(u / temperature)_v*``
-    of the reference j*, v*: the first (ListNet's top-one probability, Cao et al., ICML 2007, with one relevant sensor)
-    only where j* can send something.
+    ``(s_j - r)^2 + (u_v - r)^2`` of the recorded decision, and
+    ``-ln softmax(s / temperature)_j* - ln softmax(u / temperature)_v*`` of the reference j*, v*.
+    The first term (ListNet's top-one probability, Cao et al., ICML 2007, with one relevant sensor) counts only where j*
+    can send something.
     """
     scores, z = modules.attention(batch.features, batch.admissible)
     everyone = torch.arange(len(batch))

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
+from shared.reasons import LLM_FAILURES
 from shared.wire import Candidate, Tokens
 from simulator.records.record import Record
 
-# Fallback reasons of decisions for which the LLM was queried, and its answer was missing or unusable.
-_LLM_QUERIED_IN_VAIN = frozenset(
-    {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
-)
 DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]
 
 
@@ -49,6 +46,6 @@ class Decision(Record):
 
 def queried_llm(decision: Decision) -> bool:
     """Whether the LLM was queried for it, with a usable answer or not."""
-    if decision.source in ("llm", "guided") or decision.reason in _LLM_QUERIED_IN_VAIN:
+    if decision.source in ("llm", "guided") or decision.reason in LLM_FAILURES:
         return True
     return decision.tokens is not None and decision.tokens.server_prompt is not None

@@ -10,7 +10,8 @@ import pytest
 
 from service.config.settings import Settings
 from shared.guidance import GuidanceStatus
-from shared.wire import DecideResponse, Reason
+from shared.reasons import Reason
+from shared.wire import DecideResponse
 from tests.e2e.processes import serving_edge
 from tests.waiting import until
 

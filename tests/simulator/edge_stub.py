@@ -187,7 +187,7 @@ def _misbehave(behaviour: Behaviour, body: DecideRequest) -> Response | None:
             errors = [{"field": "sensors.queue[0]", "problem": "Input should be less than 100000"}]
             return _problem(422, "sensors.queue[0]: too many", errors=errors)
         case "crash":
-            return _problem(500, "the edge failed; its log says more")
+            return _problem(500, "the edge failed; its log has the details")
         case "html":
             return Response("<h1>Bad gateway</h1>\nnginx", status_code=404)
         case "forgot" if body.outcome is not None:

@@ -181,10 +181,10 @@ def test_the_command_makes_lists_and_removes(tmp_path: Path, capsys: pytest.Capt
     listed = capsys.readouterr().out
     assert "fleet-1" in listed and "admin decide" in listed and key not in listed
     assert main(["add", "fleet-1", *file]) == 2
-    assert "there is a key fleet-1 already" in capsys.readouterr().err
+    assert "there is already a key fleet-1" in capsys.readouterr().err
     assert main(["remove", "fleet-1", *file]) == 0
     assert main(["remove", "fleet-1", *file]) == 2
-    with pytest.raises(BadKeys, match="holds no key"):
+    with pytest.raises(BadKeys, match="has no key"):
         ApiKeys(tmp_path / "keys.json")
 
 

@@ -9,7 +9,7 @@ from tests.service.making import PAPER, attended, mission, uav
 
 def test_features_are_the_papers_five_between_zero_and_one() -> None:
     m = mission()
-    m.visits[2] = 3
+    m.records.visits[2] = 3
     view = attended(m, uav(step=9), step=9)
     state, features = view.state, view.state.features(PAPER)
     assert features.shape == (6, FEATURES["paper"])

@@ -14,12 +14,12 @@ from fastapi.responses import Response
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import Deliberation
-from service.deciding.rollout_evaluator import Judgement, RolloutState, judge
+from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import LLM
 from service.llm.answers import Completion, NoDecision, TokenPosition
 from service.llm.calibration import calibrated, probabilities
 from service.mission.mission import Mission
-from service.prompting.candidates import velocities
+from service.prompting.candidates import velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
 from shared.actions import Action
 from shared.reach import Reach
@@ -148,11 +148,11 @@ def test_a_low_temperature_is_undone() -> None:
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
     distance = np.full((15, 1), 50.0)
     reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
-    assert velocities(reach, 0, 4) == [0, 5, 9, 14]
-    assert velocities(reach, 0, 1) == [14]
+    assert velocity_options(reach, 0, 4) == [0, 5, 9, 14]
+    assert velocity_options(reach, 0, 1) == [14]
     distance[:3] = distance[12:] = 1e9
     reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
-    assert velocities(reach, 0, 4) == [3, 6, 8, 11]
+    assert velocity_options(reach, 0, 4) == [3, 6, 8, 11]
 
 
 def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None:
@@ -163,7 +163,7 @@ def test_the_critic_sees_what_is_lost_by_flying_away_from_a_full_queue() -> None
     state.sensors.y[0] = float(start[1])
     mission.observe(state, 0)
     situation = RolloutState.of(mission.belief, PAPER, 0, 0)
-    judged = judge(situation, [Action(0, 0), Action(1, 0)])
+    judged = evaluate(situation, [Action(0, 0), Action(1, 0)])
     assert judged.lost[1] > judged.lost[0] + 1
     # Sensor 1 was never reported: nothing can be collected from it.
     assert judged.cost[1] >= 1.0 > judged.cost[0]
@@ -179,7 +179,7 @@ def test_a_plan_is_judged_by_its_own_continuation_and_never_below_look_ahead() -
 
     def lost(course: list[Action] | None) -> float:
         plan = None if course is None else {0: course}
-        return float(judge(RolloutState.of(mission.belief, PAPER, 0, 0, course=plan), [Action(0, 0)]).lost[0])
+        return float(evaluate(RolloutState.of(mission.belief, PAPER, 0, 0, plans=plan), [Action(0, 0)]).lost[0])
 
     pairs = [(0, 0), (2, 0), (0, 0), (2, 0), (2, 14), (0, 14), (0, 7), (2, 14)]
     dwells = [Action(*pair) for pair in pairs]
@@ -214,7 +214,7 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
     place = made.candidates.actions.index(plan)
     losses = np.zeros(len(made.candidates.actions))
     losses[place] = lost
-    verdict = made.conclude(mission.trust_in("stub"), Judgement(losses, losses), None, calibrated=False)
+    verdict = made.conclude(mission.trust_in("stub"), Evaluation(losses, losses), None, calibrated=False)
     assert verdict is not None
     assert (verdict.action == plan) == flown
 
@@ -231,7 +231,7 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
         labels = made.candidates.labels
         worst = max(labels, key=lambda name: judgement.lost[labels[name]])
         told = worst if answer == "worst" else str(random.choice(list(labels)))
-        word = made.candidates.spread({name: float(name == told) for name in labels})
+        word = made.candidates.sum_by_action({name: float(name == told) for name in labels})
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None and verdict.action == plan
         assert set(verdict.report.trust) == {"llm", "planner", "value", "policy"}
@@ -244,7 +244,7 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
         view, made = deliberation(mission, step)
         judgement = made.evaluate()
         label = answer(made, judgement.lost)
-        word = made.candidates.spread({name: float(name == label) for name in made.candidates.labels})
+        word = made.candidates.sum_by_action({name: float(name == label) for name in made.candidates.labels})
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None
         decision_id = f"{step:032x}"
@@ -270,7 +270,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     judgement = made.evaluate()
     worst = max(made.candidates.labels, key=lambda name: judgement.lost[made.candidates.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
-    told = made.candidates.spread({name: float(name == worst) for name in made.candidates.labels})
+    told = made.candidates.sum_by_action({name: float(name == worst) for name in made.candidates.labels})
     verdict = made.conclude(mission.trust_in("stub"), judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]

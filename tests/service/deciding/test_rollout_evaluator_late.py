@@ -11,7 +11,7 @@ import pytest
 from service.config.cores import usable_cores
 from service.deciding.deliberation import Deliberation
 from service.deciding.llm_query import LlmAdvice, LlmQueries
-from service.deciding.rollout_evaluator import Judgement
+from service.deciding.rollout_evaluator import Evaluation
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, wait_for
 from tests.waiting import Clock, Gate, soon
@@ -29,7 +29,7 @@ class Stuck:
         self.gate = Gate(opened=True)
         self._evaluate = Deliberation.evaluate
 
-    def evaluate(self, deliberation: Deliberation) -> Judgement:
+    def evaluate(self, deliberation: Deliberation) -> Evaluation:
         self.gate.wait()
         return self._evaluate(deliberation)
 

@@ -37,7 +37,7 @@ def test_the_same_flight_learns_the_same(tmp_path: Path, report: Report) -> None
             fly(client, report, range(20))
             mission = settled(engine, engine.missions.loaded[0], 57)
             unnamed = {key: value for key, value in state(mission).items() if key not in _NAMED}
-            return unnamed, mission.visits.tolist()
+            return unnamed, mission.records.visits.tolist()
 
     (one, visits), (other, visits_again) = flown("one.db"), flown("other.db")
     assert visits == visits_again

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from service.guidance.note_orders import BadOrders, numbers_in, read, shown
+from service.guidance.note_orders import BadOrders, numbers_in, parse_orders, similar_examples
 from service.guidance.order_examples import EXAMPLES
 from service.guidance.order_grammar import admissible, constrain_orders
 from shared.guidance import Guidance, SensorWish
@@ -17,10 +17,10 @@ ORDERS = "visit sensor 4 every 3 steps, fly at most 9 m/s"
 
 
 def test_orders_become_a_structure() -> None:
-    assert read(ORDERS, NOTE) == MEANT
-    assert read(json.dumps({"orders": ORDERS.split(", ")}), NOTE) == MEANT
-    assert read(" nothing\n", NOTE) == Guidance()
-    both = read("visit sensor 4 every 3 steps, sensor 4 counts 9 times", NOTE)
+    assert parse_orders(ORDERS, NOTE) == MEANT
+    assert parse_orders(json.dumps({"orders": ORDERS.split(", ")}), NOTE) == MEANT
+    assert parse_orders(" nothing\n", NOTE) == Guidance()
+    both = parse_orders("visit sensor 4 every 3 steps, sensor 4 counts 9 times", NOTE)
     assert both.sensors == [SensorWish(sensor_id=4, visit_every=3, weight=9)]
 
 
@@ -32,30 +32,30 @@ def test_numbers_are_found_as_digits_and_as_words() -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("visit sensor 5 every 3 steps", "number 5, which the note does not name"),
-        ("visit sensor 4 every 3 steps, fly at most 3 m/s", "number 3, which the note does not name, or not so often"),
+        ("visit sensor 5 every 3 steps", "number 5 more often than the note"),
+        ("visit sensor 4 every 3 steps, fly at most 3 m/s", "number 3 more often than the note"),
         ("fly at most 9 m/s, fly at most 3 m/s", "ordered twice"),
         ("visit sensor 4 every 3 steps!", "is no order"),
         ("I would visit sensor 4.", "is no order"),
-        ("{", "is not what was asked for"),
-        ('{"orders": [4]}', "is not what was asked for"),
+        ("{", "is not a JSON object with a list of orders"),
+        ('{"orders": [4]}', "is not a JSON object with a list of orders"),
         ("", "is no order"),
     ],
 )
 def test_what_the_note_does_not_bear_is_refused(text: str, why: str) -> None:
     with pytest.raises(BadOrders, match=re.escape(why)):
-        read(text, NOTE)
+        parse_orders(text, NOTE)
 
 
 def test_a_value_out_of_range_is_refused_by_name() -> None:
     with pytest.raises(BadOrders, match="weight"):
-        read("sensor 4 counts 60 times", "sensor 4 counts 60 times")
+        parse_orders("sensor 4 counts 60 times", "sensor 4 counts 60 times")
     with pytest.raises(BadOrders, match="max_velocity"):
-        read("fly at most 60 m/s", "at most 60 m/s")
+        parse_orders("fly at most 60 m/s", "at most 60 m/s")
 
 
 def test_a_note_without_numbers_or_with_very_many_is_not_asked_about() -> None:
-    with pytest.raises(BadOrders, match="names no number"):
+    with pytest.raises(BadOrders, match="has no number"):
         admissible("Be careful.")
     with pytest.raises(BadOrders, match="more than 10"):
         admissible(" ".join(map(str, range(40))))
@@ -96,7 +96,7 @@ def test_the_grammar_uses_no_number_more_often_than_the_note() -> None:
     assert "visit sensor 4 every 3 steps, sensor 4 counts 3 times" not in said
     for text in said:
         with suppress(BadOrders):
-            read(text, note)
+            parse_orders(text, note)
             continue
         # Nothing is refused for its numbers.
         assert re.search("fly at (most|least).*fly at", text), text
@@ -111,13 +111,13 @@ def test_a_note_with_many_numbers_gets_a_small_grammar() -> None:
 
 def test_every_worked_example_stands_up_to_its_own_checks() -> None:
     for note, orders in EXAMPLES:
-        understood = read(orders, note)
+        understood = parse_orders(orders, note)
         assert bool(understood) == (orders != "nothing")
         if orders != "nothing":
             assert set(orders.split(", ")) <= set(admissible(note))
 
 
 def test_the_examples_shown_are_the_most_alike() -> None:
-    nearest, orders = shown("Never use 3 m/s.")[-1]
+    nearest, orders = similar_examples("Never use 3 m/s.")[-1]
     assert (nearest, orders) == ("Never use 12 m/s.", "do not fly at 12 m/s")
-    assert len(shown(NOTE)) == len(set(shown(NOTE))) == 8
+    assert len(similar_examples(NOTE)) == len(set(similar_examples(NOTE))) == 8

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.config.settings import Settings
 from service.deciding.deliberation import Deliberation
 from service.deciding.look_ahead import look_ahead
-from service.deciding.rollout_evaluator import RolloutState, judge
+from service.deciding.rollout_evaluator import RolloutState, evaluate
 from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
@@ -124,7 +124,7 @@ def test_orders_that_do_not_stand_up_are_drawn_again(edge: Edge) -> None:
         ("Look at sensor 42 every 3 steps", "visit sensor 42 every 3 steps", "sensor 42 is unknown"),
         ("Between 9 and 8 m/s", "fly at least 9 m/s, fly at most 8 m/s", "no velocity is left"),
         (NOTE, "", "is no order"),
-        ("Be careful", ORDERS, "names no number"),
+        ("Be careful", ORDERS, "has no number"),
     ],
 )
 def test_what_cannot_be_made_sense_of_fails_and_the_operators_own_still_counts(
@@ -259,7 +259,7 @@ def test_a_note_that_the_context_cannot_hold_is_refused(edge: Edge) -> None:
 
 def guided_by(structure: Guidance, **spec: Any) -> Mission:
     made = mission(MissionSpec(**spec))
-    made.obey(GuidanceAnswer(guidance=structure))
+    made.answer_guidance(GuidanceAnswer(guidance=structure))
     return made
 
 
@@ -302,7 +302,7 @@ def test_the_critic_counts_what_the_operator_asks(asked: dict[str, Any]) -> None
     made.observe(uav(queue=[55.0, 59.0]), 0)
 
     def lost(guidance: Guidance) -> NDArray[np.float64]:
-        return judge(RolloutState.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
+        return evaluate(RolloutState.of(made.belief, PAPER, 0, 0, guidance=guidance), [Action(0, 0), Action(1, 0)]).lost
 
     before, after = lost(Guidance()), lost(Guidance(sensors=[SensorWish.model_validate({"sensor_id": 0, **asked})]))
     assert before[0] > before[1] and after[0] < after[1]

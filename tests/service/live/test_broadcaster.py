@@ -19,12 +19,12 @@ import pytest
 
 from service.api.api_keys import editing
 from service.api.live_routes import STATIC
-from service.live.broadcaster import MOST_LISTENERS
+from service.live.broadcaster import MAX_LISTENERS
 from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
-from service.prompting.unpruned_baseline import Uncompressed
+from service.prompting.unpruned_baseline import UnprunedState
 from service.storage.serialization import decode, encode, pack
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
@@ -147,12 +147,12 @@ def test_listeners_are_bounded_and_take_no_decisions_place(edge: Edge, report: R
     client = edge(max_requests=1)
     decided(client, report())
     with ExitStack() as stack:
-        listeners = [stack.enter_context(watching(client)) for _ in range(MOST_LISTENERS)]
+        listeners = [stack.enter_context(watching(client)) for _ in range(MAX_LISTENERS)]
         assert {next(events)[0] for events in listeners} == {"snapshot"}
         refused = client.get("/missions/test/events")
         assert refused.status_code == 503
         assert refused.headers["retry-after"]
-        assert "pages are watching already" in refused.json()["detail"]
+        assert "pages listen already" in refused.json()["detail"]
         decided(client, report(step=1))
     # Those who left take no places any more.
     until(lambda: client.get("/missions/none/events").status_code == 404)
@@ -160,7 +160,7 @@ def test_listeners_are_bounded_and_take_no_decisions_place(edge: Edge, report: R
 
 def test_nobody_watches_a_mission_that_there_is_not(edge: Edge) -> None:
     client = edge()
-    for _ in range(MOST_LISTENERS + 1):
+    for _ in range(MAX_LISTENERS + 1):
         assert client.get("/missions/none/events").status_code == 404
     assert client.get("/missions/-/events").status_code == 422
 
@@ -227,7 +227,7 @@ def test_the_page_is_open_and_what_it_shows_needs_a_key(
 ) -> None:
     # A key is looked at again at each event, and one comes soon.
     monkeypatch.setattr("service.live.broadcaster._HEARTBEAT_S", 0.05)
-    monkeypatch.setattr("service.api.live_routes._STILL_KNOWN_S", 0.0)
+    monkeypatch.setattr("service.api.live_routes._KEY_CHECK_S", 0.0)
     monkeypatch.setattr("service.api.api_keys._STALE_S", 0.0)
     path = tmp_path / "keys.json"
     with editing(path) as known:
@@ -293,7 +293,7 @@ def answer_of(decision_id: str, mission_id: str = "test") -> DecideResponse:
 
 
 def prompt_of(state: str) -> Prompt:
-    return Prompt("static", "", state, Uncompressed(attended(mission(), uav()).state, FORMATS["csv"].row))
+    return Prompt("static", "", state, UnprunedState(attended(mission(), uav()).state, FORMATS["csv"].row))
 
 
 def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
@@ -316,8 +316,8 @@ def test_what_is_kept_is_bounded_in_number_and_in_characters() -> None:
 def test_a_decision_is_shown_with_its_outcome() -> None:
     history = RecentDecisions()
     history.decided((1.0, 2.0), prompt_of(""), answer_of("a" * 32))
-    history.settled(Outcome(decision_id="a" * 32, cost=1.0))
-    history.settled(Outcome(decision_id="b" * 32, cost=1.0))
+    history.outcome_applied(Outcome(decision_id="a" * 32, cost=1.0))
+    history.outcome_applied(Outcome(decision_id="b" * 32, cost=1.0))
     assert [(one.order, one.settled) for one in history.of("test")] == [(1, 2)]
 
 

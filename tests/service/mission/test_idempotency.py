@@ -66,7 +66,7 @@ def test_only_so_many_answers_are_remembered(tmp_path: Path, report: Report) -> 
     with running(tmp_path / "m.db") as (client, engine):
         for number in range(60):
             client.post("/decide", json=report(step=number), headers={"Idempotency-Key": f"k{number}"})
-        assert len(engine.missions.loaded[0].repeats._answers) == 24
+        assert len(engine.missions.loaded[0].idempotent_answers._answers) == 24
 
 
 def test_a_batch_counts_as_many_answers_as_it_has(tmp_path: Path, report: Report) -> None:
@@ -80,7 +80,7 @@ def test_a_batch_counts_as_many_answers_as_it_has(tmp_path: Path, report: Report
 
     with running(tmp_path / "m.db") as (client, engine):
         first = [ask(client, number) for number in range(10)]
-        assert len(engine.missions.loaded[0].repeats._answers) == 8
+        assert len(engine.missions.loaded[0].idempotent_answers._answers) == 8
         # As after a kill: no checkpoint was taken.
         copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
     for path in (tmp_path / "m.db", copied):

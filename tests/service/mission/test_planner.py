@@ -91,7 +91,7 @@ def test_a_planner_that_fails_is_no_error_of_the_decision(edge: Edge, monkeypatc
 
 
 def test_a_fleet_too_large_to_plan_for_is_decided_all_the_same(edge: Edge) -> None:
-    large = Scenario(name="large", sensors=planner.MOST_SENSORS + 1, uavs=1, steps=1)
+    large = Scenario(name="large", sensors=planner.MAX_SENSORS + 1, uavs=1, steps=1)
     client = edge(mode="policy")
     made = client.put("/missions/test", json={"scenario": large.model_dump(mode="json")})
     assert made.json()["planner"] == "off"

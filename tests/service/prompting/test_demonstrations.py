@@ -9,7 +9,7 @@ from service.commands.demonstrate import main
 from service.deciding.look_ahead import look_ahead
 from service.errors import Refused
 from service.prompting.demonstrations import packaged
-from service.training.demonstration_teachers import TEACHERS, farthest_first, likeness, solutions
+from service.training.demonstration_teachers import TEACHERS, farthest_first, point, solutions
 from shared.actions import Action
 from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
@@ -83,7 +83,7 @@ def test_the_static_block_stays_as_it_is_while_the_modules_learn() -> None:
         sample = m.apply(Outcome(decision_id=f"{step:032x}", cost=1.0))
         assert sample is not None
         m.learner.update(sample, 1.0)
-        assert m.template.prompt(view.state, view.shown(), m.experiences).static == before
+        assert m.template.prompt(view.state, view.shown(), m.experiences.block).static == before
 
 
 def test_a_slower_fleet_sees_no_velocity_past_its_limit() -> None:
@@ -150,9 +150,9 @@ def test_the_farthest_comes_next() -> None:
 
 def test_what_is_alike_depends_on_the_answer() -> None:
     view = attended(mission(MissionSpec(features="reach")), uav())
-    one, other = likeness(view.state, 1, 7, PAPER), likeness(view.state, 3, 7, PAPER)
+    one, other = point(view.state, 1, 7, PAPER), point(view.state, 3, 7, PAPER)
     assert not np.allclose(one, other)
-    assert np.allclose(likeness(view.state, 1, 14, PAPER)[:-1], one[:-1])
+    assert np.allclose(point(view.state, 1, 14, PAPER)[:-1], one[:-1])
 
 
 def test_the_command_writes_what_a_mission_can_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -164,7 +164,7 @@ def test_the_command_writes_what_a_mission_can_show(tmp_path: Path, capsys: pyte
     assert len(json.loads(out.read_text())["demonstrations"]) == 5
     for options, said in (
         (["--count", "1000", *look_ahead], "--count asks 1000"),
-        (["--count", "1"], "holds no decision of planner: record with aicvds explore --teacher both"),
+        (["--count", "1"], "has no decision of planner: record with aicvds explore --teacher both"),
         (["--count", "0"], "--count 0"),
         (["--teacher", "socrates"], "choose one of planner, clairvoyant, look_ahead"),
     ):

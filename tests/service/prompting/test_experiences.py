@@ -119,7 +119,7 @@ def flown(selection: Selection, steps: int, **style: Any) -> list[tuple[str, str
     m, prompts = mission(spec), []
     for step in range(steps):
         view = attended(m, uav(step=step, position=(400.0 + 20 * step, 500.0)), step)
-        prompt = m.template.prompt(view.state, view.shown(), m.experiences, view.similar_experiences())
+        prompt = m.template.prompt(view.state, view.shown(), m.experiences.block, view.similar_experiences())
         prompts.append((prompt.static, prompt.experiences, prompt.state))
         m.commit(view.pending(f"{step:032x}", Action(view.kept_ids[step % 3], 7)))
         m.apply(Outcome(decision_id=f"{step:032x}", cost=step % 5 / 2))

@@ -21,7 +21,7 @@ def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> l
     prompts = []
     for step in range(steps):
         view = attended(m, uav(step=step, position=(500.0 + step, 500.0)), step)
-        prompts.append(m.template.prompt(view.state, view.shown(), m.experiences))
+        prompts.append(m.template.prompt(view.state, view.shown(), m.experiences.block))
         m.commit(view.pending(f"{step:032x}", Action(1, 7)))
         m.apply(Outcome(decision_id=f"{step:032x}", cost=0.125))
     return prompts
@@ -51,7 +51,7 @@ def test_by_default_the_static_block_is_the_one_whose_tokens_were_published() ->
 
 def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
     m = mission(top_k=2)
-    m.visits[0] = 4
+    m.records.visits[0] = 4
     view = attended(m, uav(step=6, queue=[30.0, None, 60.0, 15.0]), 6)
     prompt = m.template.prompt(view.state, view.shown(), [])
     assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids

@@ -9,7 +9,7 @@ from service.config.settings import Settings
 from service.prompting.row_formats import FORMATS
 from service.prompting.token_accounting import TokenCounter, price_usd
 from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
-from service.prompting.unpruned_baseline import Uncompressed
+from service.prompting.unpruned_baseline import UnprunedState
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, PromptStyle
 from tests.service.making import attended, mission, uav
@@ -96,4 +96,4 @@ def test_the_uncompressed_state_is_counted_as_if_it_were_written(row_format: str
         whole = m.template.prompt(view.state, view.shown(), [], lines).uncompressed
         assert len(whole.text.splitlines()) >= 300
         assert whole.tokens(COUNTER.count) == COUNTER.count(whole.text)
-    assert Uncompressed(view.state, FORMATS["csv"].row).tokens(COUNTER.count) > 300 * 11
+    assert UnprunedState(view.state, FORMATS["csv"].row).tokens(COUNTER.count) > 300 * 11

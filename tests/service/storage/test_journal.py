@@ -232,7 +232,7 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, report: Report) 
     with running(path) as (client, engine):
         status = client.get("/missions/test").json()
         assert status["feedback"] >= len(acknowledged)
-        applied = engine.missions.loaded[0]._applied
+        applied = engine.missions.loaded[0].pending.applied
         assert all(name in applied for name in acknowledged[-20:])
 
 

@@ -246,8 +246,8 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Of a batch's three outcomes, which come at once, two can wait.
-    monkeypatch.setattr(learning_queue, "_MAX_LESSONS", 2)
-    monkeypatch.setattr(learning_queue, "_TELL_S", 3600.0)
+    monkeypatch.setattr(learning_queue, "_MAX_TASKS", 2)
+    monkeypatch.setattr(learning_queue, "_WARNING_S", 3600.0)
     with running(tmp_path / "m.db") as (client, engine):
         owed: dict[int, str] = {}
         for step in range(6):
@@ -314,7 +314,7 @@ def test_a_key_is_known_longer_than_the_outcome_that_came_with_it(tmp_path: Path
         first = client.post("/decide", json=report()).json()
         body = report(step=1, outcome={"decision_id": first["decision_id"], "cost": 0.5})
         answer = client.post("/decide", json=body, headers={"Idempotency-Key": "k"}).json()
-        engine.missions.loaded[0]._applied.load_state_dict([])
+        engine.missions.loaded[0].pending.applied.load_state_dict([])
         again = client.post("/decide", json=body, headers={"Idempotency-Key": "k"})
         assert (again.status_code, again.json()["decision_id"]) == (200, answer["decision_id"])
         assert Outcome.model_validate(body["outcome"]).cost == 0.5
@@ -363,5 +363,5 @@ def test_a_mission_whose_prompt_no_longer_fits_flies_on_without_the_llm(
             assert len(model.bodies) == asked
             assert client.put("/missions/new", json=spec).status_code == 422
     assert [record.getMessage() for record in caplog.records if "AICVDS_LLM_CONTEXT" in record.getMessage()] == [
-        "mission test: its prompt may need more than AICVDS_LLM_CONTEXT (1024): it flies on without the LLM"
+        "mission test: its prompt may exceed AICVDS_LLM_CONTEXT (1024); it continues without the LLM"
     ]

@@ -10,7 +10,7 @@ import torch
 
 from service.learning.modules import Modules, Sample
 from service.training.reward import Reward, fleet_cost
-from service.training.rollout_examples import Batch, Example, Taught, replay
+from service.training.rollout_examples import Batch, Example, TeacherDecision, replay
 from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from service.training.training_loop import losses
 from shared.rollouts import Header, Reference, RolloutStep
@@ -37,10 +37,10 @@ def examples(reward: Reward | None = None) -> list[Example]:
     return next(replay(HEADER, steps(), reward or Reward("immediate"), "reach"))
 
 
-def taught(chosen: int = 2, velocity: int = 7, teacher: str = "planner") -> Taught:
+def taught(chosen: int = 2, velocity: int = 7, teacher: str = "planner") -> TeacherDecision:
     rng = np.random.default_rng(chosen)
     sample = Sample(rng.random((8, 12), np.float32), chosen, rng.random((15, 4), np.float32), velocity)
-    return Taught(teacher, sample, reaches=True, best_velocity=14)
+    return TeacherDecision(teacher, sample, reaches=True, best_velocity=14)
 
 
 # ---- rewards

@@ -1,0 +1,84 @@
+"""A mission's prompt template, and whether the LLM's context is large enough for its prompts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.config.prompt_budget import prompt_tokens
+from service.errors import Refused
+from service.learning.modules import Weights
+from service.mission.resolved_spec import ResolvedSpec
+from service.prompting.demonstrations import solved
+from service.prompting.experiences import NEAREST
+from service.prompting.guided_prompt import GuidedTemplate
+from service.prompting.prompt import Template, note_block
+from shared.scenario import Scenario
+
+
+def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Template:
+    """The template of the mission's mode.
+
+    Args:
+        weights: the attention weights that the mission begins with; they choose the rows of the demonstrations.
+    """
+    experiences, note = spec.prompt.experiences, spec.note
+    ranked = spec.uses_attention and spec.prompt.order == "score"
+    if spec.mode == "guided":
+        rows = spec.top_k if spec.uses_attention else scenario.sensors
+        return GuidedTemplate(scenario, rows=rows, experiences=experiences, ranked=ranked, note=note)
+    examples = solved(spec, spec.features, scenario, weights, spec.top_k if spec.uses_attention else None)
+    return Template(
+        scenario,
+        spec.prompt,
+        spec.features,
+        demonstrations=examples,
+        experiences=experiences,
+        ranked=ranked,
+        note=note,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PromptFit:
+    """The size of a mission's prompts against the LLM's context.
+
+    Attributes:
+        demonstrations: the text of the template's worked examples.
+        context: tokens of the LLM's context.
+    """
+
+    spec: ResolvedSpec
+    scenario: Scenario
+    demonstrations: str
+    context: int
+
+    def fits(self, uavs: int = 1) -> bool:
+        """Whether the context is large enough for a prompt about so many UAVs at once."""
+        return self._needed(uavs) <= self.context
+
+    def check(self) -> None:
+        """Raises ``Refused`` where the context is too small for a prompt about one UAV."""
+        if self.fits():
+            return
+        style = self.spec.prompt
+        shown, lower = f"{style.experiences} experiences", "prompt.experiences"
+        if style.demonstrations:
+            shown += f", {style.demonstrations} demonstrations"
+            lower += ", prompt.demonstrations"
+        raise Refused(
+            "prompt",
+            f"{shown} and {self._rows} sensors as {style.format} need up to {self._needed()} tokens "
+            f"and AICVDS_LLM_CONTEXT is {self.context}: raise it, or lower {lower} or top_k",
+        )
+
+    def _needed(self, uavs: int = 1) -> int:
+        """The most tokens that a prompt can have."""
+        style = self.spec.prompt
+        lines = style.experiences + (NEAREST if style.selection == "similar" else 0)
+        needed = prompt_tokens(style.format, self._rows * uavs, lines, self.spec.features, self.demonstrations)
+        # A tokenizer makes at most one token of each byte.
+        return needed + len(note_block(self.spec.note).encode())
+
+    @property
+    def _rows(self) -> int:
+        return min(self.scenario.sensors, self.spec.top_k) if self.spec.uses_attention else self.scenario.sensors
