@@ -300,7 +300,7 @@ def compression_figures(
 def tell(found: dict[str, Any], console: Console) -> None:
     """Print the figures."""
     table = Table(
-        "", "o200k", "own", "read anew", "to paper's: whole", "read anew", "to its whole", title="Tokens a decision"
+        "", "o200k", "own", "newly read", "to paper's: whole", "newly read", "to its whole", title="Tokens a decision"
     )
     for way, label in WAYS.items():
         row = found["tokens"][way]
@@ -328,7 +328,7 @@ def tell(found: dict[str, Any], console: Console) -> None:
             highlight=False,
         )
     for label, seconds in found["compression"]["seconds_to_read_reckoned"].items():
-        console.print(f"reading {label}: {seconds:.2f} s, reckoned", highlight=False)
+        console.print(f"reading {label}: {seconds:.2f} s, computed", highlight=False)
     attention = found["compression"]["attention"]
     console.print(
         f"attention: {attention['ms_median']:.3f} ms for {attention['tokens_saved']:.1f} tokens; pays below "

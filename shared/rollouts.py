@@ -22,7 +22,7 @@ class Header(Wire):
 
 
 class Reference(Wire):
-    """A teacher's action: ``planner`` knows what the fleet knew, ``clairvoyant`` knows all arrivals."""
+    """A teacher's action: ``planner`` has the fleet's knowledge, ``clairvoyant`` knows all arrivals."""
 
     teacher: Literal["planner", "clairvoyant"]
     sensor_id: SensorId

@@ -95,14 +95,14 @@ class SensorColumns(Received):
         max_length=MAX_SENSORS,
         fail_fast=True,
         exclude_if=_is_empty,
-        description="m, surveyed; left out: as told before",
+        description="m, surveyed; omitted: as sent before",
     )
     y: list[Metres] = Field(
         default_factory=list,
         max_length=MAX_SENSORS,
         fail_fast=True,
         exclude_if=_is_empty,
-        description="m, surveyed; left out: as told before",
+        description="m, surveyed; omitted: as sent before",
     )
     queue: Annotated[
         list[Annotated[float, Field(ge=0, le=100_000)] | None],

@@ -21,7 +21,7 @@ FIRST_FIX_S = 1.0
 
 @dataclass(frozen=True)
 class StubPosition:
-    """As MAVSDK tells it."""
+    """As in MAVSDK."""
 
     latitude_deg: float
     longitude_deg: float
@@ -31,7 +31,7 @@ class StubPosition:
 
 @dataclass(frozen=True)
 class StubBattery:
-    """As MAVSDK tells it."""
+    """As in MAVSDK."""
 
     remaining_percent: float
 
