@@ -268,7 +268,9 @@ def whole_steps(scribe: Scribe, scenario: Scenario) -> list[tuple[list[dict[str,
 
 def tell(found: dict[str, Any], console: Console) -> None:
     """Print the figures."""
-    table = Table("", "s", "first token", "processor", "newly read", "written", "late", title="Time to a decision, medians")
+    table = Table(
+        "", "s", "first token", "processor", "newly read", "written", "late", title="Time to a decision, medians"
+    )
     for name, row in found["times"].items():
         seconds = [f"{row[column]:.3f}" for column in ("seconds_median", "first_token_s_median", "cpu_s_median")]
         table.add_row(name, *seconds, f"{row['new_mean']:.0f}", f"{row['written_mean']:.1f}", f"{row['late']:.0f}")
