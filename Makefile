@@ -1,7 +1,7 @@
 # make install | demo | test | test-long | check | docs | bench | faults | fuzz | soak | compose | release | clean
 #
-# TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index, as its "Get Started"
-# selector prints it after --index-url; unset, torch comes from the ordinary index (on Linux the CUDA build).
+# TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index: its "Get Started" selector
+# prints it after --index-url. Unset, torch comes from the ordinary index (on Linux the CUDA build).
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 TORCH_INDEX ?=
 MINUTES ?= 10
@@ -10,23 +10,23 @@ AICVDS_BUILD_NETWORK ?= default
 TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
-# mypy 2.4 may infer another type in another run, by the order of its sets: PYTHONHASHSEED makes its verdict the same everywhere.
+# mypy 2.4 may infer different types in different runs, by the order of its sets: PYTHONHASHSEED makes its result stable.
 .PHONY: help install demo test test-long check docs bench faults fuzz soak compose release clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make install   a virtual environment in .venv with everything, and the embedded model"
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
-	@echo "make test      install, run the tests: 5 minutes on 2 cores"
-	@echo "make test-long the tests that train, experiment, fly and measure for long"
+	@echo "make test      install, run the tests: at most 5 minutes on 2 cores"
+	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
-	@echo "make docs      build the documentation into site/, to be read without a network"
-	@echo "make bench     how fast the edge and its LLM are, side by side with others: runs/*.json"
+	@echo "make docs      install, build the documentation into site/, to be read without a network"
+	@echo "make bench     measure the edge and its LLM, side by side with others: runs/*.json"
 	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
-	@echo "make fuzz      10,000 requests that schemathesis makes up, with keys and without: none breaks the edge"
-	@echo "make soak      200 missions for MINUTES=10: memory, tasks and connections must not grow"
+	@echo "make fuzz      send 10,000 requests that schemathesis generates, with keys and without: none may break the edge"
+	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
-	@echo "make release   wheel, sdist and SBOM into dist/, tried, and the images; IMAGES=required: not without these"
+	@echo "make release   build and try wheel, sdist and SBOM in dist/, and the images; IMAGES=required: fail without images"
 
 install: .venv/installed
 
@@ -60,7 +60,7 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# Fewer rounds than the figures in docs/benchmarks.md are of: 15:27 on a slow day, with two rounds more of the first, 20 s each.
+# The figures in docs/benchmarks.md have more rounds. These took 15:27 on a slow day, with two more rounds of startup.py, 20 s each.
 bench: install
 	$(BIN)/python benchmarks/startup.py --rounds 3
 	$(BIN)/python benchmarks/overhead.py --rounds 5

@@ -1,6 +1,7 @@
-"""``make release``: what a release is made of, into dist/: wheel, sdist, SBOM, checksums, and both Docker images.
+"""``make release``: builds wheel, sdist, SBOM and checksums into dist/, and both Docker images.
 
-The version is git's: of the tag v1.2.3 on this commit, or a development version. docs/releases.md says how to cut one.
+The version comes from git: from the tag v1.2.3 on this commit, otherwise it is a development version.
+docs/releases.md says how to cut one.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ ROOT = Path(__file__).parent
 DIST = ROOT / "dist"
 PACKAGES = ("service", "shared", "simulator")
 IMAGES = ("edge", "simulator")
-# Of this repository's own making; what users run needs none of them.
+# Extras for work on this repository, which users do not need.
 OWN_EXTRAS = {"dev", "docs", "release"}
 
 console = Console(stderr=True, highlight=False)
 
 
 class NotReleased(Exception):
-    """The text says why, and what to do."""
+    """The release is refused; the text says why, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +52,15 @@ class Release:
     """
 
     images: Literal["auto", "required", "none"] = "auto"
-    """Docker images: `auto` leaves them out where no engine answers, `required` fails there, `none` builds none."""
+    """Docker images: without an engine `auto` skips them and `required` fails; `none` builds none."""
     torch_index: Annotated[str, tyro.conf.arg(metavar="URL")] = ""
-    """PyTorch's CPU index, for the clean environment and the edge's image; by default torch comes as the rest does."""
+    """PyTorch's CPU index, for the clean environment and the edge's image; by default the ordinary index has torch."""
     build_network: Annotated[str, tyro.conf.arg(metavar="NAME")] = "default"
-    """Network of the images' builds; `host` where they reach the package index only from the machine's own."""
+    """Network of the images' builds; `host` if they reach the package index only from the machine's own network."""
 
 
 def main() -> int:
-    """Release what is checked out; returns the exit code."""
+    """Release the commit that is checked out; returns the exit code."""
     options = tyro.cli(Release, prog="release.py")
     try:
         version = version_to_release(ROOT)
@@ -79,13 +80,13 @@ def version_to_release(root: Path) -> str:
     """The version of the commit that is checked out in ``root``.
 
     Raises:
-        NotReleased: no git repository, or there are changes that no commit holds, or the changelog does not have the
-            version, which a development version need not be in.
+        NotReleased: there is no git repository, there are uncommitted changes, or the changelog has no section for
+            the version; a development version needs none.
     """
     if not (root / ".git").exists():
-        raise NotReleased("this is no clone of the git repository, which is where the version comes from")
+        raise NotReleased("this is no clone of the git repository, and the version comes from git")
     if changed := output("git", "status", "--porcelain", cwd=root).rstrip("\n"):
-        raise NotReleased(f"commit, stash or delete first what no commit holds:\n{changed}")
+        raise NotReleased(f"commit, stash or delete these changes first:\n{changed}")
     version = output(sys.executable, "-m", "setuptools_scm", cwd=root).strip()
     if Version(version).is_devrelease:
         console.print(f"{version} is a development version: no tag such as v1.2.3 is on this commit", soft_wrap=True)
@@ -99,7 +100,7 @@ def version_to_release(root: Path) -> str:
 
 
 def images_wanted(asked: Literal["auto", "required", "none"]) -> bool:
-    """Whether images are to be built; raises ``NotReleased`` where they must be and cannot."""
+    """Whether to build images; raises ``NotReleased`` if they are required and no engine answers."""
     if asked == "none":
         console.print("The Docker images are left out, as IMAGES=none says")
         return False
@@ -112,11 +113,11 @@ def images_wanted(asked: Literal["auto", "required", "none"]) -> bool:
 
 
 def release(version: str, options: Release, images: Sequence[str]) -> None:
-    """Build, try and list everything; raises ``CalledProcessError`` or ``NotReleased`` where something fails."""
+    """Build, try and list everything; raises ``CalledProcessError`` or ``NotReleased`` if a step fails."""
     shutil.rmtree(DIST, ignore_errors=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        # A clone holds nothing but what is committed, of all that lies about where somebody works.
+        # A clone has only committed files.
         source = folder / "source"
         run("git", "clone", "--quiet", ROOT, source)
         step(f"wheel and sdist of {version}")
@@ -137,7 +138,7 @@ def release(version: str, options: Release, images: Sequence[str]) -> None:
 
 def build_wheel(source: Path) -> Path:
     """Build the sdist, and the wheel from it, with the pinned tools of this environment; returns the wheel."""
-    # The commit's time in the archives: the same commit gives the same wheel.
+    # With the commit's time in the archives the same commit gives the same wheel.
     seconds = output("git", "log", "-1", "--format=%ct", cwd=source).strip()
     run(sys.executable, "-m", "build", "--quiet", "--no-isolation", "--outdir", DIST, source, SOURCE_DATE_EPOCH=seconds)
     (wheel,) = DIST.glob("*.whl")
@@ -145,18 +146,16 @@ def build_wheel(source: Path) -> Path:
 
 
 def check_contents(wheel: Path, source: Path) -> None:
-    """Raise ``NotReleased`` where the wheel lacks a file that git has of the packages, or has another."""
+    """Raise ``NotReleased`` if the packages' files in the wheel are not those in git."""
     with zipfile.ZipFile(wheel) as archive:
         packed = {name for name in archive.namelist() if name.split("/")[0] in PACKAGES}
     tracked = set(output("git", "ls-files", *PACKAGES, cwd=source).splitlines())
     if packed != tracked:
-        raise NotReleased(
-            f"the wheel is not what git has, by package-data of pyproject.toml: {sorted(packed ^ tracked)}"
-        )
+        raise NotReleased(f"the wheel and git differ, see package-data in pyproject.toml: {sorted(packed ^ tracked)}")
 
 
 def clean_environment(wheel: Path, torch_index: str, folder: Path) -> Path:
-    """Install the wheel with every extra of users into a new virtual environment; returns its Python."""
+    """Install the wheel with all users' extras into a new virtual environment; returns its Python."""
     with zipfile.ZipFile(wheel) as archive:
         (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         extras = set(parse_email(archive.read(metadata))[0]["provides_extra"]) - OWN_EXTRAS
@@ -171,7 +170,7 @@ def clean_environment(wheel: Path, torch_index: str, folder: Path) -> Path:
 
 
 def try_installed(version: str, python: Path, folder: Path) -> None:
-    """Let the installed edge decide in every mode, and the simulator fly, as they must in the images."""
+    """Let the installed edge decide in every mode and the simulator fly, as in the images."""
     settings = ("AICVDS_", "OTEL_", "PYTHON")
     env = {name: value for name, value in os.environ.items() if not name.startswith(settings)}
     env |= {name: os.environ[name] for name in ("AICVDS_CACHE_DIR",) if name in os.environ}
@@ -186,10 +185,10 @@ def try_installed(version: str, python: Path, folder: Path) -> None:
 
 
 def write_sbom(version: str, python: Path, path: Path) -> None:
-    """List what is installed beside that Python, as CycloneDX JSON."""
+    """List the packages installed for that Python, as CycloneDX JSON."""
     sbom = (sys.executable, "-m", "cyclonedx_py", "environment", "--pyproject", ROOT / "pyproject.toml")
     run(*sbom, "--output-reproducible", "--output-format", "JSON", "--output-file", path, python)
-    # pyproject.toml does not say which version this is.
+    # pyproject.toml has no version.
     bom = json.loads(path.read_text(encoding="utf-8"))
     bom["metadata"]["component"] |= {"version": version, "purl": f"pkg:pypi/aic-vds@{quote(version)}"}
     path.write_text(json.dumps(bom, indent=2) + "\n", encoding="utf-8")
@@ -197,7 +196,7 @@ def write_sbom(version: str, python: Path, path: Path) -> None:
 
 def build_image(name: str, version: str, source: Path, options: Release) -> str:
     """Build the image of the edge or of the simulator; returns its name and tag."""
-    # A tag has no `+`.
+    # The tag of an image cannot have a `+`.
     image = f"aicvds-{name}:{version.replace('+', '-')}"
     step(f"image {image}")
     labels = {"version": version, "revision": output("git", "rev-parse", "HEAD", cwd=source).strip()}
@@ -208,7 +207,7 @@ def build_image(name: str, version: str, source: Path, options: Release) -> str:
     command += ["--network", options.build_network]
     command += [f"--build-arg={key}={value}" for key, value in arguments.items()]
     command += [f"--label=org.opencontainers.image.{key}={value}" for key, value in labels.items()]
-    # Without the buildx plug-in there is only the classic builder.
+    # Without the buildx plug-in Docker has only the classic builder.
     buildkit = "1" if succeeds("docker", "buildx", "version") else "0"
     run(*command, source, DOCKER_BUILDKIT=buildkit)
     expect_version(output("docker", "run", "--rm", "--network=none", image, "aicvds", "--version"), version)
@@ -216,7 +215,7 @@ def build_image(name: str, version: str, source: Path, options: Release) -> str:
 
 
 def expect_version(said: str, version: str) -> None:
-    """Raise ``NotReleased`` unless that is what ``aicvds --version`` says of this version."""
+    """Raise ``NotReleased`` unless ``said`` is the output of ``aicvds --version`` for this version."""
     if said.strip() != f"aicvds {version}":
         raise NotReleased(f"`aicvds --version` says {said.strip()!r}, and {version} is released")
 
@@ -226,12 +225,12 @@ def step(what: str) -> None:
 
 
 def run(*command: str | Path, **env: str) -> None:
-    """Run it where everybody sees what it says."""
+    """Run a command with visible output."""
     subprocess.run(command, cwd=ROOT, env={**os.environ, **env}, check=True)
 
 
 def output(*command: str | Path, cwd: Path = ROOT) -> str:
-    """What it prints."""
+    """The output of a command."""
     return subprocess.run(command, cwd=cwd, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 

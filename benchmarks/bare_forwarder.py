@@ -1,4 +1,4 @@
-"""The least that a Python service can do: a FastAPI application that passes JSON on with httpx, and answers what came.
+"""A minimal Python service: a FastAPI application that forwards JSON with httpx and returns the answer.
 
 python benchmarks/bare_forwarder.py --port 9010 --upstream http://127.0.0.1:9009/v1
 """

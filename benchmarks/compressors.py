@@ -1,9 +1,9 @@
-"""What making a prompt shorter takes: a compressor of LLMLingua-2's size, and this project's attention.
+"""The time to shorten a prompt: by a compressor of LLMLingua-2's size, and by this project's attention.
 
-LLMLingua-2 (Pan et al. 2024, arXiv 2403.12968) keeps the tokens that an encoder classifies as worth keeping: that of
-XLM-RoBERTa large, or of multilingual BERT in its small version, over windows of 512 tokens. Its weights are not fetched
-here, and how long it takes does not depend on their values: these are encoders of the same sizes with random weights,
-without the table of embeddings, which takes no time to speak of. Half of the tokens are kept.
+LLMLingua-2 (Pan et al. 2024, arXiv 2403.12968) keeps the tokens that an encoder classifies as worth keeping. The
+encoder is XLM-RoBERTa large, or multilingual BERT in the small version, over windows of 512 tokens. Its time does not
+depend on the values of its weights, so this module does not download them: it has encoders of the same sizes with
+random weights, without the table of embeddings, which takes almost no time. They keep half of the tokens.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _K = 5
 
 @dataclass(frozen=True)
 class Size:
-    """An encoder's."""
+    """The sizes of an encoder."""
 
     label: str
     layers: int
@@ -39,12 +39,12 @@ class Size:
 
 SMALL = Size("LLMLingua-2 small (multilingual BERT base)", 12, 768, 12, 3072)
 LARGE = Size("LLMLingua-2 (XLM-RoBERTa large)", 24, 1024, 16, 4096)
-# For tests: it shows nothing but that the benchmark runs.
+# For tests: it only shows that the benchmark runs.
 TINY = Size("tiny", 1, 64, 2, 128)
 
 
 class Compressor(nn.Module):
-    """Says of each token's embedding whether to keep it."""
+    """Classifies each token's embedding: keep the token or not."""
 
     def __init__(self, size: Size) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class Compressor(nn.Module):
 
     @torch.inference_mode()
     def window_s(self, tokens: int) -> float:
-        """Seconds to classify one window of so many tokens, and to choose half of them."""
+        """Seconds to classify one window of tokens, and to choose half of them."""
         embedded = torch.randn(1, tokens, self._width)
         began = time.perf_counter()
         keep = self._keep(self._encoder(embedded)).softmax(dim=-1)[0, :, 1]
@@ -65,7 +65,7 @@ class Compressor(nn.Module):
 
 
 def attention_s(scenario: Scenario, repeats: int) -> list[float]:
-    """Seconds of scoring all J sensors by the edge's attention module and taking the best k, measured so often."""
+    """Seconds in which the edge's attention module scores all J sensors and takes the best k, for each repetition."""
     weights = initial_weights("pretrained", "paper", _LEVELS, 0)
     features = np.random.default_rng(0).random((scenario.sensors, FEATURES["paper"]), dtype=np.float32)
     took = []

@@ -1,24 +1,25 @@
-"""The way of one `POST /decide` through the code: the files and functions that it enters, and its changes of file.
+"""The way of one `POST /decide` through the code: its files, its functions, and its changes of file.
 
     python benchmarks/decision_path.py
     python benchmarks/decision_path.py --modes guided --list
 
-Runs `aicvds serve` in a process of its own for each mode and round, in its main thread, with a SQLite store, a planner,
-and an LLM that answers at once from a thread of the same process. After four decisions two requests of UAV 0 are
-counted: the README's four sensors, first without an outcome, then with that of an earlier decision.
+It runs `aicvds serve` in a process of its own for each mode and round, in the main thread, with a SQLite store, a
+planner, and an LLM that answers at once from a thread of the same process. After four decisions it counts two requests
+of UAV 0 with the README's four sensors, first without an outcome, then with an earlier decision's outcome.
 
-How it is counted, by `sys.setprofile`, from sending the request to having the answer: every `call` event of a Python
-function in the packages `service` and `shared`; a coroutine that goes on is one more. A file counts once it is entered.
-A function is known by its file and qualified name; lambdas and comprehensions are left out. A change of file is a call
-on the event loop's thread in another file than the call before it there; going back to a caller is none. The other
-threads (plan search, critic) are counted apart, the process that writes SQLite not at all. Learning from the outcome is
-part of the way, and so are the bounds on heads, the loading and the client of the LLM. How often a coroutine goes on
-depends a little on timing: each mode is measured several times, and the median is told. Prints a table, writes JSON.
+`sys.setprofile` counts, from the request to the answer, every `call` event of a Python function in the packages
+`service` and `shared`; a coroutine that resumes is one more call. A file counts once it is entered. A function is known
+by its file and qualified name; lambdas and comprehensions do not count. A change of file is a call on the event loop's
+thread in another file than the call before it; a return to a caller is none. The other threads (plan search, rollout
+evaluator) count apart, and the process that writes SQLite does not count. Learning from the outcome is part of the way,
+and so are the limits on headers, the startup gate and the client of the LLM. The number of a coroutine's resumptions
+depends a little on timing, so each mode is measured several times, and the result is the median. It prints a table and
+writes JSON.
 
 Commit 601e8f2, mode guided, with an outcome: 69 files (55 service, 14 shared), 281 functions, 330 changes of file;
-without: 66, 251, 310. Mode llm: 60 files (48, 12), 204 functions, 187 changes; without: 57, 176, 165. A count of the
-same commit made by other means gave 64 files (50, 14), 261 functions and 304 changes for guided, 54 files and 204
-functions for llm: it left out a few files at the edge of the way.
+without: 66, 251, 310. Mode llm: 60 files (48, 12), 204 functions, 187 changes; without: 57, 176, 165. Another
+method of counting the same commit gave 64 files (50, 14), 261 functions and 304 changes for guided, 54 files and 204
+functions for llm: it omitted a few files at the ends of the way.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from rich.console import Console
 from rich.table import Table
 
 PACKAGES = ("service", "shared")
-# The first word of a process that counts; its mode follows.
+# The first argument of a counting process; its mode follows.
 COUNTED = "counted"
 SENSORS: dict[str, list[Any]] = {
     "id": [0, 1, 2, 3],
@@ -65,11 +66,11 @@ class DecisionPath:
     """Count the way of one decision."""
 
     modes: tuple[str, ...] = ("guided", "llm")
-    """Of the missions."""
+    """Modes of the missions."""
     rounds: int = 3
-    """Processes started for each mode."""
+    """Processes for each mode."""
     show: Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(name="list")] = False
-    """Show the event loop's calls in order, each file's under it; of the last round."""
+    """Show the event loop's calls of the last round in order, grouped by file."""
     out: Path = Path("runs/decision_path.json")
     """Where to write."""
 
@@ -102,7 +103,7 @@ class Calls:
 
 
 def counts(calls: Calls) -> dict[str, Any]:
-    """What is told of them."""
+    """The counts of the calls."""
     files = {file for file, _ in calls.loop}
     named = {(file, name) for file, name in calls.loop if not name.endswith(">")}
     return {
@@ -117,7 +118,7 @@ def counts(calls: Calls) -> dict[str, Any]:
 
 
 class _Llm(BaseHTTPRequestHandler):
-    """Names the first that its grammar allows."""
+    """An LLM server that answers with the first text that the grammar allows."""
 
     protocol_version = "HTTP/1.1"
 
@@ -171,7 +172,7 @@ def _ask(port: int, calls: Calls) -> None:
             body = {"decision_id": answer["decision_id"], "cost": 0.2, "failed": False}
             counted = []
             for step, outcome in ((2, None), (3, body)):
-                # What is done after an answer is done.
+                # The work after an answer is done.
                 time.sleep(0.5)
                 calls.loop, calls.beside, calls.on = [], [], True
                 answer = _decide(client, step, 0, outcome)
@@ -211,7 +212,7 @@ def _decide(client: httpx.Client, step: int, uav: int, outcome: dict[str, Any] |
 
 
 def measured(mode: str, rounds: int) -> Iterator[list[Calls]]:
-    """One a round, each of a process of its own."""
+    """The counts of each round, each from a process of its own."""
     for _ in range(rounds):
         command = [sys.executable, __file__, COUNTED, mode]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=300)

@@ -1,12 +1,12 @@
-"""How many missions one edge flies: decisions a second, p99 and memory for 1 to 1,000, and what learning costs them.
+"""The missions of one edge: decisions a second, p99 and memory for 1 to 1,000 missions, and the cost of learning.
 
     python benchmarks/fleet.py
 
-Starts a real edge of mode ``value`` with a store; missions of scenario ``paper`` (3 UAVs, 10 sensors) are asked for by
-``POST /decide``, each request with its UAV's last outcome, over a few connections that each wait for an answer before
-they ask again. Memory a mission is what the edge's resident memory grew by, divided. Whether learning is off the hot
-path: at a pace that the edge holds, blocks of decisions with outcomes and without, in turn; the ratio of their p99.
-Client and edge share the machine's cores. Prints a table, writes JSON.
+It starts a real edge of mode ``value`` with a store. Missions of scenario ``paper`` (3 UAVs, 10 sensors) send
+``POST /decide``, each request with its UAV's last outcome, over a few connections that wait for each answer. The memory
+of a mission is the growth of the edge's resident memory, divided by the missions. To show whether learning slows
+decisions, blocks of decisions with outcomes and without follow each other at a pace that the edge can hold; the result
+is the ratio of their p99. Client and edge share the machine's cores. It prints a table and writes JSON.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ class Fleet:
     """Fly 1 to 1,000 missions on one edge."""
 
     missions: tuple[int, ...] = (1, 10, 100, 1000)
-    """Numbers of missions held, ascending."""
+    """Numbers of missions, ascending."""
     decisions: int = 1200
-    """Decisions measured at each number; at least one for each UAV of each mission is made."""
+    """Measured decisions at each number; each UAV of each mission gets at least one."""
     connections: int = 4
-    """That ask at once."""
+    """Concurrent connections."""
     each: int = 12
-    """Decisions of each of the most missions, for the memory a mission."""
+    """Decisions of each mission at the largest number, for the memory of a mission."""
     veterans: int = 100
-    """Missions flown on, for the memory of one that has flown for long."""
+    """Missions that fly on, for the memory of a long mission."""
     lifetime: int = 100
-    """Their decisions."""
+    """Decisions of a long mission."""
     pace: float = 30.0
     """Decisions a second, for p99 with outcomes and without."""
     block: int = 150
-    """Decisions of a block at that pace."""
+    """Decisions in a block at that pace."""
     blocks: int = 4
     """Blocks with outcomes, and as many without."""
     out: Path = Path("runs/fleet.json")
@@ -67,7 +67,7 @@ class Fleet:
 
 @dataclass
 class Flown:
-    """A mission's place in its flight: its next decision, and what is owed for each UAV."""
+    """A mission's progress in its flight: its next decision, and each UAV's unreported outcome."""
 
     name: str
     told: int = 0
@@ -76,12 +76,12 @@ class Flown:
 
     @property
     def uav(self) -> int:
-        """Whose turn it is."""
+        """The UAV of the next decision."""
         return self.told % UAVS
 
     @property
     def step(self) -> int:
-        """At which step."""
+        """The step of the next decision."""
         return self.told // UAVS
 
 
@@ -93,7 +93,7 @@ class Radio:
         self._random = random.Random(seed)
 
     def decide(self, mission: Flown, learn: bool) -> float:
-        """The mission's next decision; milliseconds from the request to the answer."""
+        """Ask for the mission's next decision; returns the milliseconds from the request to the answer."""
         with mission.turn:
             uav = mission.uav
             outcome = mission.owed.pop(uav, None) if learn else None
@@ -103,7 +103,7 @@ class Radio:
         return took_ms
 
     def step(self, mission: Flown) -> None:
-        """The mission's next three decisions, asked for at once."""
+        """Ask for the mission's next three decisions in one batch."""
         states = [{**self._state(mission, uav), "outcome": mission.owed.pop(uav, None)} for uav in range(UAVS)]
         answer, _ = self.post("/decide/batch", {"mission_id": mission.name, "step": mission.step, "uavs": states})
         for one in answer["decisions"]:
@@ -113,12 +113,12 @@ class Radio:
         """The answer and its milliseconds."""
         content = json.dumps(body).encode()
         headers = {"Content-Type": "application/json"}
-        # As the UAVs of `aicvds simulate` do.
+        # The UAVs of `aicvds simulate` do the same.
         headers |= {"Idempotency-Key": uuid.uuid4().hex} if path.startswith("/decide") else {}
         try:
             response, data, took_ms = self._ask(method, path, content, headers)
         except (ConnectionError, http.client.RemoteDisconnected):
-            # The edge closes what is not used for seconds; the key makes the second the same request.
+            # The edge closes idle connections after seconds; the key makes the second attempt the same request.
             self._http.close()
             response, data, took_ms = self._ask(method, path, content, headers)
         if response.status >= 300:
@@ -153,7 +153,7 @@ class Radio:
 
 
 def at_once(radios: Sequence[Radio], work: Sequence[Callable[[Radio], float | None]]) -> list[float]:
-    """Do all of the work, each radio one after the other; what came of it."""
+    """Do all of the work, each radio one job after the other; returns the results."""
     waiting, found, faults = iter(work), list[float](), list[BaseException]()
     lock = threading.Lock()
 
@@ -180,7 +180,7 @@ def at_once(radios: Sequence[Radio], work: Sequence[Callable[[Radio], float | No
 
 
 def paced(radios: Sequence[Radio], missions: Sequence[Flown], count: int, pace: float, learn: bool) -> list[float]:
-    """Decisions begun at even intervals, whether earlier ones are answered or not as far as there are radios."""
+    """Start decisions at even intervals, without waiting for earlier answers while a radio is free."""
     began = time.perf_counter()
 
     def at(index: int) -> Callable[[Radio], float]:
@@ -211,7 +211,7 @@ def main(args: Fleet) -> int:
 
 
 def _resident(edge: psutil.Process) -> int:
-    """Bytes, with the process that writes its store."""
+    """The edge's resident bytes, with the process that writes its store."""
     return sum(each.memory_info().rss for each in (edge, *edge.children()))
 
 

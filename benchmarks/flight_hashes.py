@@ -1,18 +1,19 @@
-"""What a seed flies: one SHA-256 a flight, to prove that a change of the code changes no decision and no loss.
+"""One SHA-256 for each flight, to prove that a change of the code changes no decision and no loss.
 
     python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/before.json
     python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/after.json --against runs/before.json
 
-Starts `aicvds serve` with no LLM and a store of its own, and flies every scenario in modes `value`, `policy` and
-`guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order flown, each decision's
-step, UAV, sensor, velocity, source, reason and failure, its cost and the packets that its UAV lost, as
+It starts `aicvds serve` with no LLM and a store of its own, and flies every scenario in modes `value`, `policy` and
+`guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order of the flight, each
+decision's step, UAV, sensor, velocity, source, reason and failure, its cost and its UAV's lost packets, as
 `decisions.jsonl` has them.
 
-A flight repeats to the bit where no wall clock decides. The planner's search has two limits: the solver's deterministic
-time, and AICVDS_PLANNER_MS of wall clock, which is set to its highest here; the deadline is a minute. Requests come one
-after another, so each outcome is learned before the next decision. The radio of `lossy_uplink` draws its losses from
-the seed; its jitter is only waited for, and left out here. A flight in which a clock decided all the same is an error.
-Another version of OR-Tools may plan otherwise; another processor rounds otherwise, which seldom shows in a decision.
+A flight repeats to the bit if no wall clock decides. The planner's search has two limits: the solver's deterministic
+time, and AICVDS_PLANNER_MS of wall clock, which has its largest value here; the deadline is a minute. Requests come one
+after another, so the edge learns from each outcome before the next decision. The radio of `lossy_uplink` draws its
+losses from the seed; its jitter only delays requests, and is off here. A flight in which a clock decided nevertheless
+is an error. Another version of OR-Tools may plan differently. Another processor rounds differently, which seldom
+changes a decision.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from simulator.cli.options import chosen_site
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport
 
-# The only names from inside: who flies a world, and the radio that loses requests.
+# The only internal names: the functions that fly a world, and the radio that loses requests.
 from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.sites.site import Site
@@ -49,7 +50,7 @@ MODES = ("value", "policy", "guided")
 ON_BOARD = ("eof", "wqcs", "mpc")
 FIELDS = ("step", "uav_id", "sensor_id", "velocity", "source", "reason", "failed", "cost", "lost_packets")
 DEADLINE_MS = 60_000
-# Reasons that a clock gave.
+# Reasons of decisions that a clock caused.
 LATE = {"critic_timeout", "llm_timeout", "llm_busy", "edge_refused", "edge_protocol"}
 
 
@@ -58,19 +59,19 @@ class Hashes:
     """Fly, hash, and compare."""
 
     seeds: tuple[int, ...] = (0, 1)
-    """Of the worlds."""
+    """Seeds of the worlds."""
     steps: int | None = None
-    """Waypoints of a flight; the scenario's unless given."""
+    """Steps of a flight; by default the scenario's."""
     only: str = ""
-    """A regular expression: fly only those whose names it finds, such as `^paper (value|eof)`."""
+    """A regular expression: fly only the flights whose names match, such as `^paper (value|eof)`."""
     out: Path = Path("runs/flight_hashes.json")
     """Where to write."""
     against: Path | None = None
-    """What was written before: flights that are in both are compared, and the exit code is 1 where one differs."""
+    """An earlier result: compare the flights that are in both; the exit code is 1 if one differs."""
 
 
 class Course(NamedTuple):
-    """A flight's name: scenario, who decides, and for an edge the uplink."""
+    """A flight's name: scenario, decider, and for an edge the uplink."""
 
     scenario: str
     decides: str
@@ -81,7 +82,7 @@ class Course(NamedTuple):
 
 
 def courses() -> list[Course]:
-    """All of them; what is quick comes first."""
+    """All flights, the quick ones first."""
     on_board = [Course(scenario, policy) for policy in ON_BOARD for scenario in SCENARIOS]
     over_edge = [Course(scenario, mode, "full") for mode in MODES for scenario in SCENARIOS]
     reduced = [Course("paper", mode, uplink) for mode in MODES for uplink in ("delta", "pruned")]
@@ -116,7 +117,7 @@ def main(options: Hashes) -> int:
 
 
 def told(flight: Flight, name: str) -> dict[str, Any]:
-    """A flight's hash, and sums that say where to look when it differs; raises where a clock decided."""
+    """A flight's hash, and sums that help to find a difference; raises an error if a clock decided."""
     lines = [json.loads(decision.model_dump_json()) for decision in flight.decisions]
     if late := {line["reason"] for line in lines} & LATE:
         raise RuntimeError(f"{name}: decided by a clock, so nothing is proven: {', '.join(sorted(late))}")
@@ -159,8 +160,8 @@ def _over(url: str, course: Course, site: Site, seed: int) -> Flight:
 @contextmanager
 def serving() -> Iterator[str]:
     """An edge as a process of its own, with nothing inherited that changes a decision; yields its URL."""
-    # An answer waits for the store, and so for what is learned from the outcome that came with its request: with no
-    # store the next request may overtake that on a busy machine.
+    # An answer waits for the store, and so for learning from its request's outcome. Without a store the next request
+    # may overtake learning on a busy machine.
     folder = tempfile.mkdtemp()
     settings = {"MODE": "value", "STORE": f"{folder}/m.db", "PLANNER_MS": "60000", "LOG_LEVEL": "warning"}
     process = subprocess.Popen(

@@ -1,8 +1,8 @@
-"""What an LLM would be asked in a mission, decision by decision, in several ways side by side.
+"""The prompts of a mission, decision by decision, in several forms side by side.
 
-A policy on board flies. Beside it go the edge's own missions, one for each way of asking: they hear what the UAVs
-report, what is decided and what it costs, and make their prompts. So all prompts of one decision are about the same
-situation, and no LLM is needed to make them.
+A policy on board flies the mission. For each form of the prompt there is one of the edge's missions: it gets the UAVs'
+reports, the decisions and their costs, and makes its prompts. So all prompts of one decision are about the same
+situation, and no LLM is needed.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ WAYS = {
     PAPER: "the paper's template",
 }
 _POLICY = "mpc"
-# The longest prompt of them, the paper's, with room to spare.
+# Enough for the longest prompt, the paper's.
 CONTEXT = 8192
 
 
 @dataclass(frozen=True)
 class Put:
-    """One decision as it is put to an LLM in one way; ``offer`` in mode ``guided``, whose answer is a letter."""
+    """One decision's prompt in one form; mode ``guided``, whose answer is a letter, has an ``offer``."""
 
     prompt: Prompt
     sensors: list[int]
@@ -62,7 +62,7 @@ class Put:
 
 @dataclass(frozen=True)
 class Asked:
-    """One decision: the ways of putting it, by name, and the situation for a critic to judge answers by."""
+    """One decision: its prompts by form, and the situation for the rollout evaluator to judge answers."""
 
     seed: int
     step: int
@@ -73,7 +73,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Together:
-    """One step of the fleet as mode ``guided`` puts it in one call."""
+    """One step of the fleet as mode ``guided``'s query about all UAVs."""
 
     step: int
     prompt: Prompt
@@ -85,9 +85,9 @@ class Together:
 
 
 class Scribe(LocalPilot):
-    """Flies by a planner on board and writes down how each decision would be put to an LLM.
+    """Flies by a planner on board and records the prompts of each decision.
 
-    ``asked`` has the decisions that every way would have asked about, ``together`` the fleet's whole steps.
+    ``asked`` has the decisions for which every form has a prompt, ``together`` the fleet's whole steps.
     """
 
     def __init__(self, scenario: Scenario, seed: int, policy: str = _POLICY) -> None:
@@ -151,7 +151,7 @@ class Scribe(LocalPilot):
 
 
 def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
-    """The edge's mission for each of ``WAYS``, with the settings that it has by default."""
+    """The edge's mission for each of ``WAYS``, with the default settings."""
     settings = Settings(llm_context=CONTEXT)
     many = PromptStyle(experiences=EXPERIENCES)
 
@@ -170,13 +170,13 @@ def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
 
 
 def as_the_paper(mission: Mission) -> None:
-    """Have a mission put its decisions as the paper does."""
+    """Give a mission the paper's prompt."""
     mission.template = PaperTemplate(mission.scenario)
     mission.experiences = Newest(EXPERIENCES, uavs=mission.scenario.uavs)
 
 
 def flown(scenario: Scenario, seed: int, policy: str = _POLICY) -> Scribe:
-    """One mission, flown and written down."""
+    """Fly and record one mission."""
     scribe = Scribe(scenario, seed, policy)
     fly(Site(scenario), scribe, seed)
     return scribe

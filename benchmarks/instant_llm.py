@@ -1,9 +1,9 @@
-"""An LLM server that answers at once: what it costs to ask is then all that is measured.
+"""An LLM server that answers at once, so that a benchmark measures only the cost of asking.
 
     python benchmarks/instant_llm.py --port 9009
 
-Speaks chat completions as llama.cpp does, obeys a grammar by saying its first alternatives, and remembers the last
-body for ``GET /last``. One plain ASGI application, so that it takes as little of the machine as it can.
+It serves chat completions as llama.cpp does, obeys a grammar by its first alternatives, and returns the last
+body at ``GET /last``. It is one plain ASGI application, to use as little of the machine as possible.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Instant:
 
 
 class App:
-    """Answers every POST with a chat completion, and every GET with what it was asked last."""
+    """Answers every POST with a chat completion, and every GET with the last request's body."""
 
     def __init__(self) -> None:
         self._last = b"{}"

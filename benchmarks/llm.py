@@ -1,15 +1,15 @@
-"""The embedded LLM's time to a decision: with and without its prefix cache, threads, neighbours, and UAVs at once.
+"""The embedded LLM's time for a decision: by prefix cache, threads, busy neighbours, and concurrent UAVs.
 
     python benchmarks/llm.py
     python benchmarks/llm.py --rounds 15    # narrower intervals
 
-The prompts are a mission's own, in their order, as modes `guided` (scoring: one forward pass, whose answer is the
-probabilities of single-token labels) and `llm` (generating: a sensor and a velocity under a grammar) would send them.
-In every round each server is asked once in each condition: nothing or a busy process on every other core, llama.cpp
-with one thread and with two. `cold` reads the whole prompt, `cached` what is new since the decision before, `first` is
-the first question to a server just started. Then the fleet's decisions of one step are asked for in four ways. Times
-are from request to answer; ratios are of medians, with 95% bootstrap intervals over rounds. The processor's seconds
-are this process's, which what else the machine does changes least.
+The prompts are a mission's own, in their order, in modes `guided` (scoring: one forward pass, whose answer is the
+probabilities of single-token labels) and `llm` (generating: a sensor and a velocity under a grammar).
+In every round each server gets one request in each condition: nothing or a busy process on every other core, llama.cpp
+with one thread and with two. `cold` reads the whole prompt, `cached` only the tokens new since the decision before,
+`first` is the first request to a newly started server. Then the fleet's decisions of one step are requested in four
+ways. Times are from request to answer; ratios are of medians, with 95% bootstrap intervals over rounds. The processor's
+seconds are this process's, and other work on the machine changes them least.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ ROW, CALL, QUEUE, SLOTS = "one after the other", "one call about all", "at once,
 
 @dataclass(frozen=True)
 class Llm:
-    """Ask the embedded LLM and take the time."""
+    """Measure the embedded LLM's time for an answer."""
 
     rounds: int = 5
     """Decisions in each condition, and steps of the fleet."""
     threads: tuple[int, ...] = (1, 2)
-    """Of llama.cpp."""
+    """Threads of llama.cpp."""
     seed: int = 0
-    """Of the mission whose prompts are asked."""
+    """Scenario of the mission that gives the prompts."""
     steps: int | None = None
-    """Of that mission; unset: the scenario's."""
+    """Steps of that mission; by default the scenario's."""
     policy: Literal["mpc", "eof"] = "mpc"
-    """Who flies it: the planner, or the rule that is faster to compute."""
+    """Policy of that mission: the planner, or the rule that is faster to compute."""
     limit_s: float = 20.0
-    """Seconds after which an answer is waited for no longer; it then counts as this long."""
+    """The longest wait for an answer in seconds; a later answer counts as this long."""
     out: Path = Path("runs/llm.json")
     """Where to write the figures."""
 
 
 @dataclass
 class Line:
-    """One server and the mission's decisions that it is asked, each once, in their order."""
+    """One server, and the mission's decisions for it, each once, in their order."""
 
     way: str
     llm: LocalLLM
@@ -81,7 +81,7 @@ class Line:
         return self.llm.ask(self.body, self.limit_s)
 
     def ask_cold(self) -> Answered:
-        """The last decision again, the whole prompt read anew."""
+        """Ask for the last decision again; the server reads the whole prompt."""
         return self.llm.ask(self.body, self.limit_s, cache_prompt=False)
 
 
@@ -114,7 +114,7 @@ Times = dict[str, list[Answered]]
 
 def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
     """One UAV's decisions in every condition: ``<way> <cold|cached> <threads> <quiet|busy>``."""
-    # From here on the block of experiences is full.
+    # From this decision on the block of experiences is full.
     asked = scribe.asked[len(scribe.asked) // 3 :]
     if len(asked) < 2 * args.rounds + 1:
         raise SystemExit(f"--rounds: the mission has decisions for {(len(asked) - 1) // 2} at most")
@@ -133,7 +133,7 @@ def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -
         }
         loads = [line.llm.load_s for line in lines.values()]
         for line in lines.values():
-            # What a server without anything in its cache does first.
+            # The first request to a server with an empty cache.
             times.setdefault(f"{line.way} first", []).append(line.ask())
         for _ in track(range(args.rounds), "Asking", console=console):
             for load in (QUIET, BUSY):
@@ -147,7 +147,7 @@ def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -
 
 @contextmanager
 def neighbours(load: str) -> Iterator[None]:
-    """While it lasts a process spins on every core but one; none where it is to be quiet."""
+    """Let a process spin on every core but one for the duration of the context; none for ``quiet``."""
     command = [sys.executable, "-c", _NEIGHBOUR]
     spinning = [subprocess.Popen(command) for _ in range(max(1, usable_cores() - 1) if load == BUSY else 0)]
     try:
@@ -161,7 +161,7 @@ def neighbours(load: str) -> Iterator[None]:
 
 
 def summed(times: Times) -> dict[str, dict[str, float]]:
-    """Medians, and the tokens read anew."""
+    """Medians, and the newly read tokens."""
     return {
         name: {
             "seconds_median": statistics.median(one.seconds for one in told),
@@ -176,7 +176,7 @@ def summed(times: Times) -> dict[str, dict[str, float]]:
 
 
 def ratios(times: Times, threads: Sequence[int]) -> dict[str, list[float]]:
-    """What was asked side by side, as ratios."""
+    """Ratios of the conditions measured side by side."""
 
     def of(ours: str, theirs: str) -> list[float]:
         return ratio_of_medians([one.seconds for one in times[ours]], [one.seconds for one in times[theirs]])
@@ -203,7 +203,7 @@ def ratios(times: Times, threads: Sequence[int]) -> dict[str, list[float]]:
 def fleets(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
     """The decisions of all UAVs of a step, in mode ``guided``, by the default number of threads: seconds to the last.
 
-    Each way has a server of its own, so that each finds the step before in its cache.
+    Each way has a server of its own, so that each has the step before in its cache.
     """
     steps = whole_steps(scribe, scenario)[-args.rounds - 1 :]
     threads, uavs = Settings().embedded_threads, scenario.uavs
@@ -221,7 +221,7 @@ def fleets(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> d
                 began, cpu_began = time.perf_counter(), time.process_time()
                 answers = ask_fleet(name, models[name], bodies, together, args.limit_s, pool)
                 took, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
-                # The first step finds nothing in the cache.
+                # The first step has an empty cache.
                 if number:
                     seconds.setdefault(name, []).append(took)
                     cpu.setdefault(name, []).append(cpu_s)
@@ -245,7 +245,7 @@ def ask_fleet(
     limit_s: float,
     pool: ThreadPoolExecutor,
 ) -> list[Answered]:
-    """One step's decisions, asked for in one of the four ways."""
+    """Ask for one step's decisions in one of the four ways."""
     if name == CALL:
         return [llm.ask(together.body(), limit_s)]
     if name == ROW:
@@ -267,15 +267,17 @@ def whole_steps(scribe: Scribe, scenario: Scenario) -> list[tuple[list[dict[str,
 
 
 def tell(found: dict[str, Any], console: Console) -> None:
-    """The figures, for people."""
-    table = Table("", "s", "first token", "processor", "anew", "written", "late", title="Time to a decision, medians")
+    """Print the figures."""
+    table = Table(
+        "", "s", "first token", "processor", "newly read", "written", "late", title="Time to a decision, medians"
+    )
     for name, row in found["times"].items():
         seconds = [f"{row[column]:.3f}" for column in ("seconds_median", "first_token_s_median", "cpu_s_median")]
         table.add_row(name, *seconds, f"{row['new_mean']:.0f}", f"{row['written_mean']:.1f}", f"{row['late']:.0f}")
     console.print(table)
     for name, ratio in found["ratios"].items():
         console.print(f"{name}: {shown(ratio)}", highlight=False)
-    fleet = Table("", "s", "processor", "anew", "to one after the other", title="A fleet's step, mode guided")
+    fleet = Table("", "s", "processor", "newly read", "to one after the other", title="A fleet's step, mode guided")
     for name, row in found["fleet"].items():
         ratio = shown(row["to_one_after_the_other"])
         fleet.add_row(

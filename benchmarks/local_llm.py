@@ -1,4 +1,4 @@
-"""The embedded LLM by itself, without the edge around it: what it is asked, what it answers, and when."""
+"""The embedded LLM without the edge: its requests, its answers and their times."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import embedded_model
 from service.prompting.prompt import Prompt
 
-# Of a call that may take longer, only that it took so long is known.
+# The limit of a call; a longer one counts as this long.
 LIMIT_S = 120.0
-# llama.cpp's server hangs up after a stream without a word of it.
+# llama.cpp's server closes the connection after a stream without a token.
 _CLOSE = {"Connection": "close"}
 
 
 @dataclass(frozen=True)
 class Answered:
-    """One answer: seconds to its first token and to its last, tokens read from the prefix cache and anew, and written.
+    """One answer: seconds to its first and last token, tokens from the prefix cache, newly read and written.
 
-    ``cpu_s`` are this whole process's own meanwhile, which a busy machine changes least. ``late``: given up after the
-    limit, which then stands for the seconds.
+    ``cpu_s`` are this whole process's processor seconds, which a busy machine changes least. ``late``: the call was
+    given up at the limit, and the seconds are the limit.
     """
 
     seconds: float
@@ -43,9 +43,9 @@ class LocalLLM:
     """The embedded model, loaded as the edge loads it.
 
     Args:
-        threads: llama.cpp's.
-        context: tokens, a slot.
-        slots: requests that it takes at once.
+        threads: of llama.cpp.
+        context: tokens of a slot.
+        slots: concurrent requests.
     """
 
     def __init__(self, threads: int, context: int, slots: int = 1) -> None:

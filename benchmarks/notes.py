@@ -1,11 +1,11 @@
-"""How far an LLM understands operators' notes: 30 that no worked example repeats, compiled as the edge compiles them.
+"""An LLM's understanding of operators' notes: 30 held-out notes, compiled as the edge compiles them.
 
     python benchmarks/notes.py
 
-Prints what was understood of each, how many structures are exactly right, and by field how much of what the notes ask
-for was found and how much of what was understood is wrong; writes the same as JSON. Beside it a control without any
-LLM: the most similar worked example's orders, with this note's numbers in place of its own in the order in which they
-stand. An LLM that is no better than that has understood nothing. The LLM is the edge's: set AICVDS_LLM_URL for another.
+It prints the guidance from each note, the number of exactly right structures, and by field the orders that were found
+and the orders that are wrong; it writes the same as JSON. A control works without any LLM: the most similar worked
+example's orders, with this note's numbers in place of the example's, in their order. An LLM no better than the control
+has understood nothing. The LLM is the edge's: set AICVDS_LLM_URL for another.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FIELDS = ("visit_every", "weight", "min_velocity", "max_velocity", "forbidden_ve
 
 @dataclass(frozen=True)
 class Notes:
-    """Compile the held-out notes and compare with what they mean."""
+    """Compile the held-out notes and compare the results with their meaning."""
 
     notes: Path = NOTES
     """A JSON list of {"note": ..., "guidance": {...}}."""
@@ -46,7 +46,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Understood:
-    """One note: what it means, what was made of it, and why nothing was."""
+    """One note: its meaning, the guidance compiled from it, and the failure if there is none."""
 
     note: str
     meant: Guidance
@@ -57,7 +57,7 @@ class Understood:
 
 
 async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[Understood]]:
-    """The LLM's name and what was made of each note."""
+    """The LLM's name and the guidance compiled from each note."""
     upstream = ServerPool(settings := Settings(mode="llm"), warm_up(settings))
     upstream.start()
     while upstream.status == "loading":
@@ -79,7 +79,7 @@ async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[U
 
 
 def control(note: str) -> Guidance | None:
-    """The most similar example's orders with this note's numbers in their place; None where those do not fit."""
+    """The most similar example's orders with this note's numbers; None if the numbers do not fit."""
     example, orders = similar_examples(note, 1)[0]
     theirs, ours = numbers(example), numbers(note)
     if len(theirs) != len(ours):
@@ -92,13 +92,13 @@ def control(note: str) -> Guidance | None:
 
 
 def numbers(text: str) -> list[int]:
-    """The numbers that it names, in order."""
+    """The numbers of a text, in order."""
     named = map(number_of, re.findall(r"[a-z]+|[0-9]+", text.lower()))
     return [number for number in named if number is not None]
 
 
 def facts(guidance: Guidance | None) -> set[tuple[str, int, float]]:
-    """What a structure asks for, piece by piece: field, sensor (-1: none), value."""
+    """A structure's orders: field, sensor (-1: none), value."""
     if guidance is None:
         return set()
     asked = {("visit_every", w.sensor_id, float(w.visit_every)) for w in guidance.sensors if w.visit_every is not None}

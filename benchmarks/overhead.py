@@ -1,18 +1,18 @@
-"""What the edge adds to an LLM that answers at once, beside a bare forwarder and LiteLLM's proxy.
+"""The latency that the edge adds to an LLM that answers at once, beside a bare forwarder and LiteLLM's proxy.
 
     python benchmarks/overhead.py
 
-An LLM server that answers at once (``instant_llm.py``), and before it, each a process of its own on loopback:
+Before an LLM server that answers at once (``instant_llm.py``) there are, each a process of its own on loopback:
 (a) ``bare``, a FastAPI application that only passes the same JSON on with httpx; (b) ``litellm``, LiteLLM's proxy with
 the same prompt as a chat completion, behind its one key; (c) ``edge``, ``POST /decide`` in mode ``llm`` with everything
 on: keys, attention, prompt, token counting, checks, SQLite store, metrics, and outcomes that it learns from;
-(d) ``edge, no outcomes``: the same without them; (e) ``edge, no store``: as (c), but kept in memory only. UAVs ask as
-fast as they are answered, 3 and 64 at once, in rounds that go through all of them, so that a noisy machine is noisy for
-all. Added latency is that at the UAV less that of the LLM server asked directly by the same load generator. Prints
+(d) ``edge, no outcomes``: the same without outcomes; (e) ``edge, no store``: as (c), but in memory only. 3 and 64 UAVs
+send their next request after each answer. Every round measures all of (a) to (e), so that a noisy machine is noisy for
+all. Added latency is the latency at the UAV less that of the LLM server with the same load generator. It prints
 medians over rounds and their ratios with 95% bootstrap intervals over rounds, and writes the same as JSON. Goals: the
-edge adds at most 1.5 times what ``bare`` adds and 0.4 times what LiteLLM adds, and answers at least 0.6 and 3 times as
-many requests a second.
-LiteLLM is installed into a virtual environment of its own under runs/ the first time; --litellm none leaves it out.
+edge adds at most 1.5 times as much as ``bare`` and 0.4 times as much as LiteLLM, and answers at least 0.6 and 3 times
+as many requests a second.
+The first run installs LiteLLM into a virtual environment of its own under runs/; --litellm none omits it.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ EDGE = {
     "AICVDS_MODE": "llm",
     "AICVDS_PLANNER": "off",
     "AICVDS_LOG_LEVEL": "warning",
-    # The LLM server's first word would break a hard rule now and then, and the policy's answer would be measured.
+    # The LLM server's first alternative would sometimes break a hard rule, and the policy's answer would be measured.
     "AICVDS_VERIFY": "off",
-    # Of a busy machine the slowness is to be measured, not hidden by answers without the LLM.
+    # Answers without the LLM must not hide the slowness of a busy machine.
     "AICVDS_DEADLINE_MS": "20000",
 }
-# Each entry: of whom, at most (latency) and at least (requests a second) so many times the other's.
+# Each entry: the target, the highest ratio of latencies to it, and the lowest ratio of requests a second.
 GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0)}
 
 
@@ -63,20 +63,20 @@ class Overhead:
     """Put load on the edge, on a bare forwarder and on LiteLLM's proxy."""
 
     rounds: int = 6
-    """How often all are measured, one after the other."""
+    """Rounds; each measures all targets, one after the other."""
     seconds: float = 2.0
-    """How long each is, each time, at each number of UAVs."""
+    """Seconds of each measurement, at each number of UAVs."""
     uavs: tuple[int, ...] = (3, 64)
-    """How many ask at once."""
+    """Numbers of concurrent UAVs."""
     litellm: str = "install"
-    """`install`, the `litellm` program of your own, or `none`."""
+    """`install`, the path of a `litellm` program, or `none`."""
     out: Path = Path("runs/overhead.json")
     """Where to write the figures."""
 
 
 @dataclass
 class Uav:
-    """One UAV: it reports, is told, and reports again with the outcome of what it was told."""
+    """One UAV: it reports, gets a decision, and reports again with the decision's outcome."""
 
     number: int
     told: dict[str, Any] = field(default_factory=dict)
@@ -108,7 +108,7 @@ class Uav:
 
 @dataclass(frozen=True)
 class Target:
-    """A service under load: where, with which key, and what a UAV asks it."""
+    """A service under load: its URL, its key, and the requests of a UAV."""
 
     name: str
     port: int
@@ -117,7 +117,7 @@ class Target:
     key: str | None = None
 
     def request(self, uav: Uav) -> bytes:
-        """The whole of the UAV's next request."""
+        """The UAV's next request, with its headers."""
         body = self.body(uav)
         key = f"Authorization: Bearer {self.key}\r\n" if self.key else ""
         head = f"POST {self.path} HTTP/1.1\r\nHost: {HOST}\r\nContent-Type: application/json\r\n{key}"
@@ -138,7 +138,7 @@ async def _flies(target: Target, uav: Uav, ends: float, took_ms: list[float]) ->
             if not head.startswith(b"HTTP/1.1 200"):
                 raise SystemExit(f"{target.name}: {answer[:500].decode()}")
             uav.told = json.loads(answer)
-            # UAVs that ask at once may be answered with the same sensor, and one of them is then given another.
+            # The LLM may answer concurrent UAVs with the same sensor, and the edge then gives one of them another.
             if uav.told.get("reason") not in (None, "answer_reserved"):
                 raise SystemExit(f"{target.name}: the LLM was not heard: {uav.told['reason']}")
     finally:
@@ -181,7 +181,7 @@ def running(command: list[str], health: str, env: dict[str, str] | None = None) 
 
 
 def litellm_program(choice: str, console: Console) -> str | None:
-    """LiteLLM's program, installed if that was asked for."""
+    """LiteLLM's program, installed on request."""
     if choice == "none":
         return None
     if choice != "install":
@@ -196,7 +196,7 @@ def litellm_program(choice: str, console: Console) -> str | None:
 
 
 def _edge(settings: dict[str, str], stack: ExitStack) -> int:
-    """The port of an edge that is started, and whose LLM is ready."""
+    """Start an edge and wait for its LLM; returns its port."""
     port = usable_port(0)
     serve = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
     stack.enter_context(running(serve, f"http://{HOST}:{port}/healthz", settings))
@@ -206,7 +206,7 @@ def _edge(settings: dict[str, str], stack: ExitStack) -> int:
 
 
 def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
-    """Start everything; the LLM server itself is the first target."""
+    """Start all targets; the first is the LLM server itself."""
     llm, bare, proxy = (usable_port(0) for _ in range(3))
     python, upstream = sys.executable, f"http://{HOST}:{llm}/v1"
     stack.enter_context(running([python, str(HERE / "instant_llm.py"), "--port", str(llm)], f"{upstream}/models"))
@@ -226,7 +226,7 @@ def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
         Target("edge, no outcomes", edge, "/decide", lambda uav: uav.report(outcomes=False), key),
         Target("edge, no store", storeless, "/decide", lambda uav: uav.report(outcomes=True), key),
     ]
-    # What the edge asks is what LiteLLM is to pass on.
+    # LiteLLM is to forward the edge's own query.
     load(targets[1], [Uav(n) for n in range(FLEET)], 1.0)
     asked = httpx.get(f"http://{HOST}:{llm}/last").json()
     chat = json.dumps({"model": "instant", "messages": asked["messages"], "temperature": 0, "max_tokens": 12}).encode()
@@ -248,7 +248,7 @@ Figures = dict[str, dict[int, dict[str, list[float]]]]
 def measure(targets: list[Target], options: Overhead, console: Console) -> Figures:
     """By target, number of UAVs and quantity: one value a round."""
     found: Figures = {t.name: {n: {"p50": [], "p99": [], "rps": []} for n in options.uavs} for t in targets}
-    # Each target's UAVs go on with their missions from round to round; the edge's two kinds fly in missions apart.
+    # Each target's UAVs continue their missions from round to round; the edge's two kinds fly separate missions.
     fleets = {t.name: [Uav(999 * i + n) for n in range(max(options.uavs))] for i, t in enumerate(targets)}
     with Progress(console=console) as progress:
         task = progress.add_task("measuring", total=(options.rounds + 1) * len(targets) * len(options.uavs))
@@ -288,7 +288,7 @@ def _ratio(found: Figures, name: str, other: str, count: int, quantity: str) -> 
 
 
 def tell(rows: list[dict[str, Any]], console: Console) -> None:
-    """What each takes, and the edge's ratios with their goals."""
+    """Print each target's figures, and the edge's ratios with their goals."""
     taken = Table("UAVs", "service", "p50 ms", "p99 ms", "requests/s")
     for row in rows:
         taken.add_row(str(row["uavs"]), row["service"], *(f"{row[q]:.2f}" for q in QUANTITIES))

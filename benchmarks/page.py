@@ -1,9 +1,10 @@
-"""How smooth the mission page is: the time from frame to frame in headless Chromium, with 100 sensors and 10 UAVs.
+"""The smoothness of the mission page: the time between frames in headless Chromium, with 100 sensors and 10 UAVs.
 
     python benchmarks/page.py --seconds 20
 
-Starts an edge, opens its page, and has ten UAVs decide together ten times a second. The browser tells the times between
-its frames, and between what it drew; the same page is measured before, with nothing to draw. Prints both.
+It starts an edge, opens its page, and asks for ten UAVs' decisions ten times a second. The browser reports the times
+between its frames, and between its updates of the page. It measures the same page before, without updates, and prints
+both.
 """
 
 from __future__ import annotations
@@ -46,11 +47,11 @@ class Smoothness:
     """Measure the page's frames."""
 
     seconds: float = 20.0
-    """How long, with updates and without."""
+    """Seconds of each measurement, with updates and without."""
     sensors: int = 100
     """Sensors on the map."""
     uavs: int = 10
-    """UAVs that decide at every update."""
+    """UAVs that get a decision at every update."""
 
 
 def report(step: int, sensors: int, uavs: int) -> dict[str, Any]:
@@ -71,7 +72,7 @@ def report(step: int, sensors: int, uavs: int) -> dict[str, Any]:
 
 
 def until_up(client: httpx.Client) -> None:
-    """Wait for the edge, a minute at most."""
+    """Wait for the edge, at most a minute."""
     for _ in range(600):
         try:
             client.get("/healthz")
@@ -82,7 +83,7 @@ def until_up(client: httpx.Client) -> None:
 
 
 def fly(url: str, options: Smoothness, stop: threading.Event) -> None:
-    """Ask for the fleet's decisions, ten times a second or as often as they come."""
+    """Ask for the fleet's decisions, at most ten times a second."""
     with httpx.Client(base_url=url, timeout=60) as client:
         began, step = time.monotonic(), 1
         while not stop.is_set():
@@ -92,13 +93,13 @@ def fly(url: str, options: Smoothness, stop: threading.Event) -> None:
 
 
 def main_thread_s(session: CDPSession) -> float:
-    """Seconds that the page's main thread has computed, painting in software included; other jobs do not count."""
+    """Processor seconds of the page's main thread, painting in software included."""
     found = {one["name"]: float(one["value"]) for one in session.send("Performance.getMetrics")["metrics"]}
     return found["TaskDuration"]
 
 
 def told(name: str, page: Page, seconds: float) -> str:
-    """Measure, and say it in a line."""
+    """Measure; returns the result as a line."""
     session = page.context.new_cdp_session(page)
     session.send("Performance.enable", {"timeDomain": "threadTicks"})
     before = main_thread_s(session)
@@ -116,7 +117,7 @@ def told(name: str, page: Page, seconds: float) -> str:
 
 
 def main() -> int:
-    """Run it; returns the exit code."""
+    """Measure the page; returns the exit code."""
     options = tyro.cli(Smoothness, description=__doc__)
     console = Console()
     chromium = shutil.which("chromium")

@@ -1,10 +1,9 @@
 """The paper's own prompt, as far as it is known: every sensor in words, and the newest 30 experiences.
 
-The figure with the template was not at hand. This one has what is known of it (arXiv 2510.05698), in our own words: the
-task, the rules, the velocity strategy and the form of the answer; past decisions with what was sensed, what was decided
-and what it cost; all J sensors, with battery, queue, channel and visiting record, in about as many tokens as the paper
-states. Two choices make it shorter than it may have been: an experience tells the chosen sensor alone, and bears no
-number.
+The figure with the template was not available. This template has its known parts (arXiv 2510.05698), in our own words:
+the task, the rules, the velocity strategy and the form of the answer; past decisions with state, action and cost; all J
+sensors, with battery, queue, channel and visiting record, in about as many tokens as the paper states. Two choices make
+it shorter than the original may be: an experience names only the chosen sensor, and experiences have no numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from shared.features import State
 from shared.scenario import Scenario
 
 EXPERIENCES = 30
-# What the paper says that ten sensors take without attention.
+# The paper's number of tokens for ten sensors without attention.
 STATED_STATE_TOKENS = 213.7
 
 _STATIC = """You are an assistant at the network edge that schedules data collection for unmanned aerial vehicles \
@@ -48,7 +47,7 @@ Output: the ID of the selected sensor and the velocity, two whole numbers and no
 
 
 class PaperTemplate(Template):
-    """Puts every reported sensor to the LLM in a sentence, whatever attention or masks keep."""
+    """A prompt with a sentence for every reported sensor, without attention and masks."""
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario, experiences=EXPERIENCES)
@@ -68,14 +67,14 @@ class PaperTemplate(Template):
     def prompt(
         self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()
     ) -> Prompt:
-        """The prompt for one decision; ``kept_rows`` and ``nearest`` are not heeded."""
+        """The prompt for one decision; ``kept_rows`` and ``nearest`` are ignored."""
         whole = UnprunedState(state, lambda cells: _sentence(cells) + "\n", "Current state:\n")
         past = "Past decisions:\n" + "".join(experiences) if experiences else ""
         return Prompt(self.static, past, whole.text, whole)
 
 
 class Newest(Experiences):
-    """Always the newest, as many as there may be: the oldest goes when one is added, which moves all the others."""
+    """The newest experiences up to the limit: a new one removes the oldest, which moves all the others."""
 
     def _chosen(self, keep: int) -> list[str]:
         return self.block[-self.limit :]

@@ -1,4 +1,4 @@
-"""Ratios of medians of times taken side by side: what else a machine does slows both, and outliers count little."""
+"""Ratios of medians of times measured side by side: other work slows both, and outliers count little."""
 
 from __future__ import annotations
 

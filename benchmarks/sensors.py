@@ -1,16 +1,18 @@
-"""How the edge's own share of a decision, its memory and the wire grow with the sensors J.
+"""The growth of the edge's own share of a decision, its memory and its requests with the number of sensors J.
 
     python benchmarks/sensors.py
 
-Flies missions of 10 to 10,000 sensors in turn against real edges with a store: one of mode ``value``, which has no LLM,
-and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The share is what the edge took by its own
-clock, ``latency_ms``, less the LLM's; the round trip, less the LLM's too, has also the HTTP and the parsing. Decisions
-that fell to the LLM-free policy, as where no sensor was heard, are counted and left out. Every decision brings the last
-one's outcome, as a UAV's does; its lesson may run beside it, but earlier ones are waited for, as a UAV asks once in ten
-seconds. Then the wire: bytes of one request on each uplink (``full``, ``delta``, ``pruned``), as the clients send it,
-plain, gzip and zstd, and the time that the edge needs to unpack, to parse and to complete it, taken as the round trip
-of a request that it refuses after that, for its outcome of a decision that nobody knows; and what ``pruned`` takes
-besides, the bytes of attention's weights and the scoring on board. Prints tables, writes JSON.
+It flies missions of 10 to 10,000 sensors in turn against real edges with a store: one of mode ``value``, which has no
+LLM, and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The share is the edge's own time,
+``latency_ms``, less the LLM's. The round trip, also less the LLM's time, includes HTTP and parsing. Decisions of the
+LLM-free policy, for example without a heard sensor, are counted and omitted. Every request has the last decision's
+outcome. Its learning may run beside the next decision, but earlier learning is finished, because a UAV asks once in
+ten seconds.
+
+Then it measures requests: the bytes of one request on each uplink (``full``, ``delta``, ``pruned``), as the clients
+send it, plain, gzip and zstd, and the edge's time to unpack, parse and complete it. This time is the round trip of a
+request that the edge refuses afterwards, because its outcome is of an unknown decision. For ``pruned`` it also measures
+the bytes of the attention weights and the scoring on board. It prints tables and writes JSON.
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ from simulator.world import Observation
 
 GOALS = {"share_1000_to_10": 3.0, "share_10000_to_10": 40.0, "memory_mb": 200.0}
 UAVS = 3
-# The longest that a lesson may take.
+# The longest time for learning from one outcome.
 NO_LESSON_S = 5.0
 MODES: tuple[Mode, ...] = ("value", "llm")
 ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
@@ -70,14 +72,14 @@ class Sensors:
     steps: int = 6
     """Steps of a mission, at least 2; three UAVs decide at each."""
     rounds: int = 3
-    """Missions of each J and mode, flown in turn."""
+    """Missions of each J and mode, in turn."""
     out: Path = Path("runs/sensors.json")
     """Where to write."""
 
 
 @dataclass
 class Edge:
-    """A process, and what its decisions took: by J, one dict of milliseconds a decision."""
+    """A process, and the times of its decisions: by J, one dict of milliseconds for each decision."""
 
     mode: Mode
     url: str
@@ -86,13 +88,13 @@ class Edge:
     left_out: int = 0
 
     def peak_mb(self) -> float:
-        """The most memory that the process ever had resident."""
+        """The peak of the process's resident memory."""
         status = Path(f"/proc/{self.process.pid}/status").read_text()
         return float(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 1e3
 
 
 class Pilot(EdgePilot):
-    """Asks when every earlier lesson is over, and keeps the requests."""
+    """Asks after every earlier learning step has ended, and stores the requests."""
 
     def __init__(self, client: EdgeClient, edge: Edge, scenario: Scenario, mission_id: str) -> None:
         super().__init__(client, mission_id, scenario, 0, mode=edge.mode)
@@ -110,7 +112,7 @@ class Pilot(EdgePilot):
             if told["learner_updates"] != known:
                 known, since = told["learner_updates"], time.monotonic()
             elif time.monotonic() > since + NO_LESSON_S:
-                # A decision that the modules had no part in teaches nothing.
+                # The modules learn nothing from a decision without their part.
                 self._untaught = told["feedback"] - known
             time.sleep(0.005)
         return super().decide(uav, observation, taken)
@@ -118,7 +120,7 @@ class Pilot(EdgePilot):
 
 @contextmanager
 def instant_llm() -> Iterator[str]:
-    """An LLM that answers at once, as a process; its base URL."""
+    """Run an LLM that answers at once as a process; yields its base URL."""
     port = usable_port(0)
     script = Path(__file__).with_name("instant_llm.py")
     with subprocess.Popen([sys.executable, str(script), "--port", str(port)]) as process:
@@ -142,7 +144,7 @@ def edge_of(mode: Mode, folder: Path, llm: str) -> Iterator[Edge]:
 
 
 def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest]:
-    """Fly one mission, note what its decisions took, and forget it; returns its requests."""
+    """Fly one mission, note the times of its decisions, and delete it; returns its requests."""
     scenario = Scenario(sensors=sensors, steps=steps)
     with EdgeClient(edge.url, timeout_s=60) as client:
         pilot = Pilot(client, edge, scenario, name)
@@ -160,7 +162,7 @@ def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest
 
 
 def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) -> dict[str, Any]:
-    """Bytes and milliseconds of one request, as each uplink sends it after the one before, by encoding."""
+    """Bytes and milliseconds of one request on each uplink, after an earlier one, by encoding."""
     name = f"wire-{len(now.sensors.id)}"
     unknown = Outcome(decision_id="0" * 32, cost=0.0)
     before = before.model_copy(update={"mission_id": name, "outcome": None})

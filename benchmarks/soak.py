@@ -1,16 +1,16 @@
-"""A long flight of 200 missions against one edge: do its memory, tasks, connections and files stay what they are?
+"""A long flight of 200 missions against one edge: do its memory, tasks, connections and files stay bounded?
 
     python benchmarks/soak.py --minutes 60
 
-Starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided`` at
-once, with outcomes, request keys, retries and now and then a deleted mission. What a mission remembers is bounded, and
-full after some 300 outcomes. The resident memory goes up after that as a highest mark does, ever more seldom: so the
-edge is first flown as fast as it can, for 900 outcomes of every mission (300 of those that ask the LLM). Then it is
-flown at the pace of the paper's world, a step of every mission in 10 s, and measured after 4 minutes of that;
-``--pace-s 0`` measures it as fast as it can. Told are the slope of the resident memory, by least squares over medians
-of 20 parts (an LLM's call takes 8 MB and gives them back), with its 95% interval, the first and last count of
-tasks, connections and open files, and who decided in mode ``guided``. Prints it, and writes the same as JSON.
-``--guided 0`` shows the edge without the LLM's own memory.
+It starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided``
+at the same time, with outcomes, request keys, retries and sometimes a deleted mission. A mission's memory is bounded,
+and full after some 300 outcomes. The resident memory is a peak, and rises ever more seldom after that. So the edge
+first flies at full speed, for 900 outcomes of every mission (300 of those that ask the LLM). Then it flies at the pace
+of the paper's world, a step of every mission in 10 s, and the measurement begins after 4 minutes of that pace;
+``--pace-s 0`` measures at full speed. The results are the slope of the resident memory, by least squares over medians
+of 20 parts (an LLM's call takes 8 MB and returns them), with its 95% interval, the first and last count of
+tasks, connections and open files, and the sources of mode ``guided``'s decisions. It prints them, and writes the same
+as JSON. ``--guided 0`` shows the edge without the LLM's own memory.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from simulator.client import EdgeClient
 from simulator.flying.local_edge import HOST, usable_port
 
 MISSIONS, UAVS, SENSORS = 200, 3, 10
-# Outcomes of each mission before it is measured, by mode.
+# Outcomes of each mission before the measurement, by mode.
 WARM = {"value": 900, "guided": 300}
-# At the pace at which it is measured, before it is: what was freed when it slowed down comes into use again.
+# Seconds at the measurement's pace before the measurement, in which memory freed by the slower pace is used again.
 SETTLE_S = 240.0
 SAMPLE_S = 2.0
 WORKERS = 3
@@ -55,18 +55,18 @@ class Soak:
     """Fly 200 missions and watch the edge's memory."""
 
     minutes: float = 10.0
-    """How long to measure, once all is warm."""
+    """Minutes of the measurement, after the warm-up."""
     pace_s: float = 10.0
-    """Seconds in which every mission flies a step while it is measured; 0: as fast as it can."""
+    """Seconds in which every mission flies a step during the measurement; 0: full speed."""
     guided: int = 2
-    """Of the missions, how many are flown in mode guided, with the embedded LLM; with 0 none is loaded."""
+    """Missions of mode guided, with the embedded LLM; 0 loads no LLM."""
     out: Path = Path("runs/soak.json")
     """Where to write the figures."""
 
 
 @dataclass
 class Mission:
-    """One fleet's place in its flight."""
+    """One fleet's progress in its flight."""
 
     name: str
     mode: str
@@ -77,7 +77,7 @@ class Mission:
 
 @dataclass
 class Sample:
-    """What the edge's process held at one time."""
+    """The resources of the edge's process at one time."""
 
     at_s: float
     resident_mb: float
@@ -116,7 +116,7 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         try:
-            # Given up before the edge does, which keeps an idle connection for 5 s.
+            # Shorter than the edge's 5 s for an idle connection.
             limits = httpx.Limits(keepalive_expiry=2.0)
             with httpx.Client(base_url=self._url, timeout=60, limits=limits) as client:
                 while not self.over:
@@ -152,7 +152,7 @@ class Worker(threading.Thread):
 
 
 def sample(url: str, process: psutil.Process, began: float) -> Sample:
-    """What the process holds now."""
+    """The process's present resources."""
     lines = httpx.get(f"{url}/metrics", timeout=30).text.splitlines()
     tasks = next(float(line.split()[1]) for line in lines if line.startswith("aicvds_tasks "))
     return Sample(
@@ -168,7 +168,7 @@ def sample(url: str, process: psutil.Process, began: float) -> Sample:
 def slope(samples: list[Sample]) -> tuple[float, float]:
     """Megabytes an hour of the resident memory, and half of its 95% interval, by least squares over 20 medians.
 
-    Successive samples are alike, so that the interval of all of them would be too narrow.
+    Successive samples are similar, so the interval of all samples would be too narrow.
     """
     parts = np.array_split(np.array([[s.at_s / 3600, s.resident_mb] for s in samples]), min(20, len(samples)))
     hours, megabytes = np.array([np.median(part, axis=0) for part in parts]).T
@@ -177,7 +177,7 @@ def slope(samples: list[Sample]) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Returns 0 where nothing grows."""
+    """Run the soak test; returns 0 if nothing grows."""
     options, console = tyro.cli(Soak, description=__doc__), Console()
     missions = [Mission(f"soak{n}", "guided" if n < options.guided else "value") for n in range(MISSIONS)]
     with tempfile.TemporaryDirectory() as folder:

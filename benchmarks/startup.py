@@ -1,13 +1,13 @@
-"""How long starting takes: `aicvds serve` beside importing what it is made of, and `--help` of every command.
+"""The time to start: `aicvds serve` beside the imports of its parts, and `--help` of every command.
 
     python benchmarks/startup.py --rounds 10
 
-A round measures each by the clock, from the start of a process: `python -c "import torch, fastapi"`; `aicvds serve` in
-its ordinary configuration (SQLite, mode guided, planner, the embedded LLM loading beside) until /healthz answers 200;
-the same until a decision that is asked for at once is answered; `aicvds --help`, and every command's. Prints medians,
-and the ratio of /healthz to the imports with its 95% bootstrap interval over rounds; writes the same as JSON. Rounds
-are interleaved, so that what else the machine does meets all alike. A round before the first counts for nothing: it
-compiles, warms the disk's cache and makes the store, so what is measured is an edge that starts again.
+A round measures by the clock, from the start of a process: `python -c "import torch, fastapi"`; `aicvds serve`
+in its ordinary configuration (SQLite, mode guided, planner, the embedded LLM loading) until /healthz answers 200;
+the same until the answer to a decision requested at once; `aicvds --help`, and every command's. It prints medians,
+and the ratio of /healthz to the imports with its 95% bootstrap interval over rounds, and writes the same as JSON.
+Rounds are interleaved, so that other work on the machine affects all. A warm-up round does not count: it
+compiles, fills the disk's cache and makes the store, so the benchmark measures a repeated start.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ IMPORTS, HEALTHZ, DECIDE, HELP = "import torch, fastapi", "serve: /healthz", "se
 
 @dataclass(frozen=True)
 class Startup:
-    """Start everything again and again, in turns."""
+    """Start everything repeatedly, in turns."""
 
     rounds: int = 10
-    """Times that each is started."""
+    """Measured starts of each."""
     out: Path = Path("runs/startup.json")
     """Where to write."""
 
@@ -85,14 +85,14 @@ def main(args: Startup) -> int:
 
 
 def _ordinary(store: Path) -> dict[str, str]:
-    """This environment without its settings, but for where the model lies, and with a store of its own."""
+    """This environment without its settings, except the model's folder, and with a store of its own."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(("AICVDS_", "OTEL_"))}
     env |= {name: os.environ[name] for name in ("AICVDS_CACHE_DIR",) if name in os.environ}
     return env | {"AICVDS_STORE": str(store)}
 
 
 def _timed(env: dict[str, str]) -> dict[str, Callable[[], float]]:
-    """What a round starts, in order; each returns seconds."""
+    """The starts of a round, in order; each returns seconds."""
     commands = sorted(entry.name for entry in entry_points(group="aicvds.commands"))
     helps = [[HELP], *([command, HELP] for command in commands)]
     return {
@@ -104,34 +104,34 @@ def _timed(env: dict[str, str]) -> dict[str, Callable[[], float]]:
 
 
 def _request() -> dict[str, object]:
-    """The first of a new mission, so that none has to be read back; patient, so that a busy machine refuses none."""
+    """The first request of a new mission, which is not in the store, with a deadline that a busy machine can meet."""
     return {**STATE, "step": 0, "mission_id": uuid.uuid4().hex, "deadline_ms": 60_000}
 
 
 def _ended(command: list[str], env: dict[str, str]) -> float:
-    """Seconds of a process from its start to its end."""
+    """Seconds from the start of a process to its end."""
     began = time.perf_counter()
     subprocess.run(command, env=env, stdout=subprocess.DEVNULL, check=True)
     return time.perf_counter() - began
 
 
 def _served(env: dict[str, str], ask: Callable[[httpx.Client], httpx.Response]) -> float:
-    """Seconds from the start of an edge to its answer to a request that is sent as soon as there is a port."""
+    """Seconds from the start of an edge to its answer to a request sent as soon as it has a port."""
     with _edge(env) as (client, began):
         ask(client).raise_for_status()
         return time.perf_counter() - began
 
 
 def _llm(env: dict[str, str]) -> str:
-    """What an edge says of its LLM."""
+    """The state of an edge's LLM."""
     with _edge(env) as (client, _):
         return str(client.get("/readyz").json()["llm"])
 
 
 @contextmanager
 def _edge(env: dict[str, str]) -> Iterator[tuple[httpx.Client, float]]:
-    """A client of an edge that has just told its port, and when its process was started."""
-    # Made beforehand: what it costs the client to get ready is not the edge's.
+    """A client of an edge that has just printed its port, and the time of the process's start."""
+    # The client is made before the start, so that its own start does not count.
     with httpx.Client(timeout=120, trust_env=False) as client:
         began = time.perf_counter()
         command = [AICVDS, "serve", "--port", "0"]

@@ -1,14 +1,15 @@
-"""Tokens a decision against the paper's own template, what they cost in time and quality, and what a compressor would.
+"""Tokens of a decision beside the paper's own template, their cost in time and quality, and a compressor's.
 
     python benchmarks/tokens.py
-    python benchmarks/tokens.py --seeds 30 --asked 3    # more decisions put to the LLM: narrower intervals
+    python benchmarks/tokens.py --seeds 30 --asked 3    # more decisions for the LLM: narrower intervals
 
-Flies missions by a planner and puts every decision to an LLM in several ways: as the edge does in its modes, and as the
-paper does, with all sensors in words and 30 experiences (`paper_template.py` says how far that is known). Counts whole
-prompts in tiktoken's o200k_base and in the embedded model's own tokens, and those read anew where a server keeps the
-prompt before. Some decisions from the middle of each mission are put to the embedded model: time, what its server says
-of its cache, and the answers, which the edge's critic judges. Last, whether a compressor of LLMLingua-2's size pays.
-Intervals are 95% bootstrap intervals over missions (tokens), decisions (quality) or pairs (times).
+It flies missions by a planner and makes the prompts of every decision in several forms: those of the edge's modes, and
+the paper's, with all sensors in words and 30 experiences (`paper_template.py` says which parts of it are known). It
+counts whole prompts in tiktoken's o200k_base and in the embedded model's own tokens, and the newly read tokens of a
+server that has the prompt before in its cache. The embedded model answers some decisions from the middle of each
+mission: the benchmark measures time, the server's own account of its cache, and the answers' quality by the edge's
+rollout evaluator. Last, it measures whether a compressor of LLMLingua-2's size pays. Intervals are 95% bootstrap
+intervals over missions (tokens), decisions (quality) or pairs (times).
 """
 
 from __future__ import annotations
@@ -43,11 +44,11 @@ from shared.scenario import Scenario, scenario_named
 from simulator.experiments.intervals import interval, paired
 
 GOAL_PROMPT, GOAL_NEW = 0.5, 0.15
-# Ways whose answers are judged: each answers with a sensor and a velocity, or with a letter for both.
+# The forms with judged answers: an answer is a sensor and a velocity, or a letter for both.
 JUDGED = (GUIDED, LLM, PAPER)
-# What answers are compared with: uniform draws among all sensors that may be named, and among those attention keeps.
+# The comparisons of the answers: uniform draws among all sensors of a prompt, and among those that attention keeps.
 _DRAWN, _DRAWN_KEPT = "drawn", "drawn_among_kept"
-# Prefill speeds for which it is reckoned whether compression pays, tokens a second.
+# Prefill speeds, tokens a second, for which the benchmark computes whether compression pays.
 SPEEDS = (50, 200, 1_000, 10_000)
 _COUNTS = ("o200k", "own", "new")
 # By o200k_base: the whole prompt and its blocks, as the edge's token accounting calls them.
@@ -63,19 +64,19 @@ class Tokens:
     first: int = 0
     """The first seed."""
     asked: int = 1
-    """Decisions of each mission's middle that are put to the embedded LLM, after one more that fills its cache."""
+    """Decisions from each mission's middle for the embedded LLM, after one more that fills its cache."""
     policy: Literal["mpc", "eof"] = "mpc"
-    """Who flies: the planner, or the rule that is faster to compute."""
+    """Policy of the missions: the planner, or the rule that is faster to compute."""
     scenario: str = "paper"
-    """Their scenario."""
+    """Scenario of the missions."""
     steps: int | None = None
-    """Of each mission; unset: the scenario's."""
+    """Steps of each mission; by default the scenario's."""
     threads: int = 1
-    """Of the embedded LLM and of the compressor alike."""
+    """Threads of the embedded LLM and of the compressor."""
     encoders: Literal["real", "tiny"] = "real"
     """Sizes of the compressors; `tiny` only shows that the benchmark runs."""
     repeats: int = 3
-    """Times that a compressor reads a window."""
+    """Repetitions of a compressor's window."""
     out: Path = Path("runs/tokens.json")
     """Where to write the figures."""
 
@@ -112,7 +113,7 @@ def main(args: Tokens) -> int:
 
 
 def counted(flights: Sequence[Sequence[Asked]], llm: LocalLLM, console: Console) -> dict[str, dict[str, list[float]]]:
-    """By way and count one mean a mission: tokens by o200k_base, by the model, and those not in the prompt before."""
+    """By form and count one mean for each mission: tokens by o200k_base, by the model, and not in the prompt before."""
     counter = TokenCounter(Settings().cache_dir)
     means: dict[str, dict[str, list[float]]] = {way: {count: [] for count in (*_COUNTS, *_BLOCKS)} for way in WAYS}
     for flight in track(flights, "Counting", console=console):
@@ -129,13 +130,13 @@ def counted(flights: Sequence[Sequence[Asked]], llm: LocalLLM, console: Console)
 
 
 def anew(now: Sequence[int], before: Sequence[int]) -> int:
-    """Tokens that a server reads which kept the prompt before; the last one always."""
+    """Tokens that a server reads newly, with the prompt before in its cache; always at least the last one."""
     same = next((i for i, (a, b) in enumerate(zip(now, before, strict=False)) if a != b), min(len(now), len(before)))
     return len(now) - min(same, len(now) - 1)
 
 
 def token_figures(counts: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
-    """Means and ratios to the paper's, by way; ``new_to_whole`` is to the paper's without any prefix cache."""
+    """Means and ratios to the paper's, by form; ``new_to_whole`` is to the paper's without any prefix cache."""
     theirs = counts[PAPER]
     found: dict[str, Any] = {}
     for way, ours in counts.items():
@@ -154,9 +155,9 @@ def _ratio(ours: Sequence[float], theirs: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class Told:
-    """One answer to one way of putting a decision; ``reckoned``: the tokens that were to be read anew.
+    """One answer to one form of a decision; ``reckoned``: the expected number of newly read tokens.
 
-    That is None for the first of each mission, which finds another mission's prompt in the cache.
+    It is None for the first answer of each mission, when the cache has another mission's prompt.
     """
 
     asked: Asked
@@ -167,7 +168,7 @@ class Told:
 def put(
     flights: Sequence[Sequence[Asked]], scenario: Scenario, args: Tokens, console: Console
 ) -> dict[str, list[Told]]:
-    """Decisions put to the embedded LLM in each of ``JUDGED``, side by side, each with a server of its own."""
+    """Ask the embedded LLM for decisions in each form of ``JUDGED``, side by side, each with a server of its own."""
     middles = [(i > 0, asked) for flight in flights for i, asked in enumerate(middle(flight, args.asked + 1))]
     answers: dict[str, list[Told]] = {way: [] for way in JUDGED}
     before: dict[str, list[int]] = {}
@@ -183,12 +184,12 @@ def put(
 
 
 def middle(flight: Sequence[Asked], count: int) -> Sequence[Asked]:
-    """So many decisions in a row, from the middle on, when there are 30 experiences; fewer where there are fewer."""
+    """Consecutive decisions from the middle on, with 30 experiences; fewer if the mission is shorter."""
     return flight[len(flight) // 2 :][:count]
 
 
 def asked_figures(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, Any]:
-    """What was measured of the decisions that were put to the LLM: time, tokens read anew, expected losses."""
+    """The measurements of the LLM's decisions: time, newly read tokens, expected losses."""
     lost = judged(answers, scenario)
     warm = {way: [one for one in told if one.reckoned is not None] for way, told in answers.items()}
     paper_s = [one.answered.seconds for one in warm[PAPER]]
@@ -211,7 +212,7 @@ def asked_figures(answers: dict[str, list[Told]], scenario: Scenario) -> dict[st
 def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list[float]]:
     """Packets that the fleet is expected to lose after each answer above the best one, and after uniform draws.
 
-    Judged are all sensors that may be named at all velocities. An answer that is none loses what a draw would.
+    The candidates are all sensors of the prompt at all velocities. An invalid answer loses as much as a draw.
     """
     lost: dict[str, list[float]] = {way: [] for way in (*answers, _DRAWN, _DRAWN_KEPT)}
     for rows in zip(*answers.values(), strict=True):
@@ -231,7 +232,7 @@ def judged(answers: dict[str, list[Told]], scenario: Scenario) -> dict[str, list
 
 
 def action(way: str, asked: Asked, answered: Answered, levels: int) -> Action | None:
-    """The sensor and velocity that an answer means."""
+    """The sensor and velocity of an answer."""
     put = asked.ways[way]
     if put.offer is not None:
         return put.offer.actions[put.offer.labels[answered.text]] if answered.text in put.offer.labels else None
@@ -244,13 +245,13 @@ def action(way: str, asked: Asked, answered: Answered, levels: int) -> Action | 
 def compressing(
     last: Asked, scenario: Scenario, args: Tokens, console: Console
 ) -> tuple[dict[str, list[float]], list[float]]:
-    """Seconds for a window by compressor, and seconds a token of reading by the embedded LLM, taken side by side."""
+    """Seconds of a window by compressor, and the embedded LLM's seconds to read a token, measured side by side."""
     sizes: Sequence[Size] = (SMALL, LARGE) if args.encoders == "real" else (TINY,)
     encoders = {size.label: Compressor(size) for size in sizes}
     window: dict[str, list[float]] = {label: [] for label in encoders}
     read_s: list[float] = []
     body = last.ways[PAPER].body(scenario.max_velocity + 1)
-    # About a window long: the static block, and hardly more.
+    # About one window: the static block, and little more.
     body["messages"] = [body["messages"][0], {"role": "user", "content": "Current state: none"}]
     with LocalLLM(args.threads, CONTEXT) as llm:
         for _ in track(range(args.repeats), "Compressing", console=console):
@@ -266,7 +267,7 @@ def compression_figures(
 ) -> dict[str, Any]:
     """Seconds spent to seconds saved, and the prefill speed below which compression pays.
 
-    An encoder's time is measured on one window; that of a prompt is reckoned from it, evenly.
+    An encoder's time is measured on one window; a prompt's time is proportional to it.
     """
     prompt, speed = tokens[PAPER]["own"]["mean"], 1 / statistics.median(read_s)
     reckoned_s = {f"{way}, cached": tokens[way]["new"]["mean"] / speed for way in (GUIDED, LLM, PAPER)}
@@ -297,9 +298,9 @@ def compression_figures(
 
 
 def tell(found: dict[str, Any], console: Console) -> None:
-    """The figures, for people."""
+    """Print the figures."""
     table = Table(
-        "", "o200k", "own", "read anew", "to paper's: whole", "read anew", "to its whole", title="Tokens a decision"
+        "", "o200k", "own", "newly read", "to paper's: whole", "newly read", "to its whole", title="Tokens a decision"
     )
     for way, label in WAYS.items():
         row = found["tokens"][way]
@@ -327,7 +328,7 @@ def tell(found: dict[str, Any], console: Console) -> None:
             highlight=False,
         )
     for label, seconds in found["compression"]["seconds_to_read_reckoned"].items():
-        console.print(f"reading {label}: {seconds:.2f} s, reckoned", highlight=False)
+        console.print(f"reading {label}: {seconds:.2f} s, computed", highlight=False)
     attention = found["compression"]["attention"]
     console.print(
         f"attention: {attention['ms_median']:.3f} ms for {attention['tokens_saved']:.1f} tokens; pays below "

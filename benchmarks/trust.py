@@ -1,11 +1,11 @@
-"""Whether a good LLM comes to be trusted within one mission: the planner off, and an LLM that answers as it would.
+"""Whether trust finds a good LLM within one mission: no planner, and an LLM that answers as the planner would.
 
     python benchmarks/trust.py --seeds 30
 
-Flies every world twice over HTTP: by the edge's planner (mode `policy`), and in mode `guided` without it, where the
-LLM's place is taken by one that names what the planner would do, as far as it is offered. Prints what both lose with
-95% bootstrap intervals over worlds, their ratio, and the LLM's weight among the advisers as a mission goes on; writes
-the same as JSON. Goal: at most 1.10 times the planner. One world takes some ten seconds.
+It flies every world twice over HTTP: by the edge's planner (mode `policy`), and in mode `guided` without the planner
+and with an LLM that names the planner's action, if that is a candidate. It prints the losses of both with
+95% bootstrap intervals over worlds, their ratio, and the LLM's weight among the advisers in the course of a mission; it
+writes the same as JSON. Goal: at most 1.10 times the planner's losses. One world takes some ten seconds.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from simulator.sites.site import Site
 from simulator.world import Observation
 
 GOAL = 1.10
-# Of the probability, what the LLM leaves to the other letters.
+# The probability of all other letters together.
 _DOUBT = 0.05
 
 
@@ -55,19 +55,19 @@ class Trusted:
     first: int = 0
     """The first seed."""
     scenario: str = "paper"
-    """Their scenario."""
+    """Scenario of the worlds."""
     out: Path = Path("runs/trust.json")
     """Where to write the figures."""
 
 
 class Echo:
-    """An LLM's advice without an LLM: for ``answer``, or for the candidate nearest to it."""
+    """A stand-in for the LLM that advises ``answer``, or the candidate nearest to it."""
 
     def __init__(self) -> None:
         self.answer: tuple[int, int] = (0, 0)
 
     async def ask(self, mission: Mission, offer: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
-        """Nearly sure of the velocity nearest to the answer's for its sensor; of the first letter without it."""
+        """Nearly all probability for the answer's sensor at the nearest velocity, or else for the first letter."""
         sensor, velocity = self.answer
         letters = list(offer.labels)
         there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
@@ -77,7 +77,7 @@ class Echo:
 
 
 class Pilot(EdgePilot):
-    """Lets a planner of its own hear what the edge hears, and gives its answer to the LLM before the edge asks it."""
+    """Gives the edge's reports to a planner of its own, and the planner's action to the LLM before the edge asks."""
 
     def __init__(self, client: EdgeClient, scenario: Scenario, seed: int, echo: Echo) -> None:
         super().__init__(client, f"echo-{seed}", scenario, seed)
@@ -133,7 +133,7 @@ def main(args: Trusted) -> int:
     trust: list[list[float]] = []
     with edge() as (url, engine):
         echo = Echo()
-        # In the place of the method that asks an LLM about one UAV.
+        # It replaces the method that asks an LLM about one UAV.
         setattr(engine.queries, "ask", echo.ask)  # noqa: B010
         for seed in track(seeds, "Flying", console=console):
             lost["planner"].append(flown(url, site, seed, echo, "policy")[0])

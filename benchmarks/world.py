@@ -1,10 +1,10 @@
-"""How fast the world is: a batch of worlds in numpy beside single ones, on one core.
+"""The speed of the world: a batch of worlds in numpy beside single worlds, on one core.
 
     python benchmarks/world.py --worlds 1024
 
-Prints world steps a second (one step of one world counts as one) of both, their ratio, and what drawing a world costs;
-writes the same as JSON. Random actions. Seconds are the process's own on its core, not the clock's, and the best of
-several rounds counts: whatever else the machine does only slows.
+It prints world steps a second (one step of one world counts as one) of both, their ratio, and the time to draw a world;
+it writes the same as JSON. The actions are random. Seconds are the process's own on its core, not the clock's, and the
+best of several rounds counts, because other work on the machine can only slow a round.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ GOAL_BATCH, GOAL_SINGLE = 300_000, 5_000
 
 @dataclass(frozen=True)
 class World:
-    """Step a batch of worlds and single ones, and compare."""
+    """Step a batch of worlds and single worlds, and compare."""
 
     worlds: int = 1024
     """Worlds in the batch, B."""
     scenario: str = "paper"
-    """Their scenario."""
+    """Scenario of the worlds."""
     rounds: int = 5
-    """Missions of the batch, and ten times as many single ones; the fastest counts."""
+    """Missions of the batch, and ten times as many single missions; the fastest counts."""
     out: Path = Path("runs/world.json")
     """Where to write."""
 

@@ -1,7 +1,7 @@
-"""Run while the edge's image is built, in it, and by `make release`: nothing that an edge needs may be missed.
+"""Check of an installed edge: the build of the edge's image and `make release` run it.
 
-Starts the edge as the image does, has every mode decide with its LLM, its planner and a store, lets it learn, and
-fetches the mission page.
+It starts the edge as the image does, asks for decisions in every mode with the LLM, the planner and a store, waits
+until the edge has learned, and downloads the mission page.
 """
 
 import importlib
@@ -20,8 +20,8 @@ MODES = ("policy", "value", "guided")
 
 
 def main() -> None:
-    """Raise where anything fails."""
-    # Imported where a setting asks for them.
+    """Raise an error if anything fails."""
+    # The edge imports these only for some settings.
     for extra in ("psycopg", "opentelemetry.exporter.otlp.proto.http.trace_exporter"):
         importlib.import_module(extra)
     with tempfile.TemporaryDirectory() as folder:
@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def decide(url: str) -> None:
-    """A short mission in each mode."""
+    """Fly a short mission in each mode."""
     begun = time.monotonic()
     while (llm := asked(f"{url}/readyz")["llm"]) != "ready":
         assert llm == "loading" and time.monotonic() < begun + LLM_S, f"the LLM is {llm}"
@@ -64,7 +64,7 @@ def decide(url: str) -> None:
 
 
 def show(url: str) -> None:
-    """The mission page, with all that it names."""
+    """Download the mission page and its files."""
     page = fetched(f"{url}/").decode()
     parts = re.findall(r'(?:src|href)="(static/[^"]+)"', page)
     assert parts, page
@@ -73,14 +73,14 @@ def show(url: str) -> None:
 
 
 def asked(url: str, body: object = None, method: str | None = None) -> dict:
-    """The answer, as JSON."""
+    """The edge's answer, from JSON."""
     content = None if body is None else json.dumps(body).encode()
     request = urllib.request.Request(url, content, {"Content-Type": "application/json"}, method=method)
     return json.loads(fetched(request))
 
 
 def fetched(request: str | urllib.request.Request) -> bytes:
-    """What comes back, by no proxy."""
+    """The body of the answer; the request uses no proxy."""
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=90) as answer:
         return answer.read()
 

@@ -1,4 +1,4 @@
-# The edge: the decision service, its LLM and its token vocabulary. At run time it fetches nothing.
+# The edge: the decision service, its LLM and its token vocabulary. At run time it downloads nothing.
 #   docker build -f docker/edge.Dockerfile -t aicvds-edge .
 #   docker run --rm -p 127.0.0.1:8000:8000 -e AICVDS_ANONYMOUS=on aicvds-edge
 #
@@ -11,17 +11,18 @@ ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=igno
 WORKDIR /src
 RUN python -m venv /opt/aicvds
 COPY constraints.txt ./
-# Torch alone from its own index; what it requires comes with the rest, from the ordinary one.
+# Only torch comes from its own index; its requirements come from the ordinary one, below.
 ARG TORCH_INDEX=""
 RUN pip install --no-deps ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$(grep '^torch==' constraints.txt)"
 COPY pyproject.toml ./
-# No source yet, so this installs an empty aic-vds with all that it requires, and outlives every edit of the source.
-# Torch's C++ headers and test programs are a fifth of it, and nothing here compiles. OR-Tools brings pandas.
+# Without the source, this installs an empty aic-vds with all its requirements, and the layer stays valid after every
+# edit of the source. Torch's C++ headers and test programs are a fifth of it, and the image compiles nothing. OR-Tools
+# requires pandas.
 RUN touch README.md LICENSE \
  && pip install --constraint constraints.txt '.[service,planner,otel,postgres]' \
  && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test pandas/tests
 
-# These files alone, so that an edit elsewhere does not bring the model again.
+# Only these files, so that an edit elsewhere does not download the model again.
 FROM dependencies AS model
 COPY shared/ shared/
 COPY service/__init__.py service/
@@ -35,16 +36,16 @@ FROM dependencies AS application
 COPY README.md LICENSE ./
 COPY shared/ shared/
 COPY service/ service/
-# `make release` says which version this is: git is not in here, and would make every commit a build of its own above.
+# `make release` passes the version: there is no git here, and with git every commit would rebuild the layers above.
 ARG VERSION=""
 RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_AIC_VDS=$VERSION pip wheel --no-deps --wheel-dir /wheels .
 
-# What a running edge never opens, as docker/check_edge.py proves below:
-# - symbol tables of shared libraries (237 MB: 89 torch's, 80 llama.cpp's), which serve debuggers. Not of those in
-#   *.libs: the wheels' makers have moved their parts about, and strip breaks them;
+# This stage removes files that a running edge never opens, as docker/check_edge.py proves below:
+# - symbol tables of shared libraries (237 MB: 89 torch's, 80 llama.cpp's), which only debuggers need. The libraries in
+#   *.libs stay: their wheels rearranged them, and strip breaks them;
 # - the packages' own tests (90 MB);
-# - torch's compiled tests and protoc (52 MB). It does not start without torch_shm_manager.
-# Bytecode (__pycache__, 165 MB) stays: with a read-only root it would be made anew at every start.
+# - torch's compiled tests and protoc (52 MB). Torch does not start without torch_shm_manager.
+# Bytecode (__pycache__, 165 MB) stays: with a read-only root every start would compile it again.
 FROM dependencies AS slim
 RUN apt-get update -q && apt-get install -y -q --no-install-recommends binutils
 RUN python -m pip uninstall --quiet --yes pip \
@@ -53,10 +54,9 @@ RUN python -m pip uninstall --quiet --yes pip \
  && find . -type d -name tests -prune -exec rm -rf {} + \
  && find torch/bin -type f ! -name torch_shm_manager -delete
 
-# Layers from the largest and steadiest to the smallest: an edit of the source ships kilobytes.
+# The layers go from the largest and most stable to the smallest: an edit of the source ships kilobytes.
 FROM python:3.11-slim-bookworm
-# libgomp1: llama.cpp computes with the system's OpenMP. tini: as process 1 Python would ignore a SIGTERM that comes
-# while it is still importing.
+# libgomp1: llama.cpp uses the system's OpenMP. tini: Python as process 1 would ignore a SIGTERM during its imports.
 RUN apt-get update -q \
  && apt-get install -y -q --no-install-recommends libgomp1 tini \
  && apt-get clean && rm -rf /var/lib/apt/lists/* \
@@ -67,14 +67,14 @@ COPY --from=application /wheels /tmp/wheels
 RUN python -m pip --python /opt/aicvds/bin/python install \
     --quiet --no-cache-dir --no-index --no-deps --force-reinstall /tmp/wheels/*.whl \
  && rm -r /tmp/wheels
-# A named volume mounted here takes this owner. Without one, and with a read-only root, missions are kept nowhere.
+# A named volume mounted here takes this owner. Without a volume and with a read-only root, missions are not stored.
 RUN install --directory --owner=aicvds --group=aicvds /store
 ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none
 USER 10001:10001
 COPY docker/check_edge.py /opt/aicvds/
 RUN python /opt/aicvds/check_edge.py
 EXPOSE 8000
-# Healthy: it decides, and its LLM is no longer on its way (ready, off, or known to be unavailable).
+# Healthy: the edge decides, and its LLM is not loading any more (ready, off, or known to be unavailable).
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 CMD ["python", "-c", \
   "import json, sys, urllib.request as u; sys.exit(json.load(u.build_opener(u.ProxyHandler({})).open('http://127.0.0.1:8000/readyz', timeout=2))['llm'] == 'loading')"]
 ENTRYPOINT ["tini", "--"]

@@ -1,6 +1,6 @@
 """Equations as SVG, drawn when the pages are built: MkDocs calls this for each page (`hooks` in mkdocs.yml).
 
-A browser draws MathML well only where it finds a font for it, and scripts that draw equations come from elsewhere.
+A browser draws MathML well only with a font for it, and scripts that draw equations come from other hosts.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from xml.etree import ElementTree
 
 import ziamath
 
-# What pymdownx.arithmatex leaves in `generic` mode.
+# The output of pymdownx.arithmatex in `generic` mode.
 _INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 _BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOTALL)
 _SIZE = 17.0
-# Every drawing has its glyphs: the symbols that it would share have the same names on a page and are not the same.
+# Every drawing has its own glyphs: shared symbols would have the same names on a page and differ.
 ziamath.config.svg2 = False
 
 
@@ -30,7 +30,7 @@ def _drawn(escaped: str, inline: bool) -> str:
     latex = html.unescape(escaped).strip()
     drawing = ziamath.Latex(latex, size=_SIZE, color="currentColor", inline=inline)
     svg = drawing.svgxml()
-    # The text's baseline and the equation's are to be one.
+    # Align the equation's baseline with the text's.
     svg.set("style", f"vertical-align: {drawing.getyofst() - drawing.margin:.2f}px")
     svg.set("role", "img")
     svg.set("aria-label", latex)

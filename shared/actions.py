@@ -1,4 +1,4 @@
-"""What a UAV does in one step: the sensor that it collects from, and the velocity that it flies at."""
+"""A UAV's action in one step: the sensor that it collects from, and its velocity."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Action(NamedTuple):
-    """A sensor's ID and a velocity in m/s. It is equal to the plain pair, and stored and sent as one."""
+    """A sensor's ID and a velocity in m/s. An action equals the plain pair, and is stored and sent as a pair."""
 
     sensor_id: int
     velocity: int

@@ -1,4 +1,4 @@
-"""A dict that forgets: of too many entries, the one that was added first."""
+"""A dict of bounded weight that drops its oldest entries."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ V = TypeVar("V")
 
 
 class BoundedDict(dict[K, V], Generic[K, V]):
-    """The newest entries, in the order added; a key that is set again keeps its place.
+    """The newest entries, in the order of their addition; a key that is set again keeps its position.
 
-    Only what is set by ``[key] = value`` counts. A single entry is kept whatever it weighs.
+    Only ``[key] = value`` counts an entry's weight. A single entry stays whatever its weight.
 
     Args:
-        most: what the entries may weigh together.
-        weight: of a value; 1 of each unless given.
+        most: the largest total weight of the entries.
+        weight: returns a value's weight, by default 1.
     """
 
     def __init__(self, most: int, weight: Callable[[V], int] = lambda _: 1) -> None:
@@ -38,12 +38,12 @@ class BoundedDict(dict[K, V], Generic[K, V]):
         super().__delitem__(key)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Remove all entries."""
         super().clear()
         self._weight = 0
 
     def take(self, key: K) -> V | None:
-        """The value, which is no longer kept; None where there is none."""
+        """Remove and return the value; None if there is none."""
         value = self.get(key)
         if value is not None:
             del self[key]

@@ -34,7 +34,7 @@ def path_loss_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 
 @dataclass(frozen=True)
 class Links:
-    """Transfers at horizontal distances ``(...)``, metres, of which the path loss ``(...)``, dB, is reckoned once."""
+    """Transfers at horizontal distances ``(...)``, metres, with the path loss ``(...)``, dB, computed once."""
 
     distance_m: FloatArray
     loss_db: FloatArray
@@ -42,12 +42,12 @@ class Links:
 
     @classmethod
     def at(cls, distance_m: ArrayLike, scenario: Scenario) -> Self:
-        """Those at these distances."""
+        """The links at these distances."""
         d = np.asarray(distance_m, dtype=np.float64)
         return cls(d, path_loss_db(d, scenario), scenario)
 
     def __getitem__(self, which: Any) -> Self:
-        """Some of them, by any index that an array takes."""
+        """The links at an index, which may be any index of an array."""
         return replace(self, distance_m=self.distance_m[which], loss_db=self.loss_db[which])
 
     @property
@@ -106,7 +106,7 @@ def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.in
     """Whole packets that one step can move at that distance; 0 where the link fails."""
     d = np.asarray(distance_m, dtype=np.float64)
     packets = np.zeros(d.shape, dtype=np.int64)
-    # The path loss is what takes the time, and most of many sensors are out of every reach.
+    # The path loss takes most of the time, and of many sensors most are out of radio range.
     near = d <= scenario.radio_radius_m
     packets[near] = Links.at(d[near], scenario).packets
     return packets

@@ -1,4 +1,4 @@
-"""The ``aicvds`` command: finds its subcommands by entry point and imports only the one that is asked for."""
+"""The ``aicvds`` command: finds its subcommands by entry point and imports only the one that it runs."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ _SUMMARIES = {
     "simulate": "fly one mission against an edge, local or remote, and write its report",
     "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
     "experiment": "reproduce a figure or table of the paper, or one beyond it, over many seeds",
-    "bound": "the least that any fleet could have lost in one world, all arrivals known",
+    "bound": "the fewest packets that a fleet could have lost in one world, all arrivals known",
     "train": "train the learned baselines, MADQN and MAPPO",
     "explore": "record exploring UAVs on training worlds, for pretrain",
     "pretrain": "train the attention and velocity modules' start on what explore recorded",
     "demonstrate": "choose worked examples for the prompt from what explore recorded",
-    "replay": "ask a logged mission again of another model, prompt, k or mode",
-    "keys": "make, list and remove the keys that an edge asks for",
+    "replay": "decide a logged mission again with another model, prompt, k or mode",
+    "keys": "make, list and remove the keys for an edge",
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 
-# Of the simulator's commands, those that need more than the extra `simulator`.
+# The extra of each simulator command that needs more than the extra `simulator`.
 _EXTRAS = {"train": "marl"}
-# What only some of a command's options need, and import when they do.
+# Modules that only some options of a command import, and their extras.
 _EXTRA_OF_MODULE = {"ortools": "planner"}
-# What the extras bring and this package imports. Any other module that is missing is a mistake of ours: a traceback.
+# The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
     "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "ortools", "pettingzoo",
@@ -69,7 +69,7 @@ def main() -> int:
         return int(found[0].load()(rest) or 0)
     except ModuleNotFoundError as missing:
         module = str(missing.name).partition(".")[0]
-        # A module missing inside an installed package is no missing extra either.
+        # A module missing inside an installed package is a bug too, not a missing extra.
         if module not in _OF_EXTRAS or find_spec(module) is not None:
             raise
         extra = "service" if found[0].value.startswith("service") else _EXTRAS.get(name, "simulator")

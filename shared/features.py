@@ -1,4 +1,4 @@
-"""State augmentation: what a UAV reported, completed by what the edge knows, as arrays and features."""
+"""State augmentation: a UAV's report completed by the edge's knowledge, as arrays and features."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shared.scenario import Point, Scenario
 from shared.urgency import overflow_probability, urgency_of
 from shared.wire import Features, UavState
 
-# Numbers a sensor in each preset.
+# The number of features of a sensor in each preset.
 FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
 
 
@@ -23,10 +23,10 @@ FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
 class State:
     """One UAV's view at one step; arrays have shape ``(J,)``, ``places`` ``(J, 2)``, in the request's order.
 
-    ``progress_m`` along the trajectory, if the UAV told it; ``queue`` packets, ``battery`` J, ``gain`` dB,
+    ``progress_m`` along the trajectory, if the UAV reported it; ``queue`` packets, ``battery`` J, ``gain`` dB,
     ``rate`` packets a step, ``since_visit`` steps, ``overflow`` (the probability of one before the next visit) and
-    ``urgency`` 0..1, ``distance`` m from the UAV now. Sensors never heard (``heard`` false) hold zeros in what only a
-    beacon tells. ``reach`` only in preset ``reach``.
+    ``urgency`` 0..1, ``distance`` m from the UAV now. A sensor never heard (``heard`` false) has zeros
+    in the fields that only a beacon fills. Only preset ``reach`` has ``reach``.
     """
 
     position: Point
@@ -47,25 +47,25 @@ class State:
 
     @property
     def able(self) -> NDArray[np.bool_]:
-        """Whether each sensor was heard and has a battery."""
+        """Whether each sensor was heard and its battery is not flat."""
         return self.heard & (self.battery > 0)
 
     @property
     def overflow_risk(self) -> float:
-        """Share of the sensors heard that are expected to overflow before their next visit, 0..1; 0 of none."""
+        """Mean probability that a heard sensor overflows before its next visit, 0..1; 0 if none was heard."""
         return float(self.overflow[self.heard].mean()) if self.heard.any() else 0.0
 
     def reach_ahead(self, uav_id: int, scenario: Scenario) -> Reach:
-        """The UAV's reach after the next step, in any preset; preset ``reach`` has it already."""
+        """The UAV's reach after the next step, in any preset."""
         if self.reach is not None:
             return self.reach
         ahead = distances_ahead(uav_id, self.position, self.progress_m, self.places, scenario)
         return Reach.of(ahead, np.where(self.able, self.queue, 0.0), self.urgency, scenario)
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
-        """What attention sees of the admissible sensors, ``(n, d)``, each number 0..1.
+        """Attention's input for the n admissible sensors, ``(n, d)``, each number 0..1.
 
-        Preset ``paper``, d = 5: ``[b/E0, q/W, h normalised, delta/T, U]``. Preset ``reach``, d = 12: these and
+        Preset ``paper``, d = 5: ``[b/E0, q/W, h normalised, delta/T, U]``. Preset ``reach``, d = 12: these, and
         :meth:`Reach.sensor_features`.
         """
         best = best_gain_db(scenario)
@@ -80,14 +80,14 @@ class State:
         stacked = np.minimum(np.maximum(np.array(columns).T[self.admissible], 0.0), 1.0)
         if self.reach is not None:
             room = scenario.queue_capacity - self.queue
-            # A sensor that nothing arrives at never overflows.
+            # A sensor without arrivals never overflows.
             overflow_in = np.divide(room, self.rate, out=np.full_like(room, np.inf), where=self.rate > 0)
             added = self.reach.sensor_features(self.urgency, overflow_in, scenario)
             stacked = np.concatenate((stacked, added[self.admissible]), axis=1)
         return np.ascontiguousarray(stacked, dtype=np.float32)
 
     def approach(self, row: int, scenario: Scenario) -> NDArray[np.float32]:
-        """What the velocity scorer is told of the sensor in that row beside its context.
+        """The velocity scorer's input for the sensor in that row, beside its context.
 
         Preset ``paper``: the normalised distance, ``(1,)``. Preset ``reach``: :meth:`Reach.level_features`, ``(V, 4)``.
         """
@@ -96,7 +96,7 @@ class State:
         return np.array([self.normalised_distance(row, scenario)], dtype=np.float32)
 
     def normalised_distance(self, row: int, scenario: Scenario) -> float:
-        """Distance of the sensor in that row in radio radii, at most 2."""
+        """The distance of the sensor in that row, in radio radii, at most 2."""
         return min(float(self.distance[row]) / scenario.radio_radius_m, 2.0)
 
 
@@ -111,21 +111,21 @@ def augment(
     preset: Features = "paper",
     belief: FleetBelief | None = None,
 ) -> State:
-    """Complete a UAV's report with visiting records, urgency, and the channel from where it is now.
+    """Complete a UAV's report with visiting records, urgency, and the channel at its present position.
 
     A stale channel gain is replaced by the channel model's at the present distance: the place of a sensor does
     not change, so the model knows better than an old beacon. Admissible is a sensor heard, with a battery, and not
     reserved.
 
-    With a fleet's belief, queues and batteries are the fleet's, expected now; a sensor that nobody has heard counts as
-    heard, with the queue that is expected of it.
+    With a fleet's belief, queues and batteries are the values that the fleet expects now, and a sensor that no UAV has
+    heard counts as heard, with its expected queue.
 
     Args:
-        visits: step of each sensor's last visit (TVR_j), by sensor ID; one never visited counts from step 0.
+        visits: step of each sensor's last visit (TVR_j), by sensor ID; a sensor never visited counts from step 0.
         rates: observed arrival rates, packets a step, by sensor ID.
-        reserved: sensors that other UAVs were given this step.
-        preset: ``reach`` looks ahead along the UAV's trajectory too.
-        belief: what the fleet knows; without it, what this UAV last heard.
+        reserved: sensors that other UAVs have in this step.
+        preset: ``reach`` also looks ahead along the UAV's trajectory.
+        belief: the fleet's; without it the state has this UAV's own last beacons.
     """
     sensors = uav.sensors
     ids = np.asarray(sensors.id, dtype=np.int64)
@@ -167,6 +167,6 @@ def augment(
 
 def filled(column: Sequence[float | None], missing: float = 0.0) -> FloatArray:
     """A column as an array ``(J,)``, with ``missing`` for nulls."""
-    # numpy makes NaN of None, and the wire lets no other NaN in.
+    # numpy converts None to NaN, and the wire admits no other NaN.
     values = np.array(column, dtype=np.float64)
     return np.where(np.isnan(values), missing, values)

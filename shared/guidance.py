@@ -1,7 +1,7 @@
-"""Operator guidance: what a fleet is to heed besides losing no packets, as a structure that can be checked and obeyed.
+"""Operator guidance: a fleet's orders beside the loss of packets, as a structure that the edge can check and obey.
 
-An operator writes a note in plain words; what was understood of it is a :class:`Guidance`. Nobody obeys one that is
-not confirmed. Guidance that asks for nothing changes no number anywhere.
+An operator writes a note in plain words, and an LLM compiles it to a :class:`Guidance`. The edge obeys only confirmed
+guidance. Empty guidance changes no number anywhere.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ Level = Annotated[int, Field(ge=0, le=14)]
 MAX_WISHES = 1000
 MAX_WEIGHT = 10.0
 MAX_EVERY = 1000
-# What a step costs in which a sensor has waited longer for a visit than it was to, in lost packets: above what the
-# fullest of sensors loses in a step, so that a deadline gives way only to several sensors that overflow.
+# The cost in lost packets of each step in which a sensor is overdue. It is above the loss of the fullest sensor in one
+# step, so that a deadline gives way only to several sensors that overflow.
 LATE_PACKETS = 20.0
 
 
 class SensorWish(Received):
-    """What is asked for one sensor.
+    """The orders for one sensor.
 
-    A sensor with ``visit_every`` n is to be visited in one step of any n that follow each other.
+    With ``visit_every`` n the fleet is to visit the sensor at least once in any n consecutive steps.
     """
 
     sensor_id: SensorId
-    weight: float = Field(1.0, ge=0, le=MAX_WEIGHT, description="its lost packets count so many times; 0: not at all")
+    weight: float = Field(1.0, ge=0, le=MAX_WEIGHT, description="the factor of its lost packets; 0: they do not count")
     visit_every: int | None = Field(None, ge=1, le=MAX_EVERY, description="steps")
 
 
 class Guidance(Received):
-    """What is asked of a fleet: wishes for sensors, and the velocities that must not be flown.
+    """A fleet's orders: wishes for sensors, and forbidden velocities.
 
-    The velocities are a hard rule: neither ``forbidden_velocities`` nor any outside ``min_velocity..max_velocity`` are
-    flown, m/s. Weights and visits are weighed against each other.
+    The velocities, m/s, are a hard rule: a UAV flies none of ``forbidden_velocities`` and none outside
+    ``min_velocity..max_velocity``. Weights and visits are weighed against each other and against lost packets.
     """
 
     sensors: list[SensorWish] = Field([], max_length=MAX_WISHES, fail_fast=True)
@@ -57,24 +57,24 @@ class Guidance(Received):
         return self
 
     def __bool__(self) -> bool:
-        """Whether it asks for anything."""
+        """Whether there is any order."""
         return self.wishes or self.restricts
 
     @property
     def wishes(self) -> bool:
-        """Whether any sensor is to be treated unlike the others."""
+        """Whether any sensor has a weight or a visit deadline."""
         return any(wish.weight != 1.0 or wish.visit_every is not None for wish in self.sensors)
 
     @property
     def restricts(self) -> bool:
-        """Whether it forbids any velocity; perhaps none that the scenario has."""
+        """Whether there is a rule on velocities, even one that forbids none of the scenario's."""
         return bool(self.forbidden_velocities) or self.min_velocity is not None or self.max_velocity is not None
 
     def check(self, scenario: Scenario) -> None:
-        """Whether a fleet in this scenario can obey.
+        """Check that a fleet in this scenario can obey.
 
         Raises:
-            Impossible: an unknown sensor, a velocity that there is not, or no velocity left.
+            Impossible: a sensor is unknown, a velocity does not exist, or no velocity is left.
         """
         for row, wish in enumerate(self.sensors):
             if wish.sensor_id >= scenario.sensors:
@@ -89,34 +89,34 @@ class Guidance(Received):
             raise Impossible("forbidden_velocities", "no velocity is left to fly at")
 
     def allowed(self, levels: int) -> NDArray[np.bool_]:
-        """Which of the velocities 0..levels - 1 m/s may be flown, shape ``(levels,)``."""
+        """Which of the velocities 0..levels - 1 m/s a UAV may fly, shape ``(levels,)``."""
         level = np.arange(levels)
         fastest = levels if self.max_velocity is None else self.max_velocity
         slowest = 0 if self.min_velocity is None else self.min_velocity
         return (level >= slowest) & (level <= fastest) & ~np.isin(level, self.forbidden_velocities)
 
     def allows(self, velocity: int) -> bool:
-        """Whether this velocity may be flown."""
+        """Whether a UAV may fly this velocity."""
         slow = self.min_velocity is not None and velocity < self.min_velocity
         fast = self.max_velocity is not None and velocity > self.max_velocity
         return not (slow or fast or velocity in self.forbidden_velocities)
 
     def nearest(self, velocity: int, levels: int) -> int:
-        """The velocity of 0..levels - 1 that may be flown nearest to this one, the slower of two."""
+        """The allowed velocity of 0..levels - 1 nearest to this one, the slower of two."""
         if 0 <= velocity < levels and self.allows(velocity):
             return velocity
         choices = np.flatnonzero(self.allowed(levels))
         return int(choices[np.abs(choices - velocity).argmin()])
 
     def weights(self, sensors: int) -> FloatArray:
-        """How many times each sensor's lost packets count, shape ``(J,)``."""
+        """The factor of each sensor's lost packets, shape ``(J,)``."""
         weights = np.ones(sensors)
         for wish in self.sensors:
             weights[wish.sensor_id] = wish.weight
         return weights
 
     def every(self, sensors: int) -> FloatArray:
-        """Steps within which each sensor is to be visited, shape ``(J,)``; infinite where nobody said."""
+        """Steps within which the fleet is to visit each sensor, shape ``(J,)``; infinite without an order."""
         every = np.full(sensors, np.inf)
         for wish in self.sensors:
             if wish.visit_every is not None:
@@ -124,21 +124,21 @@ class Guidance(Received):
         return every
 
     def overdue(self, step: int, visits: NDArray[np.int64]) -> FloatArray:
-        """How long each sensor is overdue in a step in which nobody visits it, steps, shape ``(J,)``.
+        """The steps by which each sensor is overdue if no UAV visits it in this step, shape ``(J,)``.
 
-        1 where it must be visited in this very step to be on time, 0 where there is time.
+        It is 1 if a visit in this very step is just in time, and 0 if there is more time.
 
         Args:
-            visits: step of the last visit, ``(J,)``; -1 for never, which counts as just before step 0.
+            visits: step of the last visit, ``(J,)``; -1 for never, which counts as a visit just before step 0.
         """
         late: FloatArray = np.maximum(step - visits - self.every(len(visits)) + 1.0, 0.0)
         return late
 
     def lateness(self, step: int, visits: NDArray[np.int64], horizon: int, beyond: int) -> FloatArray:
-        """What a plan from ``step`` on pays for sensors left alone, packets: :attr:`FleetProblem.late`.
+        """The price of overdue sensors in a plan from ``step`` on, packets: :attr:`FleetProblem.late`.
 
-        ``late[s, e, j]`` is the price in the plan's step e, H standing for the ``beyond`` steps after it, if nobody has
-        visited sensor j since the plan's step s began.
+        ``late[s, e, j]`` is the price in the plan's step e if no UAV has visited sensor j since the plan's step s
+        began; e = H stands for the ``beyond`` steps after the plan.
 
         Args:
             visits: step of the last visit before the plan, ``(J,)``; -1 for never.
@@ -155,7 +155,7 @@ class Guidance(Received):
         return late
 
     def in_words(self) -> str:
-        """What it asks for, in plain English, from the structure alone."""
+        """The orders in plain English, from the structure alone."""
         said = []
         for wish in self.sensors:
             if wish.visit_every is not None:
@@ -176,12 +176,12 @@ class Guidance(Received):
 
 
 class Waiting:
-    """How long n sensors have waited for a visit in B copies of a world, and what that costs: for rollouts.
+    """The waiting times of n sensors in B copies of a world, and their cost: for rollouts.
 
     Args:
-        guidance: asks for the visits.
+        guidance: has the visit deadlines.
         kept: shape ``(n,)``, the sensors' IDs.
-        step: the first to be simulated.
+        step: the first simulated step.
         visits: step of the last visit by sensor ID, ``(J,)``; -1 for never.
         copies: B.
     """
@@ -193,18 +193,18 @@ class Waiting:
         self._waited = np.tile(step - visits[kept], (copies, 1))
 
     def visit(self, sensor: NDArray[np.int64], where: NDArray[np.bool_]) -> None:
-        """In the copies ``(B,)`` where that holds, this one of the n sensors ``(B,)`` is visited in this step."""
+        """Visit one sensor in this step in each copy where ``where`` holds; both have shape ``(B,)``."""
         self._waited[where, sensor[where]] = 0
 
     def end_step(self) -> FloatArray:
-        """What being late costs in this step, packets, ``(B,)``; the next step begins."""
+        """End the step; returns the cost of its overdue sensors, packets, ``(B,)``."""
         late = LATE_PACKETS * (self._waited >= self._every).sum(axis=1)
         self._waited += 1
         return np.asarray(late, dtype=np.float64)
 
 
 class Impossible(ValueError):
-    """Guidance that this fleet cannot obey; ``field`` says where."""
+    """Guidance that this fleet cannot obey; ``field`` is the field at fault."""
 
     def __init__(self, field: str, detail: str) -> None:
         super().__init__(f"{field}: {detail}")
@@ -214,30 +214,30 @@ class Impossible(ValueError):
 
 NO_GUIDANCE = Guidance()
 
-# `none`: no note, and no structure of the operator's own.
+# `none`: neither a note nor a structure of the operator's.
 GuidanceState = Literal["none", "compiling", "proposed", "confirmed", "rejected", "failed"]
 
 
 class GuidanceStatus(Wire):
-    """``GET /missions/{id}/guidance``: the operator's note, what was understood, and whether it is obeyed.
+    """``GET /missions/{id}/guidance``: the operator's note, the guidance from it, and its status.
 
-    Only what is ``confirmed`` is obeyed.
+    The edge obeys only ``confirmed`` guidance.
     """
 
     mission_id: MissionId
     status: GuidanceState
     note: str | None = None
-    guidance: Guidance | None = Field(None, description="what was understood, or given by the operator")
-    in_words: str | None = Field(None, description="the same in plain English, made from the structure alone")
-    origin: Literal["llm", "operator"] | None = Field(None, description="whose structure it is")
-    model: str | None = Field(None, description="the LLM that was asked")
-    failure: str | None = Field(None, description="why nothing could be made of the note")
+    guidance: Guidance | None = Field(None, description="compiled from the note, or given by the operator")
+    in_words: str | None = Field(None, description="the guidance in plain English, from the structure alone")
+    origin: Literal["llm", "operator"] | None = Field(None, description="the author of the structure")
+    model: str | None = Field(None, description="the LLM that compiled the note")
+    failure: str | None = Field(None, description="why the note could not be compiled")
 
 
 class GuidanceAnswer(Received):
-    """``POST /missions/{id}/guidance``: confirm or reject what was understood, or give a structure in its place.
+    """``POST /missions/{id}/guidance``: confirm or reject the compiled guidance, or replace it by a structure.
 
-    A structure given is confirmed by being given, with or without an LLM, a note, or anything understood of it.
+    A given structure counts as confirmed. It needs neither an LLM nor a note.
     """
 
     answer: Literal["confirm", "reject"] | None = None

@@ -1,4 +1,4 @@
-"""What the edge tells of its missions: where one stands, what it learned, which there are."""
+"""The edge's answers about its missions: one mission's status, its attention weights, the list of all."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shared.wire import (
 
 
 class MissionStatus(Wire):
-    """``GET /missions/{id}``; ``experiences`` is how many there are, ``prompt.experiences`` how many there can be."""
+    """``GET /missions/{id}``; ``experiences`` is their number, ``prompt.experiences`` the largest number."""
 
     mission_id: MissionId
     scenario: Scenario
@@ -30,7 +30,9 @@ class MissionStatus(Wire):
     features: Features = "paper"
     belief: Belief = "fleet"
     verify: Literal["on", "off"] = "off"
-    planner: Literal["on", "off"] = Field("off", description="`on` where it is wanted, installed, and up to the size")
+    planner: Literal["on", "off"] = Field(
+        "off", description="`on` if it is set, OR-Tools is installed, and the fleet is small enough"
+    )
     prompt: PromptStyle = PromptStyle()
     init: Init
     seed: int
@@ -51,7 +53,7 @@ class WeightArray(Wire):
 
 
 class MissionAttention(Wire):
-    """``GET /missions/{id}/attention``: what a UAV needs, beside the scenario, to score sensors as the mission does.
+    """``GET /missions/{id}/attention``: with the scenario, everything to score sensors as the mission does.
 
     ``weights`` are ``query``, ``key`` and ``value`` ``(d', d)``, ``score`` ``(1, d')`` and ``bias`` ``(1,)``, of d
     features of the preset; the scores are ``softmax(Q K^T / sqrt(d')) V w + b`` with ``Q = X W_q^T`` and so on.
@@ -60,13 +62,13 @@ class MissionAttention(Wire):
     mission_id: MissionId
     features: Features
     belief: Belief
-    top_k: int = Field(description="sensors that the mission offers: all of them where it goes without attention")
-    updates: int = Field(description="outcomes that the weights were learned from, since the mission began")
+    top_k: int = Field(description="sensors that the mission offers; without attention, all of them")
+    updates: int = Field(description="outcomes that the weights have learned from since the mission began")
     weights: list[WeightArray]
 
 
 class MissionLine(Wire):
-    """One mission of the list. Of one that is only in the store, no more than its name is known."""
+    """One mission of the list. For a mission that is only in the store, only its ID is known."""
 
     mission_id: MissionId
     mode: Mode | None = None
@@ -74,17 +76,17 @@ class MissionLine(Wire):
 
 
 class MissionList(Wire):
-    """``GET /missions``: at most 200, the one that decided last first; ``more`` are not listed."""
+    """``GET /missions``: at most 200 missions, the latest decision first; ``more`` further ones are not listed."""
 
     missions: list[MissionLine]
     more: int
-    newest: MissionId | None = Field(description="the one that decided last, since the edge started")
+    newest: MissionId | None = Field(description="the mission of the latest decision since the edge started")
 
 
 class DecisionPrompt(Wire):
     """``GET /missions/{id}/decisions/{decision_id}/prompt``, in the three blocks of the prompt.
 
-    ``asked`` says whether an LLM was asked by it; where none is, the prompt is made for the token accounting alone.
+    ``asked`` says whether an LLM got the prompt; otherwise the prompt only serves the token accounting.
     """
 
     decision_id: DecisionId

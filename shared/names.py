@@ -1,19 +1,19 @@
-"""Objects of more names than any of ours has: refused as a whole, because an error for each stops an event loop."""
+"""A limit on the names of a JSON object: an error for each of very many names would block the event loop."""
 
 from __future__ import annotations
 
 from typing import Any
 
-# Past the fields of every model; a handful of misspelt ones are each told.
+# More than any model has fields, so that a few misspelt names still get an error each.
 MOST_NAMES = 128
 
 
-def few_names(told: Any) -> Any:
-    """What was told, before it is looked at: for pydantic's ``model_validator(mode="before")``.
+def few_names(given: Any) -> Any:
+    """Pass an object on before its validation: for pydantic's ``model_validator(mode="before")``.
 
     Raises:
-        ValueError: an object of more than 128 names.
+        ValueError: the object has more than 128 names.
     """
-    if isinstance(told, dict) and len(told) > MOST_NAMES:
-        raise ValueError(f"an object of {len(told)} names, and {MOST_NAMES} are more than there are")
-    return told
+    if isinstance(given, dict) and len(given) > MOST_NAMES:
+        raise ValueError(f"an object of {len(given)} names, and {MOST_NAMES} are more than there are")
+    return given

@@ -1,4 +1,4 @@
-"""What visits and beacons say of each sensor: its visiting record and its arrival rate; a fleet's, or one UAV's own."""
+"""The visiting record and the arrival rate of each sensor, from visits and beacons of a fleet or of one UAV."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from shared.fleetplan import FleetBelief
 from shared.scenario import Scenario
 from shared.wire import UavState
 
-# Weight, in steps, of the scenario's mean arrival rate against what is observed.
+# The weight, in steps, of the scenario's mean arrival rate against the observations.
 _PRIOR_STEPS = 2.0
 NEVER = -1
 
 
 class Records:
-    """By sensor.
+    """The records of every sensor.
 
     Attributes:
-        visits: TVR_j, shape ``(J,)``: the latest step of a visit that is confirmed, or still open and so presumed to
+        visits: TVR_j, shape ``(J,)``: the step of the latest visit that is confirmed, or still open and presumed to
             succeed; -1 for none.
     """
 
@@ -44,9 +44,9 @@ class Records:
         return rates
 
     def hear(self, ids: NDArray[np.int64], seen: NDArray[np.int64], queue: FloatArray) -> None:
-        """Take beacons that are news, ``(n,)`` each.
+        """Take the beacons that are newer than the known ones, ``(n,)`` each.
 
-        Between two beacons of one sensor, with no visit and no overflow between them, its queue grew by the arrivals.
+        Between two beacons of a sensor without a visit or an overflow, the queue grows by the arrivals.
         """
         news = seen > self._seen[ids]
         undisturbed = (self._seen[ids] >= 0) & (self.visits[ids] < self._seen[ids])
@@ -57,17 +57,17 @@ class Records:
         self._queue[ids[news]] = queue[news]
 
     def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
-        """A UAV was sent: a visit, until its outcome says otherwise."""
+        """Count a decision as a visit until its outcome is known."""
         self._open.setdefault(sensor_id, {})[decision_id] = step
         self._update(sensor_id)
 
     def confirm(self, sensor_id: int, decision_id: str, step: int) -> None:
-        """The visit succeeded, or nobody will ever say."""
+        """Count the visit for good: it succeeded, or its outcome will never be known."""
         self._confirmed[sensor_id] = max(self._confirmed[sensor_id], step)
         self.withdraw(sensor_id, decision_id)
 
     def withdraw(self, sensor_id: int, decision_id: str) -> None:
-        """It was no visit: the record goes back to the latest that was one."""
+        """Drop the visit: the record returns to the latest remaining one."""
         waiting = self._open.get(sensor_id, {})
         waiting.pop(decision_id, None)
         if not waiting:
@@ -79,7 +79,7 @@ class Records:
         self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
 
     def state_dict(self) -> dict[str, Any]:
-        """All of it, as copies."""
+        """The whole state, as copies."""
         return {
             "visits": self.visits.copy(),
             "confirmed": self._confirmed.copy(),
@@ -91,14 +91,14 @@ class Records:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """As they were when the state was taken."""
+        """Restore a state."""
         self.visits, self._confirmed, self._open = state["visits"], state["confirmed"], state["open"]
         self._seen, self._queue = state["seen"], state["queue"]
         self._arrivals, self._exposure = state["arrivals"], state["exposure"]
 
 
 def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> None:
-    """Take a UAV's report in full: into the sensors' records, and all of it into the belief."""
+    """Add a UAV's full report to the sensors' records and to the belief."""
     ids = np.asarray(uav.sensors.id)
     seen = filled(uav.sensors.last_seen, NEVER).astype(np.int64)
     queue = filled(uav.sensors.queue)

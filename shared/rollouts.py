@@ -1,4 +1,4 @@
-"""Logged decisions that both sides read: the simulator records them, the edge's modules are pretrained on them."""
+"""Logged decisions: the simulator records them, and the edge's modules are pretrained on them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.wire import DecideRequest, SensorId, Wire
 
 
 class Header(Wire):
-    """First line of a rollouts file: the world of every mission in it."""
+    """The first line of a rollouts file: the world of all its missions."""
 
     scenario: Scenario
     missions: int
@@ -22,7 +22,7 @@ class Header(Wire):
 
 
 class Reference(Wire):
-    """What a teacher would have done: ``planner``, from what the fleet knew, or ``clairvoyant``, all arrivals known."""
+    """A teacher's action: ``planner`` has the fleet's knowledge, ``clairvoyant`` knows all arrivals."""
 
     teacher: Literal["planner", "clairvoyant"]
     sensor_id: SensorId
@@ -30,10 +30,10 @@ class Reference(Wire):
 
 
 class RolloutStep(Wire):
-    """One UAV's decision: what was reported, what was done, and what came of it.
+    """One UAV's decision: its report, its action, and the outcome.
 
-    ``cost`` is the UAV's own c, ``fleet_lost`` the packets lost in that step at all sensors. ``reference`` is None
-    where no teacher was asked; it was not always flown. Files from before there were references are read as that.
+    ``cost`` is the UAV's own c, ``fleet_lost`` the packets lost in that step at all sensors. ``reference`` is the
+    teacher's action, which the UAV may not have flown; None without a teacher, and in older files.
     """
 
     request: DecideRequest
@@ -57,7 +57,7 @@ def read_rollouts(path: Path) -> tuple[Header, Iterator[RolloutStep]]:
 
     Raises:
         OSError: the file cannot be read or is no gzip.
-        ValueError: a line is not what it should be; the text names it.
+        ValueError: a line is invalid; the text names it.
     """
 
     def parsed() -> Iterator[Header | RolloutStep]:

@@ -49,7 +49,7 @@ class Scenario(BaseModel):
         max_length=1000,
         strict=False,
         fail_fast=True,
-        description="polyline that layout `pipeline` strings the sensors along, and that pictures of layout "
+        description="polyline along which layout `pipeline` places the sensors, and which pictures of layout "
         "`surveyed` show; none: ()",
     )
     pipeline_spread_m: float = Field(20.0, ge=0, le=1e6, description="largest offset from the polyline, each axis")
@@ -59,7 +59,7 @@ class Scenario(BaseModel):
     step_s: float = Field(10.0, ge=0.01, le=3600)
     max_velocity: int = Field(14, ge=1, le=14, description="velocity levels are 0..max, in m/s")
     lap_radius_m: float = Field(300.0, ge=1, le=1e6)
-    lap_offset_m: float = Field(250.0, ge=0, le=1e6, description="lap centres' distance from the area's centre")
+    lap_offset_m: float = Field(250.0, ge=0, le=1e6, description="distance of the lap centres from the area's centre")
     routes: tuple[
         Annotated[tuple[Waypoint, ...], Field(strict=False, min_length=2, max_length=1000, fail_fast=True)], ...
     ] = Field(
@@ -67,7 +67,7 @@ class Scenario(BaseModel):
         max_length=100,
         strict=False,
         fail_fast=True,
-        description="waypoints of each UAV's trajectory, instead of laps; flown round where the last is the first, "
+        description="waypoints of each UAV's trajectory, instead of laps; flown in laps if the last is the first, "
         "else there and back",
     )
 
@@ -132,7 +132,7 @@ class Scenario(BaseModel):
 
     @property
     def mean_arrival_rate(self) -> float:
-        """Mean of the arrival rates' range, packets a step: what is assumed of a sensor not yet observed."""
+        """The mean of the arrival rates' range, packets a step: the assumed rate of a sensor not yet observed."""
         return (self.arrival_rate_min + self.arrival_rate_max) / 2
 
 

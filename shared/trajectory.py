@@ -1,4 +1,4 @@
-"""Trajectories as both sides know them: where a UAV is after flying on, and how far along a position lies."""
+"""Trajectories, for the edge and the simulator: the position at an arc length, and the arc length of a position."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.scenario import Point, Scenario
 
 
 class Trajectory(Protocol):
-    """A closed curve, flown in one direction. ``length_m`` of arc lead back to the same point."""
+    """A closed curve, flown in one direction. After ``length_m`` of arc a UAV is at the same point again."""
 
     @property
     def length_m(self) -> float: ...
@@ -55,7 +55,7 @@ class Circle:
     def at(self, progress_m: ArrayLike) -> FloatArray:
         """``centre + radius (cos, sin)(progress / radius)``."""
         angle = np.asarray(progress_m, dtype=np.float64) / self._radius_m
-        # np.stack takes several times as long of a few numbers.
+        # For a few numbers np.stack takes several times as long.
         points = np.empty((*angle.shape, 2))
         points[..., 0], points[..., 1] = np.cos(angle), np.sin(angle)
         return self._centre + self._radius_m * points
@@ -70,7 +70,8 @@ class Circle:
 class Polyline:
     """Straight legs from waypoint to waypoint, ``(N, 2)`` metres.
 
-    Where the last waypoint is the first, laps; else there and back again, so that ``length_m`` is twice the legs'.
+    If the last waypoint is the first, the UAV flies laps. Otherwise it flies there and back, and ``length_m`` is twice
+    the legs' length.
 
     Raises:
         ValueError: fewer than two different waypoints.
@@ -83,7 +84,7 @@ class Polyline:
         legs = np.hypot(*np.diff(points, axis=0).T)
         if not legs.sum() > 0:
             raise ValueError("a trajectory needs at least two different waypoints")
-        # A leg of no length would be two points at one arc length.
+        # A leg of length 0 would be two points at one arc length.
         keep = np.concatenate(([True], legs > 0))
         self._points: FloatArray = points[keep]
         self._reached: FloatArray = np.concatenate(([0.0], np.cumsum(legs[legs > 0])))
@@ -100,7 +101,7 @@ class Polyline:
         return np.stack([np.interp(flown, self._reached, self._points[:, axis]) for axis in (0, 1)], axis=-1)
 
     def locate(self, position: Point) -> tuple[float, float]:
-        """On the nearest leg; where there and back run over each other, on the way there."""
+        """On the nearest leg; where the ways there and back coincide, on the way there."""
         start, leg = self._points[:-1], np.diff(self._points, axis=0)
         along = np.sum((np.asarray(position) - start) * leg, axis=1) / np.sum(leg * leg, axis=1)
         foot = start + np.clip(along, 0.0, 1.0)[:, None] * leg
@@ -111,22 +112,22 @@ class Polyline:
 
 def trajectories(scenario: Scenario) -> tuple[Trajectory, ...]:
     """One trajectory a UAV: the scenario's routes if it has any, else its circles."""
-    return _made(scenario.routes) if scenario.routes else _circles(scenario.lap_centres, scenario.lap_radius_m)
+    return _polylines(scenario.routes) if scenario.routes else _circles(scenario.lap_centres, scenario.lap_radius_m)
 
 
 def progress_of(
-    trajectory: Trajectory, position: Point, told_m: float | None = None, tolerance_m: float = 10.0
+    trajectory: Trajectory, position: Point, reported_m: float | None = None, tolerance_m: float = 10.0
 ) -> float | None:
-    """How far along its trajectory a UAV is, metres; ``None`` for one that is off it.
+    """A UAV's progress along its trajectory, metres; ``None`` for a UAV off its trajectory.
 
     Args:
         position: metres.
-        told_m: what the UAV says itself; believed where the trajectory passes its position there. It settles which
-            way a UAV flies that goes there and back.
-        tolerance_m: farthest from the trajectory that counts as on it.
+        reported_m: the UAV's own report of its progress, which counts if the trajectory passes its position there. It
+            decides between the ways there and back.
+        tolerance_m: the largest distance from the trajectory that counts as on it.
     """
-    if told_m is not None and math.dist(trajectory.at(told_m), position) <= tolerance_m:
-        return told_m
+    if reported_m is not None and math.dist(trajectory.at(reported_m), position) <= tolerance_m:
+        return reported_m
     progress, gap = trajectory.locate(position)
     return progress if gap <= tolerance_m else None
 
@@ -137,5 +138,5 @@ def _circles(centres: tuple[Point, ...], radius_m: float) -> tuple[Trajectory, .
 
 
 @lru_cache(maxsize=64)
-def _made(routes: tuple[tuple[Point, ...], ...]) -> tuple[Trajectory, ...]:
+def _polylines(routes: tuple[tuple[Point, ...], ...]) -> tuple[Trajectory, ...]:
     return tuple(Polyline(route) for route in routes)

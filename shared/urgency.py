@@ -1,4 +1,4 @@
-"""How urgent a sensor is: its queue, and the probability that it overflows before the next visit."""
+"""The urgency of a sensor: its queue, and the probability that it overflows before the next visit."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike
 from shared.channel import FloatArray
 from shared.scenario import Scenario
 
-# Terms of the sum that are in memory at once.
+# Terms of the sum in memory at the same time.
 _TERMS = 1_000_000
 
 
 def above_by_sum(room: FloatArray, mean: FloatArray) -> FloatArray:
     """``P(Poisson(mean) > room)`` by the sum of the probabilities up to ``room``, whole numbers; ``(J,)`` each.
 
-    As scipy's to 1e-9, for whoever has no scipy: a UAV that prunes on board.
+    It equals scipy's to 1e-9, and serves a UAV without scipy that prunes on board.
     """
     counts = np.arange(int(room.max(initial=0)) + 1)
     log_factorials = np.cumsum(np.log(np.maximum(counts, 1)))
@@ -34,7 +34,7 @@ def above_by_sum(room: FloatArray, mean: FloatArray) -> FloatArray:
 try:
     from scipy.special import pdtrc
 except ImportError:
-    # The simulator's image goes without.
+    # The simulator's image has no scipy.
     _above: Callable[[FloatArray, FloatArray], FloatArray] = above_by_sum
 else:
     _above = pdtrc
@@ -48,7 +48,7 @@ def overflow_probability(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) 
         rate: arrival rate in packets a step, shape ``(J,)``, at least 0.
     """
     capacity = scenario.queue_capacity
-    # np.clip takes several times as long of a few numbers.
+    # For a few numbers np.clip takes several times as long.
     room = np.floor(capacity - np.minimum(np.maximum(np.asarray(queue, dtype=np.float64), 0), capacity))
     return np.asarray(_above(room, np.asarray(rate, dtype=np.float64) * scenario.overflow_horizon_steps))
 
@@ -59,6 +59,6 @@ def urgency(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray
 
 
 def urgency_of(queue: ArrayLike, overflow: FloatArray, scenario: Scenario) -> FloatArray:
-    """As :func:`urgency`, of probabilities ``Pof_j`` that are known, shape ``(J,)``."""
+    """As :func:`urgency`, from known probabilities ``Pof_j``, shape ``(J,)``."""
     fill = np.asarray(queue, dtype=np.float64) / scenario.queue_capacity
     return np.asarray(0.5 * np.minimum(np.maximum(fill, 0.0), 1.0) + 0.5 * overflow)

@@ -1,7 +1,7 @@
-"""The wire: what the UAVs send to the edge and what it answers. Every bound is stated here.
+"""The wire: the UAVs' requests to the edge and its answers, with all their bounds.
 
-Columns are parallel arrays, one entry a sensor. A sensor that a UAV has never heard keeps its
-surveyed place (``x``, ``y``) and has ``null`` in the four columns that only a beacon can fill.
+Columns are parallel arrays, one entry for each sensor. A sensor that a UAV has never heard has its
+surveyed position (``x``, ``y``), and ``null`` in the four columns that only a beacon can fill.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from shared.scenario import Scenario
 
 MAX_SENSORS = 10_000
 MAX_STEP = 1_000_000
-# A UAV that waited longer says so much.
+# A UAV that waited longer reports this much.
 MAX_ROUND_TRIP_MS = 600_000.0
-# Characters of an operator's note: it stands in every prompt.
+# Characters of an operator's note, which is part of every prompt.
 MAX_NOTE = 280
-# The type of the problem that the edge does not hold what a request leaves out: to be sent again in full.
+# The type of the problem that the edge does not hold the omitted part of a report: the client is to send it in full.
 INCOMPLETE = "urn:aicvds:problem:incomplete"
 
 
@@ -59,17 +59,17 @@ class Wire(BaseModel):
 
 
 class Received(Wire):
-    """What comes from anybody: an object of far too many names is one error, not one a name."""
+    """A model of a request: an object with far too many names gives one error, not one for each name."""
 
     _few_names = model_validator(mode="before")(few_names)
 
 
 class SensorColumns(Received):
-    """What one UAV knows of the sensors: parallel arrays of 1 to 10,000 entries, all of one length.
+    """One UAV's knowledge of the sensors: parallel arrays of 1 to 10,000 entries, all of the same length.
 
     ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last
-    beacon) are all ``null`` for a sensor never heard, and none of them for one that was. ``x`` and ``y`` may both be
-    left out of sensors whose places any UAV of the mission has told. Only with a ``base`` there may be no entry.
+    beacon) are all ``null`` for a sensor never heard, and none is for a sensor that was heard. ``x`` and ``y`` may both
+    be omitted for sensors whose positions any UAV of the mission has sent. Only a report with a ``base`` may be empty.
     """
 
     id: Annotated[list[SensorId], Field(max_length=MAX_SENSORS, fail_fast=True, description="no duplicates")]
@@ -78,14 +78,14 @@ class SensorColumns(Received):
         max_length=MAX_SENSORS,
         fail_fast=True,
         exclude_if=_is_empty,
-        description="m, surveyed; left out: as told before",
+        description="m, surveyed; omitted: as sent before",
     )
     y: list[Metres] = Field(
         default_factory=list,
         max_length=MAX_SENSORS,
         fail_fast=True,
         exclude_if=_is_empty,
-        description="m, surveyed; left out: as told before",
+        description="m, surveyed; omitted: as sent before",
     )
     queue: Annotated[
         list[Annotated[float, Field(ge=0, le=100_000)] | None],
@@ -127,19 +127,19 @@ class SensorColumns(Received):
 
 
 class Outcome(Received):
-    """What came of an earlier decision; applied once, however often it is sent."""
+    """The outcome of an earlier decision. It counts once, however often it is sent."""
 
     decision_id: DecisionId
     cost: float = Field(ge=0, le=10_000, description="c, 0 is best; the value regression's target is -c")
     failed: bool = Field(False, description="the transmission failed (f = 1)")
-    # Left out where it is not told: a request that is sent again after an upgrade is the same request.
+    # Omitted where it is not set, so that a request repeated after an upgrade is still the same request.
     round_trip_ms: float | None = Field(
         None,
         ge=0,
         le=MAX_ROUND_TRIP_MS,
-        exclude_if=lambda told: told is None,
-        description="from asking for that decision to its answer, as the UAV measured it, retries included; shown on "
-        "the mission page, and nothing is learned from it",
+        exclude_if=lambda value: value is None,
+        description="from the request for that decision to its answer, measured by the UAV, retries included; the "
+        "mission page shows it, and nothing learns from it",
     )
 
 
@@ -151,29 +151,27 @@ class UavState(Received):
     progress_m: float | None = Field(
         None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
     )
-    # Both left out where they are not told, for the same reason as an outcome's round trip.
+    # Both are omitted where they are not set, for the same reason as an outcome's round trip.
     base: DecisionId | None = Field(
         None,
-        exclude_if=lambda told: told is None,
-        description="the decision that this UAV was last told by this mission: `sensors` has then only the rows that "
-        "are not as in the report which that decision answered, if any. 409 of type `"
-        + INCOMPLETE
-        + "` where the edge "
-        "does not hold that report (any more): send it in full",
+        exclude_if=lambda value: value is None,
+        description="this UAV's last decision in this mission: `sensors` then has only the rows that differ from the "
+        "report which that decision answered, if any. 409 of type `" + INCOMPLETE + "` if the edge "
+        "does not hold that report (any more): send the whole report",
     )
     uplink: Literal["delta"] | None = Field(
         None,
-        exclude_if=lambda told: told is None,
-        description="`delta`: the edge holds this report, so that the UAV's next may name its decision as `base`, "
-        "which implies it",
+        exclude_if=lambda value: value is None,
+        description="`delta`: the edge is to hold this report, so that the UAV's next report may name the decision as "
+        "its `base`; a `base` implies `delta`",
     )
     sensors: SensorColumns
     outcome: Outcome | None = Field(None, description="of this UAV's previous decision")
 
     @field_validator("sensors", mode="after")
     @classmethod
-    def _some_rows(cls, sensors: SensorColumns, told: ValidationInfo) -> SensorColumns:
-        if not sensors.id and told.data.get("base") is None:
+    def _some_rows(cls, sensors: SensorColumns, info: ValidationInfo) -> SensorColumns:
+        if not sensors.id and info.data.get("base") is None:
             raise ValueError("column id has no entries: a report without a base names at least one sensor")
         return sensors
 
@@ -187,7 +185,7 @@ class DecideRequest(UavState):
 
 
 class BatchRequest(Received):
-    """``POST /decide/batch``: a fleet's UAVs at one step, decided in the order given."""
+    """``POST /decide/batch``: a fleet's UAVs at one step, decided in the given order."""
 
     mission_id: MissionId = "default"
     step: Step
@@ -210,31 +208,33 @@ class Candidate(Wire):
 
 
 class Weighed(Wire):
-    """A candidate of mode ``guided``. ``llm`` is its calibrated probability, ``null`` where the LLM was silent."""
+    """A candidate of mode ``guided``. ``llm`` is the LLM's calibrated probability, ``null`` without an answer."""
 
     sensor_id: SensorId
     velocity: int = Field(ge=0, le=14)
     llm: float | None = None
     mixture: float = Field(description="the advisers' probabilities, weighted by trust")
-    regret: float = Field(description="packets that the critic expects it to lose above the best candidate")
-    score: float = Field(description="ln(mixture) - 0.6 min(regret, 8): the highest is flown")
+    regret: float = Field(
+        description="packets that it is expected to lose above the best candidate, by the rollout evaluator"
+    )
+    score: float = Field(description="ln(mixture) - 0.6 min(regret, 8): the UAV flies the highest")
 
 
 class Guided(Wire):
-    """How mode ``guided`` decided: who was trusted how far, and the best candidates, best first."""
+    """A decision of mode ``guided``: the trust in each adviser, and the best candidates, best first."""
 
-    trust: dict[str, float] = Field(description="by adviser, before this decision; they sum to 1")
-    calibrated: bool = Field(description="whether the LLM's bias towards labels was taken off")
+    trust: dict[str, float] = Field(description="weight of each adviser before this decision; they sum to 1")
+    calibrated: bool = Field(description="whether the LLM's bias towards labels is removed")
     candidates: list[Weighed] = Field(max_length=5)
 
 
 class Tokens(Wire):
     """Token accounting of one decision.
 
-    ``static``, ``experiences``, ``state`` and their sum ``prompt`` are counted here with ``tokenizer``;
+    The edge counts ``static``, ``experiences``, ``state`` and their sum ``prompt`` with ``tokenizer``.
     ``state_uncompressed`` is the state block with every reported sensor, ``uncompressed`` the whole prompt
-    with it, and ``saved`` the difference. The ``server_`` fields are what the LLM server's ``usage`` said, in
-    the model's own tokens, chat template included; ``null`` when it said nothing.
+    with that block, and ``saved`` the difference. ``completion``, ``cached`` and ``server_prompt`` come from the LLM
+    server's ``usage``, in the model's own tokens, chat template included; ``null`` without one.
     """
 
     tokenizer: str
@@ -266,17 +266,17 @@ class DecideResponse(Wire):
     top_k: list[Candidate]
     guided: Guided | None = Field(None, description="in mode `guided` only")
     tokens: Tokens
-    deadline_ms: int = Field(description="what this decision was given")
+    deadline_ms: int = Field(description="the time limit of this decision")
     latency_ms: dict[str, float] = Field(description="by stage, and total")
     stored: bool = Field(
         True,
-        description="whether the decision, and the outcome that came with the request, are on disk: if not, send the "
-        "outcome again by `/feedback`. Always so where the edge was told to keep nothing",
+        description="whether the decision, and the outcome in the request, are on disk: if not, send the "
+        "outcome again by `/feedback`. Always true for an edge without a store",
     )
 
 
 class BatchResponse(Wire):
-    """One decision a UAV, in the order asked."""
+    """One decision for each UAV, in the order of the request."""
 
     decisions: list[DecideResponse]
 
@@ -288,28 +288,28 @@ class FeedbackRequest(Outcome):
 
 
 class FeedbackResponse(Wire):
-    """``applied`` the first time, ``duplicate`` ever after."""
+    """``applied`` the first time, ``duplicate`` every further time."""
 
     decision_id: DecisionId
     result: Literal["applied", "duplicate"]
 
 
 class PromptStyle(Received):
-    """How the prompt shows the sensors: JSON is one object a line, Markdown a table with its header.
+    """The prompt's form of the sensors: JSON is one object a line, Markdown a table with its header.
 
-    ``shuffled`` draws the rows' order anew for every step and UAV, from the mission's seed. Experiences are appended
-    until there are too many; ``selection`` says which stay then. ``demonstrations`` are worked examples in the static
-    block.
+    ``shuffled`` draws a new order of the rows for every step and UAV, from the mission's seed. Experiences are appended
+    until there are too many; ``selection`` then chooses the ones that stay. ``demonstrations`` are worked examples in
+    the static block.
     """
 
     format: Literal["csv", "json", "markdown"] = "csv"
     order: Literal["score", "shuffled"] = Field("score", description="of the rows; `score`: best first")
     experiences: int | None = Field(
-        None, ge=0, le=100, description="kept before half of them are dropped; default: the service's"
+        None, ge=0, le=100, description="number before half of them are dropped; default: the service's"
     )
     selection: Selection | None = Field(
         None,
-        description="experiences that stay: the newest, those like the present state, or the best and some of the "
+        description="experiences that stay: the newest, those most like the present state, or the best and some of the "
         "worst; default: the service's",
     )
     demonstrations: int = Field(0, ge=0, le=20, description="worked examples, solved by the teacher")
@@ -318,8 +318,8 @@ class PromptStyle(Received):
 class MissionSpec(Received):
     """``PUT /missions/{id}``: the world that a fleet flies in and how it decides.
 
-    ``attention`` off is the paper's baseline: every admissible sensor stands in the prompt, in the request's
-    order. It is the LLM's prompt that changes: mode ``value`` has nothing to decide by but attention, and keeps it.
+    ``attention`` off is the paper's baseline: the prompt has every admissible sensor, in the request's
+    order. Mode ``value`` decides by attention alone, and always uses it.
     """
 
     scenario: Annotated[str, Field(max_length=32)] | Scenario = Field(
@@ -327,16 +327,18 @@ class MissionSpec(Received):
     )
     mode: Mode | None = Field(None, description="default: the service's")
     top_k: int | None = Field(None, ge=1, le=100, description="default: the service's")
-    attention: Literal["on", "off"] = Field("on", description="`off`: no pruning, every admissible sensor is offered")
+    attention: Literal["on", "off"] = Field(
+        "on", description="`off`: no pruning, the prompt has every admissible sensor"
+    )
     features: Features | None = Field(
         None,
-        description="what the modules see: `paper`, its five, or `reach`, also what the trajectory brings in reach; "
-        "default: `paper` in mode `llm`, else `reach`",
+        description="the modules' inputs: `paper`, its five numbers a sensor, or `reach`, with seven more on packets "
+        "in reach along the trajectory; default: `paper` in mode `llm`, else `reach`",
     )
     belief: Belief | None = Field(
         None,
-        description="what is decided from: `fleet`, the newest that any UAV reported, rolled forward, or `reported`, "
-        "what the UAV itself last heard; default: `reported` in mode `llm`, the paper's method, else `fleet`",
+        description="the basis of decisions: `fleet`, the newest report of any UAV, rolled forward, or `reported`, the "
+        "UAV's own last beacons; default: `reported` in mode `llm`, the paper's method, else `fleet`",
     )
     planner: Literal["on", "off"] | None = Field(
         None, description="`off`: one step of look-ahead is the LLM-free policy; default: the service's"
@@ -347,22 +349,23 @@ class MissionSpec(Received):
         "battery); default: the service's",
     )
     prompt: PromptStyle = PromptStyle()
-    init: Init = Field("pretrained", description="the modules' start; `random` is the paper's")
+    init: Init = Field("pretrained", description="the modules' initial weights; `random` is the paper's start")
     seed: int = Field(0, ge=0, lt=2**32, description="of random initial weights and of shuffled rows")
     note: Note | None = Field(
         None,
-        description="the operator's, in plain words, such as `suspected leak at sensor 4: visit it every third step`",
+        description="the operator's note in plain words, such as `suspected leak at sensor 4: visit it every third "
+        "step`",
     )
 
 
 class Readiness(Wire):
-    """``GET /readyz``: decisions can be made, and by whom."""
+    """``GET /readyz``: whether the edge can decide, and its present decider."""
 
     ready: bool
     decides: Source
     llm: Literal["loading", "ready", "unavailable", "off"]
     model: str | None = None
-    standing_by: int = Field(0, description="further LLM servers that are well")
+    standing_by: int = Field(0, description="further healthy LLM servers")
     constraint: str | None = Field(None, description="how the server holds the LLM to the answer's form")
     detail: str | None = None
 

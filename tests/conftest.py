@@ -21,12 +21,12 @@ from service.storage.store import Store
 from tests.running import serving
 from tests.waiting import PATIENCE_S
 
-# Edges that are started as processes keep nothing, unless a test says so: they would share the user's store.
+# An edge started as a process has no store unless a test gives one: otherwise all would share the user's store.
 os.environ["AICVDS_STORE"] = "none"
 
-# Where the tests must be complete, as in CI, one whose program is missing fails.
+# Set where the tests must be complete, as in CI: a test whose program is missing then fails.
 _COMPLETE = "AICVDS_TESTS_COMPLETE"
-# Of Debian's packages of the same name; tests that need one are marked so.
+# Programs from Debian's packages of the same names; the mark `needs` names a test's program.
 _PROGRAMS = ("chromium", "prometheus")
 
 Edge = Callable[..., httpx.Client]
@@ -34,7 +34,7 @@ Edge = Callable[..., httpx.Client]
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An answer waits for a slow disk as long as it takes, unless a test says otherwise."""
+    """Let an answer wait for a slow disk as long as necessary, unless a test sets another limit."""
     monkeypatch.setattr("service.edge.engine._STORE_S", PATIENCE_S)
 
 
@@ -48,9 +48,9 @@ def vocabulary() -> Iterator[None]:
 
 @pytest.fixture
 def edge(tmp_path: Path) -> Iterator[Edge]:
-    """Starts real edges with stores and the settings given (no LLM unless told), and returns a client of each.
+    """Starts real edges with stores and the given settings (by default no LLM), and returns a client of each.
 
-    The deadline is far unless told: a busy machine must not decide what a decision is.
+    The default deadline is long, so that a busy machine changes no decision.
     """
     count = itertools.count()
     with ExitStack() as stack:
@@ -92,7 +92,7 @@ def report() -> Callable[..., dict[str, Any]]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what needs a program that is not installed, unless the tests must be complete."""
+    """Deselect the tests that need a missing program, unless the tests must be complete."""
     missing = set(_missing())
     left_out = [i for i in items if missing & {name for mark in i.iter_markers("needs") for name in mark.args}]
     if left_out:
@@ -101,7 +101,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """What was left out, and how to have it."""
+    """Print the deselected tests' programs, and how to install them."""
     for name in _missing():
         terminalreporter.write_line(f"left out: the tests that need {name}. To run them: apt-get install {name}")
 

@@ -19,7 +19,7 @@ Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]
 
 @contextmanager
 def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
-    """The application under a real uvicorn, with the edge's bounds on heads; yields its base URL."""
+    """Serve the application by a real uvicorn with the edge's limits on headers; yields its base URL."""
     config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", http=BoundedHttpProtocol, ws="none")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
@@ -38,7 +38,7 @@ def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
 
 @contextmanager
 def listening(handler: Handler) -> Iterator[str]:
-    """A raw TCP server, for upstreams that do not speak HTTP as they should; yields its base URL."""
+    """Run a raw TCP server, for LLM servers that break HTTP; yields its base URL."""
     loop = asyncio.new_event_loop()
     started = threading.Event()
     address: list[str] = []

@@ -16,6 +16,9 @@ from tests.e2e.processes import serving_edge
 ROOT = Path(__file__).parents[1]
 # Where a reader is led, not what a page loads.
 LINKS = re.compile(r"<a [^>]*>")
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+CODE_PATH = re.compile(r"(?<![\w./-])(?:service|simulator|shared)/[\w./-]*")
+CODE_NAME = re.compile(r"`((?:service|simulator|shared)/[\w/]+\.py):([\w.]+)`")
 LOADED = re.compile(r'(?:src|href)="((?:https?:)?//[^"]+)"')
 
 
@@ -52,6 +55,22 @@ def test_equations_are_drawn(site: Path) -> None:
     assert asked > 5
     assert method.count('<p class="equation"><svg') == asked
     assert "arithmatex" not in method and "merror" not in method
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_path_of_the_code_exists(page: Path) -> None:
+    paths = {path.rstrip(".-/") for path in CODE_PATH.findall(page.read_text(encoding="utf-8"))}
+    assert not [path for path in paths if not (ROOT / path).exists()]
+
+
+def test_every_name_in_the_architecture_is_in_its_file() -> None:
+    named = CODE_NAME.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    assert len(named) > 30
+    defined = {path: (ROOT / path).read_text(encoding="utf-8") for path, _ in named}
+    for path, name in named:
+        for part in name.split("."):
+            definition = rf"^ *(?:async )?(?:def|class) {part}\b|^{part}\b.* = "
+            assert re.search(definition, defined[path], re.MULTILINE), f"{path} defines no {name}"
 
 
 def blocks(page: str) -> str:

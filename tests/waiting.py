@@ -1,4 +1,4 @@
-"""Waiting without a clock: for what must come true, and at gates that a test opens."""
+"""Waiting without a clock: for a condition, and at gates that a test opens."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-# Far beyond what a busy machine needs: it is only waited out by a test that fails.
+# Far beyond the needs of a busy machine: only a failing test waits so long.
 PATIENCE_S = 120.0
 
 
 def until(found: Callable[[], T], told: Callable[[], object] = lambda: "") -> T:
-    """What ``found`` returns, as soon as that is true; ``told`` says how it stood where it never is."""
+    """Wait until ``found`` returns a true value, and return it; ``told`` describes the state if it never does."""
     ends = time.monotonic() + PATIENCE_S
     while not (seen := found()):
         assert time.monotonic() < ends, f"it never came true: {told()}"
@@ -25,7 +25,7 @@ def until(found: Callable[[], T], told: Callable[[], object] = lambda: "") -> T:
 
 
 async def soon(found: Callable[[], T]) -> T:
-    """As :func:`until`, for a condition of this event loop."""
+    """As :func:`until`, for a condition on this event loop."""
     async with asyncio.timeout(PATIENCE_S):
         while not (seen := found()):
             await asyncio.sleep(0.001)
@@ -33,9 +33,9 @@ async def soon(found: Callable[[], T]) -> T:
 
 
 class Gate:
-    """Holds whoever comes until it is opened, from any thread; at the end of a ``with`` it is.
+    """Holds every caller until it is opened, from any thread. The end of a ``with`` opens it.
 
-    ``came`` counts those who have come, whether they have passed or not.
+    ``came`` counts the callers, whether they have passed or not.
     """
 
     def __init__(self, *, opened: bool = False) -> None:
@@ -46,20 +46,20 @@ class Gate:
             self._opened.set()
 
     def open(self) -> None:
-        """Let everyone pass who is here, or comes."""
+        """Let all present and future callers pass."""
         self._opened.set()
 
     def shut(self) -> None:
-        """Hold who comes from now on."""
+        """Hold future callers."""
         self._opened.clear()
 
     def wait(self) -> None:
-        """Pass, in a thread."""
+        """Wait for the gate in a thread."""
         self._come()
         assert self._opened.wait(PATIENCE_S)
 
     async def passed(self) -> None:
-        """Pass, on an event loop."""
+        """Wait for the gate on an event loop."""
         self._come()
         while not self._opened.is_set():
             await asyncio.sleep(0.002)
@@ -76,7 +76,7 @@ class Gate:
 
 
 class Clock:
-    """Stands in for a module's ``time``: ahead of the real one by as much as a test says."""
+    """Replaces a module's ``time``: it is ``ahead_s`` ahead of the real one."""
 
     def __init__(self) -> None:
         self.ahead_s = 0.0
@@ -89,7 +89,7 @@ class Clock:
 
 
 class Striding:
-    """Stands in for a module's ``time``: stands still, but for a stride at each look."""
+    """Replaces a module's ``time``: it advances only by a stride at each call."""
 
     def __init__(self, stride_s: float) -> None:
         self.now_s, self._stride_s = 1000.0, stride_s

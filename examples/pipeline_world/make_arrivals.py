@@ -1,8 +1,8 @@
 """Make arrivals.csv beside this file:  python examples/pipeline_world/make_arrivals.py
 
-Ten minutes of traffic in steps of ten seconds. Every sensor reports at a rate of its own, which swells by half and
-ebbs again as the line's pressure is raised; and a cleaning pig passes from kilometre 1.5 to 4.5 at 5 m/s, whose noise
-makes the sensors within 400 m of it report six times as much. Counts are Poisson around that.
+Ten minutes of traffic in steps of ten seconds. Every sensor reports at a rate of its own, which rises by half and
+falls again with the line's pressure. A cleaning pig passes from kilometre 1.5 to 4.5 at 5 m/s, and the sensors within
+400 m of its noise report six times as much. The counts are Poisson draws of these rates.
 """
 
 import csv

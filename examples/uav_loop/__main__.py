@@ -19,7 +19,7 @@ from shared.scenario import Scenario
 from shared.trajectory import trajectories
 from simulator.client import AsyncEdgeClient
 
-# Seconds that a UAV on the ground waits for its edge.
+# Seconds that a UAV waits for its edge before take-off.
 GROUND_S = 60.0
 # The south-west corner of the area, WGS 84.
 ORIGIN = (39.9312, 41.2345)
@@ -32,14 +32,14 @@ ROUTE = ((250.0, 250.0), (750.0, 250.0), (750.0, 750.0), (250.0, 750.0), (250.0,
 
 @dataclass(frozen=True)
 class Job:
-    """Fly one stub UAV over eight sensors, in simulated time. Prints a line a step, and at the end what came of it."""
+    """Fly one stub UAV over eight sensors, in simulated time. Prints one line a step, and the sums at the end."""
 
     edge: str = "http://localhost:8000"
     """The edge's URL; a key goes into AICVDS_API_KEY."""
     steps: int = 30
     """Decisions to ask for, one every ten simulated seconds."""
     seed: int = 0
-    """Of the sensors' queues and arrivals."""
+    """The seed of the sensors' queues and arrivals."""
 
 
 def world(steps: int) -> Scenario:

@@ -1,4 +1,4 @@
-"""The loop of one real UAV: telemetry in, ask the edge, fly and collect as it says, tell it what came of that."""
+"""The loop of one real UAV: read telemetry, ask the edge, fly and collect as decided, report the outcome."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from simulator.policies.registry import policy_named
 from simulator.world import Observation
 
 DEADLINE_MS = 3000
-# Below this the UAV goes home, whatever the edge says.
+# Below this charge the UAV flies home, whatever the edge decides.
 RESERVE_PERCENT = 20.0
 FALLBACK = "eof"
 
 
 @dataclass(frozen=True)
 class Leg:
-    """One step as it was flown. ``decided_by`` is the edge's ``source``, or ``onboard``."""
+    """One flown step. ``decided_by`` is the edge's ``source``, or ``onboard``."""
 
     step: int
     position: Point
@@ -40,7 +40,7 @@ class Leg:
 
 @dataclass
 class Flown:
-    """What came of a mission: its legs, how many outcomes the edge has, and why the UAV went without it, if it did."""
+    """A flown mission: its legs, the number of outcomes that the edge has, and the last error of asking the edge."""
 
     legs: list[Leg] = field(default_factory=list)
     outcomes_told: int = 0
@@ -52,14 +52,14 @@ class Loop:
     """Flies one UAV of a mission along its trajectory.
 
     Args:
-        vehicle: what flies; already in the air.
-        edge: who decides.
+        vehicle: already in the air.
+        edge: the client of the edge that decides.
         scenario: the mission's world; layout ``surveyed``, so that the sensors' places are known.
-        frame: where the scenario's plane lies on the globe.
-        mission_id: at the edge.
-        uav: which of the scenario's UAVs this is.
-        patience_s: the edge has its own deadline; a UAV that has heard nothing by now decides for itself.
-        on_leg: hears every leg.
+        frame: the position of the scenario's plane on the globe.
+        mission_id: the mission's ID at the edge.
+        uav: the index of this UAV in the scenario.
+        patience_s: after this time without an answer the UAV decides on board; the edge's own deadline is shorter.
+        on_leg: called with every leg.
     """
 
     def __init__(
@@ -83,11 +83,11 @@ class Loop:
         self._fallback.reset(scenario, 0)
         self._sent_m: tuple[float, float] | None = None
         self._owed: Outcome | None = None
-        # Told to an edge that could not put them on disk.
+        # Outcomes sent to an edge that could not store them.
         self._unsure: list[Outcome] = []
 
     async def fly(self) -> Flown:
-        """The whole mission, or until the battery says to go home."""
+        """Fly the whole mission, or until the battery is low."""
         await self._make_mission()
         await self._listen(0)
         for step in range(self._scenario.steps):
@@ -101,7 +101,7 @@ class Loop:
         return self.flown
 
     async def _leg(self, step: int, position: Position) -> None:
-        """Decide, fly one step, collect, and keep what the edge is to be told of it."""
+        """Decide, fly one step, collect, and keep the outcome for the next request."""
         here = self._frame.metres(position)
         progress = self._progress(here)
         observation = self._known.observation(step, here, progress, self._sites)
@@ -115,10 +115,9 @@ class Loop:
         self._on_leg(self.flown.legs[-1])
 
     def _progress(self, here: Point) -> float:
-        """Metres along the trajectory: the point nearest to the UAV between where it was and where it was sent.
+        """Metres along the trajectory: the point nearest to the UAV between its last position and its target.
 
-        Wind and turns keep a UAV from the metre that it was sent to; and a route that is flown there and back passes
-        every place twice.
+        Wind and turns keep a UAV from its exact target, and a route flown there and back passes every place twice.
         """
         if self._sent_m is None:
             return self._path.locate(here)[0]
@@ -126,7 +125,7 @@ class Loop:
         return float(along[np.argmin(np.hypot(*(self._path.at(along) - here).T))])
 
     async def _fly_on(self, position: Position, here: Point, progress: float, velocity: int) -> None:
-        """One step along the trajectory, in a straight line to its end; at 0 m/s the UAV stays where it is."""
+        """Fly one step along the trajectory, in a straight line to its end; at 0 m/s the UAV stays in place."""
         sent = progress + velocity * self._scenario.step_s
         self._sent_m = (progress, sent)
         if velocity > 0:
@@ -143,7 +142,7 @@ class Loop:
             self.flown.last_error = str(error)
 
     async def _fix(self) -> Position:
-        """The position, once there is one: before the first fix MAVSDK says NaN."""
+        """Wait for a position: before the first fix MAVSDK returns NaN."""
         while True:
             position = await self._vehicle.telemetry.position()
             if math.isfinite(position.latitude_deg) and math.isfinite(position.absolute_altitude_m):
@@ -151,11 +150,11 @@ class Loop:
             await self._vehicle.clock.sleep(0.5)
 
     async def _listen(self, step: int) -> int:
-        """Hear the sensors in range; returns the packets that they lost since they were last heard."""
+        """Hear the sensors in range; returns the packets that they lost since their last beacons."""
         return self._known.hear(step, await self._vehicle.radio.beacons())
 
     async def _decide(self, observation: Observation) -> tuple[int, int, str, str | None]:
-        """Sensor, velocity, who decided, and the decision's id if it was the edge."""
+        """Sensor, velocity, the decider, and the decision's ID if the edge decided."""
         request = decide_request(self._uav, observation, self._mission_id, deadline_ms=DEADLINE_MS, outcome=self._owed)
         try:
             async with asyncio.timeout(self._patience_s):
@@ -175,7 +174,7 @@ class Loop:
         try:
             return await self._edge.decide(request)
         except EdgeRefused as refused:
-            # An edge that lost its store knows neither the earlier decision nor the mission; it can still decide.
+            # An edge that lost its store knows neither the earlier decision nor the mission, but it can still decide.
             if request.outcome is None or not refused.blames("outcome"):
                 raise
             self._owed = None
@@ -183,7 +182,7 @@ class Loop:
             return await self._edge.decide(request.model_copy(update={"outcome": None}))
 
     async def _tell_the_last(self) -> None:
-        """What no later request carried."""
+        """Send the outcomes that no later request carried."""
         for outcome in (*self._unsure, *([self._owed] if self._owed is not None else [])):
             try:
                 await self._edge.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
@@ -194,7 +193,7 @@ class Loop:
 
 
 class _Known:
-    """What this UAV has heard of J sensors, as :class:`simulator.world.Observation` has it."""
+    """The beacons that this UAV has heard of J sensors, in the form of :class:`simulator.world.Observation`."""
 
     def __init__(self, sensors: int) -> None:
         self._queue, self._battery, self._gain = np.zeros((3, sensors))
@@ -202,7 +201,7 @@ class _Known:
         self._lost: dict[int, int] = {}
 
     def hear(self, step: int, beacons: dict[int, Beacon]) -> int:
-        """Take in the beacons; returns the packets lost since these sensors were last heard."""
+        """Store the beacons; returns the packets lost since these sensors were last heard."""
         lost = 0
         for sensor, beacon in beacons.items():
             self._queue[sensor] = beacon.queue
@@ -214,7 +213,7 @@ class _Known:
         return lost
 
     def observation(self, step: int, here: Point, progress: float, sites: FloatArray) -> Observation:
-        """What the edge and the policies on board decide from."""
+        """The observation that the edge and the policies on board decide from."""
         return Observation(
             step=np.array([step]),
             position=np.array(here),

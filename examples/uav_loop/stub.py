@@ -1,4 +1,4 @@
-"""A vehicle, its sensors and its clock that are not there: they move in simulated time, as fast as they are asked."""
+"""A stub of a vehicle, its sensors and its clock, in simulated time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FIRST_FIX_S = 1.0
 
 @dataclass(frozen=True)
 class StubPosition:
-    """As MAVSDK tells it."""
+    """As in MAVSDK."""
 
     latitude_deg: float
     longitude_deg: float
@@ -31,7 +31,7 @@ class StubPosition:
 
 @dataclass(frozen=True)
 class StubBattery:
-    """As MAVSDK tells it."""
+    """As in MAVSDK."""
 
     remaining_percent: float
 
@@ -39,12 +39,12 @@ class StubBattery:
 class StubWorld:
     """One UAV over a scenario's sensors: clock, telemetry, action and radio in one.
 
-    Packets arrive at the end of each of the scenario's steps. The vehicle flies straight to where it was sent.
+    Packets arrive at the end of each of the scenario's steps. The vehicle flies straight to its target.
 
     Attributes:
         now_s: simulated seconds since the start.
         place: x and y, metres.
-        sent_home: whether it was told to return.
+        sent_home: whether it was ordered to return.
     """
 
     def __init__(self, scenario: Scenario, frame: LocalFrame, start: Point, seed: int, charge: float = 100.0) -> None:
@@ -60,7 +60,7 @@ class StubWorld:
         self._altitude_m = scenario.altitude_m
 
     def vehicle(self) -> Vehicle:
-        """What the loop flies."""
+        """The vehicle for the loop."""
         return Vehicle(telemetry=self, action=self, radio=self, clock=self)
 
     async def sleep(self, delay: float) -> None:
@@ -76,18 +76,18 @@ class StubWorld:
             self._arrived += 1
 
     async def position(self) -> StubPosition:
-        """NaN before the first fix, as MAVSDK has it."""
+        """The position; NaN before the first fix, as in MAVSDK."""
         if self.now_s < FIRST_FIX_S:
             return StubPosition(math.nan, math.nan, math.nan, math.nan)
         latitude, longitude = self._frame.degrees(*self.place)
         return StubPosition(latitude, longitude, GROUND_ABOVE_SEA_M + self._altitude_m, self._altitude_m)
 
     async def battery(self) -> StubBattery:
-        """Used up evenly."""
+        """The charge falls evenly with time."""
         return StubBattery(max(0.0, self._charge - 100.0 * self.now_s / ENDURANCE_S))
 
     async def set_current_speed(self, speed_m_s: float) -> None:
-        """Of the legs that follow."""
+        """Set the speed of the legs that follow."""
         self._speed = speed_m_s
 
     async def goto_location(
@@ -98,7 +98,7 @@ class StubWorld:
         self._altitude_m = absolute_altitude_m - GROUND_ABOVE_SEA_M
 
     async def return_to_launch(self) -> None:
-        """Note it."""
+        """Note the order."""
         self.sent_home = True
 
     async def beacons(self) -> dict[int, Beacon]:

@@ -1,8 +1,8 @@
-"""What the loop needs of a vehicle, of its radio and of time: the stub has it, and so has a real UAV.
+"""The loop's requirements of a vehicle, its radio and its clock: the stub meets them, and so does a real UAV.
 
 ``Telemetry`` and ``Action`` are the part of MAVSDK 4 (``mavsdk.asyncio``) that the loop uses, under MAVSDK's own names
-and units: angles in degrees (WGS 84), altitudes in metres, percent from 0 to 100, NaN where nothing is known yet.
-``TelemetryAsync(system)`` and ``ActionAsync(system)`` fit as they are.
+and units: angles in degrees (WGS 84), altitudes in metres, percent from 0 to 100, NaN for unknown values.
+``TelemetryAsync(system)`` and ``ActionAsync(system)`` fit without a wrapper.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Action(Protocol):
     """``mavsdk.asyncio.plugins.action.ActionAsync``."""
 
     async def set_current_speed(self, speed_m_s: float) -> None:
-        """Of the legs that follow."""
+        """Set the speed of the legs that follow."""
         ...
 
     async def goto_location(
@@ -71,7 +71,7 @@ class Action(Protocol):
 
 @dataclass(frozen=True)
 class Beacon:
-    """What a sensor said of itself when it was last heard. ``lost`` counts its packets dropped since it was set up."""
+    """A sensor's last beacon. ``lost`` counts the packets that it has dropped since it was set up."""
 
     queue: int
     battery_j: float
@@ -81,26 +81,26 @@ class Beacon:
 
 @dataclass(frozen=True)
 class Collected:
-    """What came of asking a sensor for its packets."""
+    """The result of collecting from a sensor."""
 
     packets: int
     failed: bool
 
 
 class Radio(Protocol):
-    """The data link to the ground sensors, which is no part of MAVLink."""
+    """The data link to the ground sensors, which MAVLink does not cover."""
 
     async def beacons(self) -> dict[int, Beacon]:
         """The sensors in range, by index."""
         ...
 
     async def collect(self, sensor: int) -> Collected:
-        """Fetch what waits at a sensor, as much as the link carries in one step."""
+        """Fetch a sensor's waiting packets, as many as the link carries in one step."""
         ...
 
 
 class Clock(Protocol):
-    """Time as the vehicle has it: ``asyncio`` itself fits."""
+    """The vehicle's time: the module ``asyncio`` fits."""
 
     async def sleep(self, delay: float) -> None:
         """Wait so many seconds."""
@@ -109,7 +109,7 @@ class Clock(Protocol):
 
 @dataclass(frozen=True)
 class Vehicle:
-    """One UAV: its autopilot, the link to the sensors, its clock."""
+    """One UAV: its autopilot, its link to the sensors, and its clock."""
 
     telemetry: Telemetry
     action: Action

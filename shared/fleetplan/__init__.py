@@ -1,4 +1,4 @@
-"""The fleet's planner: what all UAVs do over a horizon so that the fewest packets are lost (extra ``planner``)."""
+"""The fleet's planner: the actions of all UAVs over a horizon that lose the fewest packets (extra ``planner``)."""
 
 from __future__ import annotations
 

@@ -1,22 +1,22 @@
 """The exact time-expanded formulation of a fleet's plan, for OR-Tools CP-SAT.
 
-Of UAV i the integer ``c_it`` is the sum of its velocities up to step t, so that it is ``c_it x step_s`` metres on along
-its trajectory, whatever its shape. The Boolean ``x_ijtk`` says that it collects from sensor j in step t over a link
-of at least ``p_k`` packets; it confines ``c_it`` to the values from which that link holds. Of sensor j, ``q_jt`` is
-the queue before step t and ``l_jt`` what it loses in it:
+The integer ``c_it`` is the sum of UAV i's velocities up to step t. After step t the UAV has flown ``c_it x step_s``
+metres along its trajectory, for any shape of the trajectory. The Boolean ``x_ijtk`` says that it collects from sensor j
+in step t over a link of at least ``p_k`` packets; it confines ``c_it`` to the values from which that link holds. For
+sensor j, ``q_jt`` is the queue before step t and ``l_jt`` its lost packets in that step:
 
     q_j(t+1) + l_jt >= q_jt + a_jt - sum_ik p_k x_ijtk,   q_j(t+1) + l_jt >= a_jt,   q_jt <= W
 
-with at most one x a UAV and step, and at most one a sensor and step. Smaller queues are never worse, so that
-minimising the sum of ``l`` makes these the world's recursion. What makes the search quick are redundant constraints,
-one for every sensor and every run of steps s..e in which more than W packets come together:
+with at most one x for each UAV and step, and at most one for each sensor and step. Smaller queues are never worse, so
+that minimising the sum of ``l`` makes these inequalities the world's recursion. Redundant constraints make the search
+quick, one for every sensor and every run of steps s..e in which more than W packets come together:
 
-    sum_t l_jt + excess x sum_t x_jt >= excess,   excess = what came at its start and since, less W
+    sum_t l_jt + excess x sum_t x_jt >= excess,   excess = the queue at its start and the arrivals since, less W
 
-that is, unless the sensor is visited within them, the excess is lost.
+That is, without a visit in these steps the sensor loses the excess.
 
-Batteries enter only as the packets that each can pay for over its best link, all steps together. That leaves out
-that a weak link costs more, and so keeps every plan that the world allows: the bound proven stays valid.
+Batteries enter only as the packets that each can pay for over its best link, all steps together. This ignores the
+higher cost of a weak link, and so keeps every plan that the world allows: the proven bound stays valid.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from ortools.sat.python import cp_model
 from shared.channel import IntArray, packets_per_step, rate_bps
 from shared.fleetplan.problem import Course, FleetProblem, fly
 
-# Booleans that serve a sensor in a step, and the packets that each moves.
+# The Booleans that serve a sensor in a step, and the packets that each moves.
 Visits = list[tuple[Any, int]]
 Links = Literal["exact", "cautious", "hopeful"]
 
-# CP-SAT's objective has integer coefficients: a lost packet costs this much, so that a risk may be a fraction.
+# The cost of a lost packet. CP-SAT's objective has integer coefficients, and an expected loss may be a fraction.
 SCALE = 100
 
 
@@ -53,15 +53,15 @@ class Serve(NamedTuple):
 class Formulation:
     """The model of one problem.
 
-    ``links`` says how exactly it takes what links can move. ``exact``: level by level, as it is, which needs several
-    times the Booleans. ``cautious``: every link moves no more than the weakest that holds, so that its plans lose at
-    most their objective. ``hopeful``: as much as the strongest, so that its bound holds in the world. Often all three
-    agree, and then the last two have proven an exact plan quickly.
+    ``links`` says how exactly the model takes the capacity of links. ``exact``: level by level, as in the world, which
+    needs several times the Booleans. ``cautious``: every link moves no more than the weakest link that holds, so that
+    the plans lose at most their objective. ``hopeful``: every link moves as much as the strongest, so that the bound
+    holds in the world. Often all three agree, and then the last two have proven an exact plan quickly.
 
     Attributes:
-        model: to be solved.
+        model: for the solver.
         flown: ``c_it`` by UAV and step.
-        serves: ``x`` by what it says.
+        serves: ``x`` by its meaning.
     """
 
     def __init__(self, problem: FleetProblem, links: Links = "exact") -> None:
@@ -84,7 +84,7 @@ class Formulation:
 
     @cached_property
     def _most(self) -> IntArray:
-        """The largest queue a sensor can have before each step, shape ``(H, J)``: no transfer moves more."""
+        """The largest possible queue of each sensor before each step, shape ``(H, J)``: no transfer moves more."""
         problem, capacity = self.problem, self.problem.scenario.queue_capacity
         most = [problem.queue]
         for arrivals in problem.arrivals[:-1]:
@@ -93,19 +93,19 @@ class Formulation:
 
     @cached_property
     def _overflow(self) -> IntArray:
-        """The most that a sensor can lose in each step, and nothing after the last, shape ``(H + 1, J)``."""
+        """The largest possible loss of each sensor in each step, and 0 after the last, shape ``(H + 1, J)``."""
         most = np.maximum(self._most + self.problem.arrivals - self.problem.scenario.queue_capacity, 0)
         return np.concatenate((most, np.zeros_like(most[:1])))
 
     def _affordable(self) -> IntArray:
-        """Packets that each battery pays for over the best link of all, that from right above, shape ``(J,)``."""
+        """Packets that each battery pays for over the best link, the one from right above, shape ``(J,)``."""
         world = self.problem.scenario
-        # In a world so noisy that nothing gets through, as little as flying it does.
+        # The lower limit is that of the flown world, for a world so noisy that no packet arrives.
         joules = world.transmit_power_w * world.packet_bits / max(float(rate_bps(0.0, world)), 1e-12)
         return np.asarray(np.floor(np.minimum(self.problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
 
     def _fly(self, uav: int) -> None:
-        """The variables of one UAV: velocities within 0..max, fixed ones as they are, and where it can serve."""
+        """Add one UAV's variables: velocities within 0..max, the fixed ones, and the sensors that it can serve."""
         problem, model = self.problem, self.model
         fastest = problem.scenario.max_velocity
         fixed = problem.fixed.get(uav, np.empty((0, 2), dtype=np.int64))
@@ -130,7 +130,7 @@ class Formulation:
         self.flown.append(row)
 
     def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray, start: int) -> None:
-        """A Boolean for every sensor that the UAV can serve in this step, one a level of packets."""
+        """Add a Boolean for every sensor that the UAV can serve in this step and for every level of packets."""
         servable = packets.any(axis=0)
         if self.problem.usable is not None:
             servable &= self.problem.usable[step]
@@ -143,7 +143,7 @@ class Formulation:
                 self.serves[Serve(uav, sensor, step, level, needed)] = literal
 
     def _levels(self, packets: IntArray) -> list[tuple[int, int]]:
-        """The packets that a transfer is taken to move, and those that its link must be able to, level by level."""
+        """By level, the packets that a transfer moves in the model, and those that its link must be able to move."""
         levels = np.unique(packets[packets > 0]).tolist()
         match self._links:
             case "exact":
@@ -154,7 +154,7 @@ class Formulation:
                 return [(levels[-1], levels[0])]
 
     def _exclude(self) -> None:
-        """A UAV serves at most one sensor in a step, a sensor at most one UAV."""
+        """Let a UAV serve at most one sensor in a step, and a sensor at most one UAV."""
         rivals: dict[tuple[str, int, int], list[Any]] = defaultdict(list)
         for serve, literal in self.serves.items():
             rivals["uav", serve.uav, serve.step].append(literal)
@@ -172,12 +172,12 @@ class Formulation:
         return visits
 
     def _store(self, sensor: int, affordable: int, visits: list[Visits]) -> None:
-        """The queue of one sensor, what overflows."""
+        """Add one sensor's queue and its losses."""
         problem, model, capacity = self.problem, self.model, self.problem.scenario.queue_capacity
-        came = [int(problem.queue[sensor]), *problem.arrivals[:, sensor].tolist()]
-        queue: list[Any] = [came[0]]
+        supply = [int(problem.queue[sensor]), *problem.arrivals[:, sensor].tolist()]
+        queue: list[Any] = [supply[0]]
         lost: list[Any] = []
-        for step, arrived in enumerate(came[1:]):
+        for step, arrived in enumerate(supply[1:]):
             filled = int(self._most[step, sensor]) + arrived
             after = model.new_int_var(min(arrived, capacity), min(filled, capacity), "")
             over = model.new_int_var(max(0, arrived - capacity), int(self._overflow[step, sensor]), "")
@@ -187,23 +187,23 @@ class Formulation:
                 model.add(after + over >= arrived)
             queue.append(after)
             lost.append(over)
-        if sum(came) > affordable:
-            # What was there and what came is lost, left or paid for.
-            model.add(_total(lost) + queue[-1] >= sum(came) - affordable)
-        self._must_visit(came, lost, visits, capacity)
+        if sum(supply) > affordable:
+            # Every packet is lost, still in the queue, or paid for by the battery.
+            model.add(_total(lost) + queue[-1] >= sum(supply) - affordable)
+        self._must_visit(supply, lost, visits, capacity)
         self._queue.append(queue[1:])
         self._lost.append(lost)
         self._expect(sensor, lost, visits)
 
-    def _must_visit(self, came: list[int], costs: list[Any], visits: list[Visits], room: int) -> None:
-        """What comes in a run of steps without a visit and has no room is paid for.
+    def _must_visit(self, supply: list[int], costs: list[Any], visits: list[Visits], room: int) -> None:
+        """Let every run of steps without a visit cost the packets that have no room.
 
-        ``costs[t]`` is what is paid in step t, and ``came[0]`` what was there before step 0.
+        ``costs[t]`` is the cost of step t, and ``supply[0]`` the queue before step 0.
         """
-        for start in range(len(came)):
-            excess = came[start] - room
-            for end in range(start + 1, len(came)):
-                excess += came[end]
+        for start in range(len(supply)):
+            excess = supply[start] - room
+            for end in range(start + 1, len(supply)):
+                excess += supply[end]
                 if excess > room:
                     break
                 if excess > 0:
@@ -211,7 +211,7 @@ class Formulation:
                     self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
 
     def _expect(self, sensor: int, lost: list[Any], visits: list[Visits]) -> None:
-        """The cost of one sensor: what it loses as it counts, or what is paid for leaving it alone if that is more."""
+        """Add one sensor's cost: its weighted loss, or the price of neglecting it if that is more."""
         neglect, weights = self._neglect, self.problem.weights
         packet = SCALE if weights is None else round(SCALE * float(weights[sensor]))
         if neglect is None:
@@ -230,7 +230,7 @@ class Formulation:
             self._costs.append(cost)
 
     def hint(self, actions: IntArray) -> None:
-        """Start from these actions ``(H, I, 2)``, which begin with the fixed ones."""
+        """Let the search start from these actions ``(H, I, 2)``, which begin with the fixed ones."""
         course = fly(self.problem, actions)
         flown = np.cumsum(actions[:, :, 1], axis=0)
         for uav, row in enumerate(self.flown):
@@ -247,7 +247,7 @@ class Formulation:
                 self.model.add_hint(self._lost[sensor][step], int(course.lost[step, sensor]))
 
     def _served(self, actions: IntArray, course: Course) -> set[Serve]:
-        """The best level of every transfer that these actions made."""
+        """The best level of every transfer of these actions."""
         best: dict[tuple[int, int], Serve] = {}
         for serve in self.serves:
             made = (serve.step, serve.uav)
@@ -272,12 +272,12 @@ class Formulation:
         return np.stack([sensor, velocity.T], axis=-1)
 
     def _spare(self, chosen: IntArray, uav: int, flown: int, queue: IntArray) -> int:
-        """A sensor for a UAV that needs none, so that it takes no other UAV's transfer."""
+        """A sensor for a UAV that needs none, so that it blocks no other UAV's transfer."""
         free = ~np.isin(np.arange(self.problem.sensors), chosen)
         distance = self.problem.distance(uav, np.array(flown))
         if free.any():
             return int(np.argmin(np.where(free, distance, np.inf)))
-        # With fewer sensors than UAVs: one that an earlier UAV has served by then, else the farthest.
+        # With fewer sensors than UAVs: a sensor that an earlier UAV serves, otherwise the farthest.
         earlier = chosen[:uav]
         return int(earlier[0]) if len(earlier) else int(np.argmax(distance))
 

@@ -1,4 +1,4 @@
-"""A quick plan to start a search from, and to fall back on: every UAV looks one step ahead, again and again."""
+"""A quick plan, as the start of a search and as a fallback: in every step each UAV looks one step ahead."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from shared.fleetplan.problem import FleetProblem
 from shared.fleetplan.risk import normal_below
 from shared.scenario import Scenario
 
-# What a metre a second is worth in urgent packets: a UAV that dwells on little lets the rest of its way overflow.
+# The worth of a metre a second in urgent packets: while a UAV dwells at few packets, sensors further on overflow.
 _VELOCITY_BONUS = 0.5
 
 
 def look_ahead(problem: FleetProblem) -> IntArray:
-    """Actions ``(H, I, 2)`` that begin with the fixed ones and go on greedily.
+    """Actions ``(H, I, 2)`` that begin with the fixed ones and continue greedily.
 
     Step by step and in the order of their indices, every UAV takes the sensor and the velocity of greatest
     ``U_j min(q_j, packets movable from the new position) + 0.5 v``, with the urgency
-    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.urgency`, its Poisson taken as a normal of the same mean.
-    Sensors that another takes in the same step are left to it. Batteries are taken to last. The urgent packets of a
-    sensor count as often as its lost ones, and in reach of it what is paid for it being late counts too.
+    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.urgency`, with a normal of the same mean for its Poisson.
+    No two UAVs take a sensor in the same step. Batteries are assumed to last. A sensor's urgent packets have the weight
+    of its lost ones, and for a sensor in reach the price of being overdue counts too.
     """
     world = problem.scenario
     window = max(1, math.ceil(world.overflow_horizon_steps))
@@ -37,13 +37,13 @@ def look_ahead(problem: FleetProblem) -> IntArray:
         late = None if problem.late is None else problem.late[since, step, every]
         if problem.weights is not None:
             urgent = urgent * problem.weights
-        told = {uav: fixed[step] for uav, fixed in problem.fixed.items() if step < len(fixed)}
+        fixed_now = {uav: fixed[step] for uav, fixed in problem.fixed.items() if step < len(fixed)}
         free = np.ones(problem.sensors, dtype=np.bool_) if problem.usable is None else problem.usable[step].copy()
-        free[[int(sensor) for sensor, _ in told.values()]] = False
+        free[[int(sensor) for sensor, _ in fixed_now.values()]] = False
         moved = np.zeros(problem.sensors)
         for uav in range(problem.uavs):
-            if uav in told:
-                sensor, velocity = told[uav].tolist()
+            if uav in fixed_now:
+                sensor, velocity = fixed_now[uav].tolist()
                 packets = _links(problem, uav, flown[uav] + np.array([velocity]))[0]
             else:
                 links = _links(problem, uav, flown[uav] + problem.levels)
@@ -59,9 +59,9 @@ def look_ahead(problem: FleetProblem) -> IntArray:
 
 
 def _urgency(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArray:
-    came = np.maximum(rate * world.overflow_horizon_steps, 1e-9)
+    arrived = np.maximum(rate * world.overflow_horizon_steps, 1e-9)
     room = world.queue_capacity - queue
-    return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * normal_below((came - room) / np.sqrt(came)))
+    return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * normal_below((arrived - room) / np.sqrt(arrived)))
 
 
 def _links(problem: FleetProblem, uav: int, velocity: IntArray) -> IntArray:
@@ -76,7 +76,7 @@ def _best(
     levels: IntArray,
     late: FloatArray | None,
 ) -> tuple[int, int]:
-    """Sensor and index of the velocity level, of links ``(levels, J)``."""
+    """The best sensor and the index of its velocity level, from links ``(levels, J)``."""
     worth = urgent * np.minimum(queue, links)
     if late is not None:
         worth = worth + late * (links > 0)

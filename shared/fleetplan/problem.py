@@ -1,4 +1,4 @@
-"""What a fleet's plan is made for, what a plan is, and what becomes of the sensors when it is flown."""
+"""The problem of planning for a fleet, and the course of the sensors' queues under a plan."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from shared.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class FleetProblem:
-    """A fleet, its sensors, and what arrives over a horizon of H steps.
+    """A fleet, its sensors, and the arrivals over a horizon of H steps.
 
     Attributes:
         scenario: the physics: channel, velocities, step, queue capacity W, transmit power.
-        trajectories: one a UAV, I of them.
-        progress_m: shape ``(I,)``, how far along each UAV is.
+        trajectories: one for each of the I UAVs.
+        progress_m: shape ``(I,)``, each UAV's progress along its trajectory.
         places: shape ``(J, 2)``, metres.
         queue: shape ``(J,)``, whole packets, 0..W.
         battery: shape ``(J,)``, joules.
         arrivals: shape ``(H, J)``, whole packets that arrive in each step, after the transfers.
-        fixed: by UAV, its first actions ``(n, 2)`` (sensor, velocity), n at most H, which the plan must begin with.
-        usable: shape ``(H, J)``, where a plan may serve a sensor in a step; ``None``: everywhere.
-            Fixed actions are not held to it.
-        risk: shape ``(H + 1, H + 1, J)``, for arrivals that are only expected: ``risk[s, e]`` are the packets that a
-            sensor is expected to lose in step e (H stands for all later steps) if nobody has visited it since step s
-            began. Its last visit was then in step s - 1 and emptied it; s = 0 means before the plan. Only s <= e
-            counts. ``None``: arrivals are certain.
-        allowed: shape ``(V,)``, the velocities 0..V - 1 that a plan may fly at; ``None``: all. Fixed actions are not
-            held to it.
-        weights: shape ``(J,)``, how many times each sensor's lost packets count; ``None``: once.
-        late: shape ``(H + 1, H + 1, J)`` as ``risk``: packets that are paid for leaving a sensor alone so long, beside
-            what it loses. Never less for an earlier s. ``None``: nothing.
+        fixed: by UAV, its first actions ``(n, 2)`` (sensor, velocity), n at most H, which begin every plan.
+        usable: shape ``(H, J)``, whether a plan may serve a sensor in a step; ``None``: always. Fixed actions need not
+            obey it.
+        risk: shape ``(H + 1, H + 1, J)``, for uncertain arrivals: ``risk[s, e]`` is each sensor's expected loss in
+            step e (H stands for all later steps) if no UAV has visited it since step s began. Its last visit was then
+            in step s - 1 and emptied it; s = 0 means before the plan. Only s <= e counts. ``None``: arrivals are
+            certain.
+        allowed: shape ``(V,)``, whether a plan may fly each velocity 0..V - 1; ``None``: all. Fixed actions need not
+            obey it.
+        weights: shape ``(J,)``, the factor of each sensor's lost packets; ``None``: 1.
+        late: shape ``(H + 1, H + 1, J)`` as ``risk``: the price in packets of not visiting a sensor for so long,
+            beside its losses. Never less for an earlier s. ``None``: 0.
 
     Raises:
         ValueError: a shape or a value is wrong; the message names the field.
@@ -108,20 +108,20 @@ class FleetProblem:
 
     @property
     def levels(self) -> IntArray:
-        """The velocities that a plan may fly at, slowest first."""
+        """The velocities that a plan may fly, slowest first."""
         every = np.arange(self.scenario.max_velocity + 1)
         return every if self.allowed is None else every[self.allowed]
 
     @property
     def neglect(self) -> FloatArray | None:
-        """What is paid for leaving sensors alone: the risk as it counts, and lateness; ``None`` where nothing is."""
+        """The price of neglecting sensors: the weighted risk and lateness; ``None`` without either."""
         if self.late is None:
             return self.risk if self.risk is None or self.weights is None else self.risk * self.weights
         risk = np.zeros_like(self.late) if self.risk is None else self.risk
         return self.late + (risk if self.weights is None else risk * self.weights)
 
     def distance(self, uav: int, velocity: IntArray) -> FloatArray:
-        """Horizontal distances to all sensors, ``(..., J)`` metres, after steps at velocities that sum to ``(...)``."""
+        """Horizontal distances to all sensors, metres, ``(..., J)``, after steps whose velocities sum to ``(...)``."""
         progress = self.progress_m[uav] + np.asarray(velocity) * self.scenario.step_s
         offset = self.trajectories[uav].at(progress)[..., None, :] - self.places
         return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
@@ -129,12 +129,12 @@ class FleetProblem:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What becomes of the sensors when actions are flown.
+    """The course of the sensors' queues when a fleet flies its actions.
 
     Attributes:
         queue: shape ``(H + 1, J)``, packets before each step and after the last.
         lost: shape ``(H, J)``, packets.
-        link: shape ``(H, I)``, packets that the link could move; 0 where the transmission failed.
+        link: shape ``(H, I)``, packets that the link could move; 0 for a failed transmission.
     """
 
     queue: IntArray
@@ -145,8 +145,8 @@ class Course:
 def fly(problem: FleetProblem, actions: IntArray) -> Course:
     """Fly actions ``(H, I, 2)`` as the simulated world does: move, transfer, arrive, overflow.
 
-    The transfers go by UAV index; one fails where the link does not hold, where the sensor has served in this step,
-    or where its battery cannot pay for one packet.
+    The transfers go in the order of the UAVs. A transfer fails if the link does not hold, if the sensor has served
+    another UAV in this step, or if its battery cannot pay for one packet.
     """
     capacity = problem.scenario.queue_capacity
     queue, lost = [problem.queue], []
@@ -170,7 +170,7 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
 
 
 def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
-    """The packets that actions lose, and what a plan minimises: those as they count and what is expected above them."""
+    """The lost packets of actions, and the objective of a plan: weighted losses and expected losses above them."""
     course = fly(problem, actions)
     lost = int(course.lost.sum())
     paid = course.lost if problem.weights is None else course.lost * problem.weights
@@ -181,14 +181,14 @@ def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
     cost, every = 0.0, np.arange(problem.sensors)
     for step in range(problem.horizon):
         since[actions[step, course.link[step] > 0, 0]] = step + 1
-        # A sensor visited in this very step has its risk from the next one on.
+        # The risk of a sensor visited in this step begins with the next step.
         expected = np.where(since <= step, neglect[np.minimum(since, step), step, every], 0.0)
         cost += float(np.maximum(expected, paid[step]).sum())
     return lost, cost + float(neglect[since, problem.horizon, every].sum())
 
 
 def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float]]]:
-    """By step, each UAV's sensor, the packets its link can move (``None``: it does not hold), and joules a packet."""
+    """By step: each UAV's sensor, the packets of its link (``None``: it does not hold), and joules a packet."""
     world = problem.scenario
     flown, sensor = np.cumsum(actions[:, :, 1], axis=0), actions[:, :, 0]
     columns = []

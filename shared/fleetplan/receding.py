@@ -1,4 +1,4 @@
-"""Receding-horizon planning over a fleet's belief: plan some steps for all UAVs, fly the first, plan again."""
+"""Receding-horizon planning over a fleet's belief: plan some steps for all UAVs, fly the first, and plan again."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from shared.guidance import NO_GUIDANCE, Guidance
 from shared.scenario import Scenario
 
 _HORIZON = 8
-# Losses this long after the horizon still count, as if nobody came in the meantime.
+# Losses in this many steps after the horizon count too, as if no UAV visited the sensors in the meantime.
 _BEYOND = 4
-# Deterministic seconds of search for a whole fleet's step: what it may take, and what it may take on average, so that
-# a hard world does not cost a multiple of an easy one. A mission begins with some saved.
+# Deterministic seconds of search for a whole fleet's step: the limit, and the average, so that a hard world does not
+# cost a multiple of an easy one. A mission begins with some saved seconds.
 _MOST_WORK = 0.3
 _WORK = 0.1
 _SAVED_WORK = 1.0
-# Larger fleets plan UAV by UAV, each with the others' plans as they stand, and less far.
+# Larger fleets plan UAV by UAV, each with the others' present plans, and fewer steps ahead.
 _JOINT_UAVS = 4
 _NEAR_HORIZON = 4
 _MOST_SENSORS = 40
@@ -36,17 +36,17 @@ _NEAR_SENSORS = 16
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A plan to be searched for, taken from a belief at once: another thread may search.
+    """The problem of one plan, copied from a belief, so that another thread may search.
 
     Attributes:
-        step: the plan's first.
-        uavs: the columns of the problem's UAVs, by index.
-        free: those of them whose actions the plan may choose.
-        kept: shape ``(n,)``, IDs of the sensors planned for; the problem has one more, nowhere.
-        problem: what to solve.
+        step: the plan's first step.
+        uavs: the index of each UAV of the problem, by its column.
+        free: the UAVs whose actions the plan may choose.
+        kept: shape ``(n,)``, IDs of the sensors in the plan; the problem has one more, which is nowhere.
+        problem: to solve.
         before: shape ``(H, I, 2)``, the last plan in the problem's terms.
         work: deterministic seconds that the search may take.
-        saved: whether so much was saved that the search may begin from the last plan alone.
+        saved: whether enough seconds are saved to start the search from the last plan alone.
     """
 
     step: int
@@ -59,7 +59,7 @@ class Draft:
     saved: bool
 
     def search(self, seconds: float = math.inf) -> Plan:
-        """The best plan found within the work and the wall clock, never worse than what it starts from.
+        """The best plan found within the work and the wall clock, never worse than the search's start.
 
         Raises:
             ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
@@ -74,17 +74,17 @@ class Draft:
 class RecedingHorizon:
     """Plan eight steps ahead for the fleet with CP-SAT, fly the first, and plan again.
 
-    What is minimised are the packets expected to be lost in those steps and, with nobody coming, in four more; see
-    :func:`shared.fleetplan.neglect`. A plan is made for all UAVs that are present; those that were told already what to
-    do in this step are held to it. Fleets of more than four plan UAV by UAV, four steps ahead.
+    The objective is the expected number of packets lost in those steps and, without further visits, in four more; see
+    :func:`shared.fleetplan.neglect`. A plan covers all UAVs that are present; the decisions already made in this step
+    are fixed. Fleets of more than four UAVs plan UAV by UAV, four steps ahead.
 
-    The search is limited in the solver's deterministic time, so that a mission repeats to the bit. Steps that are
-    solved early save time for others; where none is left, a short search starts from the better of the last plan and
-    :func:`shared.fleetplan.look_ahead`, and never ends with a worse one.
+    The solver's deterministic time limits the search, so that a mission repeats to the bit. Steps that are solved early
+    save time for others. Without saved time a short search starts from the better of the last plan and
+    :func:`shared.fleetplan.look_ahead`, and never ends with a worse plan.
 
     Attributes:
         plans: by UAV, its planned actions ``(n, 2)``, sensor (-1: none) and velocity, from step ``step`` on.
-        guidance: what plans obey from the next one on.
+        guidance: the next plans obey it.
     """
 
     def __init__(self, scenario: Scenario, belief: FleetBelief) -> None:
@@ -97,35 +97,35 @@ class RecedingHorizon:
         self._saved = _SAVED_WORK
 
     def begin(self, step: int) -> None:
-        """Go on to a later step: the belief advances, and the plans lose what was flown."""
+        """Go to a later step: the belief advances, and the plans lose their flown steps."""
         if step <= self.step:
             return
-        gone = step - self.step
+        passed = step - self.step
         self._belief.advance(step)
         self._saved += _WORK
-        self.plans = {uav: actions[gone:] for uav, actions in self.plans.items()}
+        self.plans = {uav: actions[passed:] for uav, actions in self.plans.items()}
         self.step = step
 
     def draft(self, uavs: Collection[int], taken: Collection[int] = ()) -> Draft | None:
-        """What a plan of this step has to solve in which these UAVs are yet to be told.
+        """The problem of a plan for this step, in which these UAVs have no decision yet.
 
         Args:
-            uavs: they were located in this step.
-            taken: sensors that are given away in this step, beside those that the belief was told of.
+            uavs: UAVs located in this step.
+            taken: sensors reserved in this step, beside those of the belief's decisions.
 
         Returns:
-            None where none of the UAVs flies its trajectory.
+            None if none of the UAVs flies its trajectory.
         """
         belief, step, world = self._belief, self.step, self._scenario
         present = [uav for uav in belief.present(step) if belief.uavs[uav].progress_m is not None]
         free = [uav for uav in (present if self._joint else uavs) if uav in present]
         if not set(uavs) & set(free):
             return None
-        decided = {uav: told for uav, told in belief.decided(step).items() if uav in present}
+        decided = {uav: action for uav, action in belief.decided(step).items() if uav in present}
         left = world.steps - step
         # Past the scenario's last step a fleet may fly on.
         horizon = min(_HORIZON if self._joint else _NEAR_HORIZON, left if left > 0 else _HORIZON)
-        fixed = {u: np.array([told]) for u, told in decided.items()}
+        fixed = {u: np.array([action]) for u, action in decided.items()}
         fixed |= {u: self.plans[u][:horizon] for u in present if u not in free and len(self.plans.get(u, ()))}
         kept = self._worth_planning(free if self._joint else [u for u in uavs if u in present], horizon)
         index = {int(sensor): k for k, sensor in enumerate(kept)}
@@ -154,7 +154,7 @@ class RecedingHorizon:
         return Draft(step, present, free, kept, problem, before, long if saved else _WORK / world.uavs, saved)
 
     def adopt(self, draft: Draft, best: Plan) -> None:
-        """Fly by this plan from now on, unless the fleet has gone on meanwhile."""
+        """Fly this plan from now on, unless the fleet is at a later step."""
         self._saved -= best.work
         if draft.step != self.step:
             return
@@ -165,7 +165,7 @@ class RecedingHorizon:
                 self.plans[uav] = np.stack((names[actions[:, 0]], actions[:, 1]), axis=-1)
 
     def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
-        """The sensors that these UAVs can reach within the horizon; of very many, those that fill first."""
+        """The sensors that these UAVs can reach within the horizon; of too many, the first to fill."""
         belief, world = self._belief, self._scenario
         flown = np.arange(horizon * world.max_velocity + 1) * world.step_s
         near = np.zeros(world.sensors, dtype=np.bool_)
@@ -174,22 +174,22 @@ class RecedingHorizon:
         near |= not near.any()
         room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.rate, 1e-9)
         if self.guidance.wishes:
-            # Where to go is the operator's to say, whatever fills first.
+            # The operator's sensors come before those that fill first.
             room = np.where(np.isfinite(self.guidance.every(world.sensors)), -1.0, room)
         order = np.argsort(np.where(near, room, np.inf), kind="stable")
         return np.sort(order[: min(int(near.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
 
     def _usable(self, kept: IntArray, horizon: int, taken: Collection[int]) -> NDArray[np.bool_]:
-        """All but what others, who were not decided for here, have taken in this step."""
+        """Every sensor and step, except the sensors that other UAVs have reserved in this step."""
         usable = np.ones((horizon, len(kept) + 1), dtype=np.bool_)
         usable[0, :-1] = ~np.isin(kept, list(taken))
         return usable
 
     def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
-        """What is expected of the kept sensors, and of one nowhere that never has a packet."""
+        """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         queue, rate = belief.queue(step)[kept], belief.rate[kept]
-        came = np.rint(queue + np.arange(horizon + 1)[:, None] * rate).astype(np.int64)
+        expected = np.rint(queue + np.arange(horizon + 1)[:, None] * rate).astype(np.int64)
         risk = neglect(
             base=belief.base[kept],
             base_variance=belief.base_variance[kept],
@@ -201,25 +201,25 @@ class RecedingHorizon:
             beyond=self._beyond(horizon),
         )
         return {
-            "queue": np.append(np.minimum(came[0], world.queue_capacity), 0),
+            "queue": np.append(np.minimum(expected[0], world.queue_capacity), 0),
             "battery": np.append(belief.battery[kept], 0.0),
-            "arrivals": np.pad(np.diff(came, axis=0), ((0, 0), (0, 1))),
+            "arrivals": np.pad(np.diff(expected, axis=0), ((0, 0), (0, 1))),
             "risk": np.pad(risk, ((0, 0), (0, 0), (0, 1))),
         }
 
     def _beyond(self, horizon: int) -> int:
-        """Steps after the plan that count."""
+        """The number of steps after the plan that count."""
         left = self._scenario.steps - self.step
         return max(0, min(_BEYOND, left - horizon)) if left > 0 else _BEYOND
 
     def _guided(self, kept: IntArray, horizon: int) -> dict[str, Any]:
-        """What the guidance asks for, of the kept sensors and of one nowhere."""
-        asked: dict[str, Any] = {}
+        """The guidance's part of the problem, for the kept sensors and one nowhere."""
+        orders: dict[str, Any] = {}
         world, step = self._scenario, self.step
         if self.guidance.restricts:
-            asked["allowed"] = self.guidance.allowed(world.max_velocity + 1)
+            orders["allowed"] = self.guidance.allowed(world.max_velocity + 1)
         if self.guidance.wishes:
-            asked["weights"] = np.append(self.guidance.weights(world.sensors)[kept], 1.0)
+            orders["weights"] = np.append(self.guidance.weights(world.sensors)[kept], 1.0)
             late = self.guidance.lateness(step, self._belief.visited, horizon, self._beyond(horizon))
-            asked["late"] = np.pad(late[:, :, kept], ((0, 0), (0, 0), (0, 1)))
-        return asked
+            orders["late"] = np.pad(late[:, :, kept], ((0, 0), (0, 0), (0, 1)))
+        return orders

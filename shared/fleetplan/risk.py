@@ -1,4 +1,4 @@
-"""The packets that a sensor is expected to lose, by how long it is left alone, when its arrivals are only estimated."""
+"""The expected loss of a sensor by the time without a visit, for estimated arrivals."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _erf = np.frompyfunc(math.erf, 1, 1)
 
 
 def normal_below(z: ArrayLike) -> FloatArray:
-    """``Phi(z)``, of the shape of z. By the standard library: planning is to need no more than OR-Tools."""
+    """``Phi(z)``, of the shape of z. It uses the standard library: planning needs no package but OR-Tools."""
     return np.asarray(0.5 * (1.0 + np.asarray(_erf(np.asarray(z) / math.sqrt(2.0)), dtype=np.float64)))
 
 
 def expected_overflow(mean: ArrayLike, variance: ArrayLike, capacity: float) -> FloatArray:
-    """``E[(X - W)+]`` of a normal X, packets: what a queue without a visit has lost when X came, whatever the order.
+    """``E[(X - W)+]`` of a normal X, packets: the loss of a queue without a visit and with X arrivals in any order.
 
     ``(mean - W) Phi(z) + sd phi(z)`` with ``z = (mean - W) / sd``; shapes broadcast.
     """
@@ -38,17 +38,17 @@ def neglect(
     horizon: int,
     beyond: int,
 ) -> FloatArray:
-    """What a plan pays for neglecting sensors: the ``risk`` of a :class:`~shared.fleetplan.problem.FleetProblem`.
+    """The price of neglecting sensors in a plan: the ``risk`` of a :class:`~shared.fleetplan.problem.FleetProblem`.
 
-    In n steps ``n rate`` packets come on average, with the variance ``n rate + n^2 rate_variance``: Poisson's and
-    that of the estimate.
+    In n steps ``n rate`` packets come on average, with the variance ``n rate + n^2 rate_variance``: the Poisson's and
+    the estimate's.
 
     Args:
-        base: packets last known of, ``(J,)``.
+        base: the last known packets, ``(J,)``.
         base_variance: their variance, ``(J,)``.
         age: steps since then, ``(J,)``.
         rate: expected packets a step, ``(J,)``.
-        rate_variance: of that estimate, ``(J,)``.
+        rate_variance: the estimate's variance, ``(J,)``.
         capacity: W, packets.
         horizon: steps H of the plan.
         beyond: steps after the plan whose losses count too, at least 0.

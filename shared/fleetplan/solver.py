@@ -1,4 +1,4 @@
-"""Plans of a fleet: the least packets lost over a horizon, found and bounded by CP-SAT."""
+"""Plans of a fleet with the fewest lost packets over a horizon, found and bounded by CP-SAT."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from shared.fleetplan.formulation import Formulation, Links
 
 _QUICK_WORK = 3.0
-# Steps that a start is planned by.
+# The steps of each plan that makes a start.
 _NEAR = 8
-# One worker first raises the bound by cores, which ends soonest where most sensors lose nothing; where losses are many
-# that finds no plan, and the rest of the work goes to the usual search. Without a limit of work the first never ends.
+# One worker first raises the bound by cores, which is fastest if most sensors lose nothing. With many losses it finds
+# no plan, and the usual search gets the rest of the work. Without a limit of work the first search never ends.
 _STRATEGIES: tuple[tuple[Mapping[str, Any], float], ...] = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
-# Less work than this is gone before the first proves anything.
+# With less work the first search proves nothing.
 _WORK_FOR_CORES = 0.05
 _INTERRUPTED = "INTERRUPTED"
 _USUAL: tuple[tuple[Mapping[str, Any], float], ...] = (({}, 1.0),)
@@ -33,14 +33,14 @@ _USUAL: tuple[tuple[Mapping[str, Any], float], ...] = (({}, 1.0),)
 
 @dataclass(frozen=True)
 class Budget:
-    """How long to search.
+    """The limits of a search.
 
     Attributes:
         work: limit of the solver's deterministic time: about seconds on an idle core, but counted in operations, so
-            that with one worker the same problem gives the same plan whatever the machine is doing.
+            that with one worker the same problem gives the same plan on a busy machine too.
         seconds: limit of the wall clock; the plan then depends on the machine.
         workers: threads.
-        seed: of the solver's randomness.
+        seed: of the solver's random choices.
     """
 
     work: float = math.inf
@@ -50,7 +50,7 @@ class Budget:
 
 
 class News(NamedTuple):
-    """How far a search is: the best plan's objective and the bound proven so far, both in lost packets."""
+    """The progress of a search: the best plan's objective and the proven bound so far, both in lost packets."""
 
     objective: float
     lower_bound: float
@@ -58,15 +58,15 @@ class News(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a fleet does.
+    """A fleet's plan.
 
     Attributes:
         actions: shape ``(H, I, 2)``: sensor, velocity. A UAV with nothing to collect names a sensor that no other
-            one's transfer needs.
-        lost_packets: what flying the actions loses over the horizon, batteries and links as they are.
-        objective: that and what is expected above it; without a ``risk``, the same.
-        lower_bound: proven: no actions have a lower objective, whatever the batteries. With ``cautious`` links it
-            holds only if every link were as weak as those.
+            UAV's transfer needs.
+        lost_packets: the packets that the actions lose over the horizon, with the real batteries and links.
+        objective: these and the expected losses above them; without a ``risk``, the same.
+        lower_bound: proven: no actions have a lower objective, with any batteries. With ``cautious`` links it holds
+            only if every link were as weak as those.
         status: the solver's, such as OPTIMAL, FEASIBLE or UNKNOWN.
         seconds: wall clock, building included.
         work: deterministic time used.
@@ -82,12 +82,12 @@ class Plan:
 
     @property
     def optimal(self) -> bool:
-        """Whether the plan is proven to be the best (with ``cautious`` links: if every link were that weak)."""
+        """Whether the plan is proven to be the best (with ``cautious`` links: if every link were so weak)."""
         return self.objective <= self.lower_bound + 1e-9
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C ended a search; ``plan`` is the best until then, and its bound holds."""
+    """Ctrl-C ended a search; ``plan`` is the best plan found, and its bound holds."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__()
@@ -105,23 +105,23 @@ def plan(
 
     Args:
         problem: to solve.
-        budget: when to stop; without limits, when the optimum is proven.
-        links: how exactly to take what links can move; see :class:`~shared.fleetplan.formulation.Formulation`.
-        hint: actions ``(H, I, 2)`` to start from, such as an earlier plan's shifted by a step. They are the plan
+        budget: the limits; without limits the search ends when the optimum is proven.
+        links: how exactly to take the capacity of links; see :class:`~shared.fleetplan.formulation.Formulation`.
+        hint: actions ``(H, I, 2)`` to start from, such as an earlier plan's, shifted by a step. They become the plan
             unless the search finds better ones.
         on_news: called with each better plan or bound, from a thread of the solver.
 
     Returns:
-        The best plan found; if there is none, the hint, else everyone at full speed.
+        The best plan found; otherwise the hint; without one, all UAVs at full speed.
 
     Raises:
         ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
-        Interrupted: by Ctrl-C, where the budget limits seconds.
+        Interrupted: Ctrl-C came, and the budget limits seconds.
     """
     from shared.fleetplan.formulation import Formulation
 
     begun = time.perf_counter()
-    best = _priced(problem, _begun_as_fixed(problem, hint))
+    best = _priced(problem, _with_fixed(problem, hint))
     found = _Search(None, 0.0, "UNKNOWN", 0.0)
     cores = budget.workers == 1 and budget.work >= _WORK_FOR_CORES
     for strategy, share in _STRATEGIES if cores else _USUAL:
@@ -146,16 +146,16 @@ def plan(
 def least_loss(
     problem: FleetProblem, seconds: float, workers: int = 8, on_news: Callable[[News], None] | None = None
 ) -> Plan:
-    """The plan of least cost and the best bound that can be proven in about so many seconds.
+    """The plan of the least cost and the best bound that can be proven in about ``seconds``.
 
-    It starts from a greedy plan. First it searches quickly with links taken as all alike, too strong for the bound and
-    too weak for the plan; where the two do not meet, with all ``workers``, and then with links as they are.
+    The search starts from a greedy plan. It first searches quickly with uniform links, too strong for the bound and too
+    weak for the plan. If bound and plan do not meet, it searches with all ``workers``, and then with exact links.
 
     Raises:
-        Interrupted: by Ctrl-C.
+        Interrupted: Ctrl-C came.
     """
     begun = time.perf_counter()
-    start = best = _unproven(_priced(problem, _begun_as_fixed(problem, look_ahead(problem))))
+    start = best = _unproven(_priced(problem, _with_fixed(problem, look_ahead(problem))))
     try:
         for best in _improved(problem, start, seconds, workers, on_news):
             if best.optimal:
@@ -169,7 +169,7 @@ def least_loss(
 def _improved(
     problem: FleetProblem, best: Plan, seconds: float, workers: int, on_news: Callable[[News], None] | None
 ) -> Iterator[Plan]:
-    """The best plan and bound after each of several searches; the last one may be cut short by Ctrl-C."""
+    """The best plan and bound after each of several searches; Ctrl-C may interrupt the last one."""
     begun = time.perf_counter()
     quick = Budget(work=_QUICK_WORK)
     searches: list[tuple[Links, Budget, float]] = [
@@ -189,7 +189,7 @@ def _improved(
             return
         now = replace(budget, seconds=max(left * share, 0.01))
         try:
-            found = plan(problem, now, links, best.actions, _told(on_news, best, links))
+            found = plan(problem, now, links, best.actions, _of_all(on_news, best, links))
         except Interrupted as stopped:
             yield _better(best, stopped.plan, links)
             raise
@@ -202,7 +202,7 @@ def _unproven(priced: _Priced) -> Plan:
 
 
 def _receding(problem: FleetProblem, seconds: float) -> IntArray:
-    """Actions from plans of a few steps each, one after another: a start for where the whole is too large."""
+    """Actions from plans of a few steps each, one after another: a start for a problem too large as a whole."""
     begun, flown = time.perf_counter(), []
     now = problem
     while True:
@@ -224,27 +224,27 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
 
 
 def _better(best: Plan, found: Plan, links: Links) -> Plan:
-    """The cheaper plan with the higher of the bounds that hold in the world."""
+    """The cheaper plan, with the higher of the bounds that hold in the world."""
     proven = 0.0 if links == "cautious" else found.lower_bound
     cheaper = min(best, found, key=lambda p: p.objective)
     return replace(cheaper, lower_bound=max(best.lower_bound, proven), work=best.work + found.work)
 
 
-def _told(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
-    """News of one search made news of them all: what too strong or too weak links promise is left out."""
+def _of_all(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
+    """Turn the news of one search into news of all searches, without the promises of too strong or too weak links."""
     if on_news is None:
         return None
 
-    def told(news: News) -> None:
+    def pass_on(news: News) -> None:
         objective = best.objective if links == "hopeful" else min(best.objective, news.objective)
         proven = best.lower_bound if links == "cautious" else max(best.lower_bound, news.lower_bound)
         on_news(News(objective, proven))
 
-    return told
+    return pass_on
 
 
 class _Search(NamedTuple):
-    """What came of one run of the solver; ``actions`` is ``None`` if it found no plan."""
+    """The result of one run of the solver; ``actions`` is ``None`` if it found no plan."""
 
     actions: IntArray | None
     lower_bound: float
@@ -253,7 +253,7 @@ class _Search(NamedTuple):
 
 
 class _Priced(NamedTuple):
-    """Actions and what they cost; ``found`` by the solver, or else given."""
+    """Actions and their cost; ``found`` is true for the solver's own."""
 
     actions: IntArray
     lost_packets: int
@@ -289,13 +289,13 @@ def _search(
             if on_news is not None:
                 on_news(News(self.objective_value / SCALE, self.best_objective_bound / SCALE))
 
-    # Ctrl-C is Python's to see, not the solver's to swallow.
+    # Python handles Ctrl-C, not the solver.
     solver.parameters.catch_sigint_signal = False
     listener = Listener() if on_news is not None else None
     status, stopped = _solved(solver, formulation.model, listener, budget)
     found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
     actions = formulation.actions(solver.value) if found else None
-    # A plan's cost is whole in the formulation's units; what is missing to that is the solver's rounding.
+    # A plan's cost is a whole number of the formulation's units; any fraction is the solver's rounding.
     bound = max(0, math.ceil(solver.best_objective_bound - 1e-6)) / SCALE
     name = _INTERRUPTED if stopped else solver.status_name(status)
     return _Search(actions, bound, name, solver.deterministic_time)
@@ -304,7 +304,7 @@ def _search(
 def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any, bool]:
     """The solver's status, and whether Ctrl-C ended the search.
 
-    Python sees Ctrl-C only between its own instructions of the main thread, so that a long search runs beside it.
+    Python handles Ctrl-C only between instructions of the main thread, so a long search runs in another thread.
     """
     if budget.seconds == math.inf:
         return solver.solve(model, listener), False
@@ -317,17 +317,17 @@ def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any
             return search.result(), True
 
 
-def _begun_as_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
-    """The actions, or everyone at full speed at sensor 0, with the problem's fixed ones at their beginning.
+def _with_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
+    """The actions, or full speed and sensor 0 for all UAVs, with the problem's fixed ones at the beginning.
 
-    Velocities that are not allowed give way to the nearest that are.
+    The nearest allowed velocity replaces a forbidden one.
     """
     if actions is None:
-        begun = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
-        begun[:, :, 1] = problem.levels[-1]
+        start = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
+        start[:, :, 1] = problem.levels[-1]
     else:
-        begun = actions.copy()
-        begun[:, :, 1] = problem.levels[np.abs(begun[:, :, 1, None] - problem.levels).argmin(axis=-1)]
+        start = actions.copy()
+        start[:, :, 1] = problem.levels[np.abs(start[:, :, 1, None] - problem.levels).argmin(axis=-1)]
     for uav, fixed in problem.fixed.items():
-        begun[: len(fixed), uav] = fixed
-    return begun
+        start[: len(fixed), uav] = fixed
+    return start

@@ -37,7 +37,7 @@ FLOWN = {
     f"{BIN}aicvds simulate --world examples/pipeline_world --edge {EDGE}": "--steps 2",
     f"{BIN}aicvds simulate --world examples/pipeline_world --policy eof --out runs/pipeline_world": "--steps 2",
 }
-# The edge that the others are flown against is this one; the commands of "Who may ask" have an edge of their own.
+# The edge that the others are flown against is this one; the commands of "Authentication" have an edge of their own.
 SERVED = [
     f"{BIN}aicvds serve",
     f"AICVDS_LLM_URL=http://localhost:11434/v1 AICVDS_LLM_MODEL=qwen3:8b {BIN}aicvds serve",
@@ -60,6 +60,8 @@ MADE = {
     "make install": "what runs this was installed by it",
     "make demo": "`aicvds demo` is `serve` and `simulate`, which are run here",
     "make test": "this is part of it",
+    "make test-long": "minutes; CI runs it",
+    "make compose": "it needs a Docker engine; CI runs it",
     "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
     "make fuzz": "some minutes; tests/service/api/test_fuzz.py is a short one",

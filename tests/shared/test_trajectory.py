@@ -75,13 +75,13 @@ def test_the_gap_is_the_way_to_the_trajectory() -> None:
 def test_there_and_back_only_the_uav_knows_which() -> None:
     there, back = 40.0, 260.0
     assert progress_of(THERE_AND_BACK, (40.0, 0.0)) == there
-    assert progress_of(THERE_AND_BACK, (40.0, 0.0), told_m=back) == back
-    assert progress_of(THERE_AND_BACK, (40.0, 0.0), told_m=120.0) == there  # it is not there
+    assert progress_of(THERE_AND_BACK, (40.0, 0.0), reported_m=back) == back
+    assert progress_of(THERE_AND_BACK, (40.0, 0.0), reported_m=120.0) == there  # it is not there
 
 
 def test_off_its_trajectory() -> None:
     assert progress_of(SQUARE, (50.0, 30.0)) is None
-    assert progress_of(SQUARE, (50.0, 30.0), told_m=50.0) is None
+    assert progress_of(SQUARE, (50.0, 30.0), reported_m=50.0) is None
     assert progress_of(SQUARE, (50.0, 9.0)) == 50.0
 
 
