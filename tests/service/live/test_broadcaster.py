@@ -318,7 +318,7 @@ def test_a_decision_is_shown_with_its_outcome() -> None:
     history.decided((1.0, 2.0), prompt_of(""), answer_of("a" * 32))
     history.outcome_applied(Outcome(decision_id="a" * 32, cost=1.0))
     history.outcome_applied(Outcome(decision_id="b" * 32, cost=1.0))
-    assert [(one.order, one.settled) for one in history.of("test")] == [(1, 2)]
+    assert [(one.order, one.outcome_order) for one in history.of("test")] == [(1, 2)]
 
 
 def test_a_round_trip_is_in_no_journal_and_old_journals_are_read() -> None:

@@ -66,10 +66,10 @@ def test_pending_decisions_are_bounded_and_the_forgotten_are_unknown() -> None:
     m = mission()
     ids = [decide(m, number, step=number) for number in range(1, 40)]
     with pytest.raises(NotFound):
-        m.find(outcome(ids[0]))
-    assert m.find(outcome(ids[-1])) == "pending"
+        m.pending.find(outcome(ids[0]))
+    assert m.pending.find(outcome(ids[-1])) == "pending"
     assert m.apply(outcome(ids[-1])) is not None
-    assert m.find(outcome(ids[-1])) == "applied"
+    assert m.pending.find(outcome(ids[-1])) == "applied"
 
 
 def test_a_failure_takes_back_only_its_own_visit() -> None:
@@ -154,7 +154,7 @@ def test_one_uav_that_retries_forgets_only_its_own_decisions() -> None:
     other = decide(m, 1, uav_id=1, sensor=2)
     for number in range(2, 60):
         decide(m, number, step=number, uav_id=0)
-    assert m.find(outcome(other)) == "pending"
+    assert m.pending.find(outcome(other)) == "pending"
 
 
 def test_a_uav_that_asks_again_and_again_teaches_once_a_step() -> None:

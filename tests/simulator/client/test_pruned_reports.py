@@ -48,7 +48,7 @@ def test_a_lone_uav_selects_the_edges_sensors(
 ) -> None:
     """A single UAV knows all that the edge knows: from full reports, the edge ranks the sensors alike."""
     # The learning ends before the weights are fetched, so the fetched ones are those that decide.
-    monkeypatch.setattr(LearningQueue, "add", LearningQueue._learn)
+    monkeypatch.setattr(LearningQueue, "add", LearningQueue._train)
     alone = PAPER.model_copy(update={"uavs": 1, "steps": 10})
     world, reports = PipelineWorld(alone), PrunedReports()
     observations, _ = world.reset(seed=3)
