@@ -16,7 +16,7 @@ import pytest
 
 from service.api.app import create_app
 from service.config.settings import Settings
-from service.prompting import token_accounting
+from service.prompting.tokenizer import encoding
 from service.storage.store import Store
 from tests.running import serving
 from tests.waiting import PATIENCE_S
@@ -42,7 +42,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def vocabulary() -> Iterator[None]:
     """One token vocabulary for all edges of this process: to build one takes more than most tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(token_accounting, "encoding", cache(token_accounting.encoding))
+        patch.setattr("service.prompting.token_accounting.encoding", cache(encoding))
         yield
 
 
