@@ -163,7 +163,7 @@ def test_the_command_writes_what_a_mission_can_show(tmp_path: Path, capsys: pyte
     assert "5 of" in capsys.readouterr().out
     assert len(json.loads(out.read_text())["demonstrations"]) == 5
     for options, said in (
-        (["--count", "1000", *look_ahead], "--count asks 1000"),
+        (["--count", "1000", *look_ahead], "--count asks for 1000"),
         (["--count", "1"], "has no decision of planner: record with aicvds explore --teacher both"),
         (["--count", "0"], "--count 0"),
         (["--teacher", "socrates"], "choose one of planner, clairvoyant, look_ahead"),
