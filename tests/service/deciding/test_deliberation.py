@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -13,14 +14,17 @@ from fastapi.responses import Response
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
+from service.deciding.deadline import Deadline
 from service.deciding.deliberation import Deliberation
+from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import LLM
 from service.llm.answers import Completion, NoDecision, TokenPosition
 from service.llm.calibration import calibrated, probabilities
 from service.mission.mission import Mission
-from service.prompting.candidates import velocity_options
+from service.prompting.candidates import CandidateSet, velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
+from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.reach import Reach
 from shared.trajectory import trajectories
@@ -28,7 +32,7 @@ from shared.wire import MissionSpec, Outcome
 from tests.running import listening, serving
 from tests.service.making import PAPER, attended, uav
 from tests.service.stub_llm import FAULTS, StubLlm, misbehaving, said, wait_for
-from tests.waiting import Clock, until
+from tests.waiting import until
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -340,10 +344,15 @@ def test_without_the_llm_the_others_decide(
 ) -> None:
     handler, reason = FAULTS[fault]
     if reason == "llm_timeout":
-        # All but a moment of the LLM's minute is over; the critic has all of it.
-        clock = Clock()
-        clock.ahead_s = 59.8
-        monkeypatch.setattr("service.deciding.deadline.time", clock)
+        # The LLM has a moment, and the rollout evaluator its whole minute.
+        ask = LlmQueries.ask
+
+        async def briefly(
+            self: LlmQueries, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline
+        ) -> LlmAdvice:
+            return await ask(self, mission, candidates, prompt, Deadline(time.perf_counter() + 0.2))
+
+        monkeypatch.setattr(LlmQueries, "ask", briefly)
     with listening(misbehaving(handler)) as url:
         client = edge(mode="guided", llm_url=f"{url}/v1", llm_model="stub-1")
         wait_for(client, "ready")
