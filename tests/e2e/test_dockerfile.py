@@ -155,6 +155,7 @@ def test_every_file_that_is_copied_for_the_model_is_needed(tmp_path: Path) -> No
         assert ran.returncode == 1 and f"No module named '{module}'" in ran.stderr, ran.stdout + ran.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("image", "package", "version", "built"),
     [("edge", "service", "1.2.3", "1.2.3"), ("simulator", "simulator", "", "0.1.0.dev0")],

@@ -77,6 +77,7 @@ def test_bad_use_is_one_clear_line_and_exit_2(args: list[str], env: dict[str, st
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.long
 def test_other_addresses_are_served_with_keys_or_when_told_to(tmp_path: Path) -> None:
     keys = str(tmp_path / "keys.json")
     key = run("keys", "add", "fleet", "--file", keys).stdout.strip()
@@ -158,6 +159,7 @@ def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable
     assert (answer.status_code, answer.json()["reason"]) == (200, "llm_timeout")
 
 
+@pytest.mark.long
 def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..., dict[str, Any]]) -> None:
     body = json.dumps(report()).encode()
     head = "POST /decide HTTP/1.1\r\nHost: edge\r\nContent-Type: application/json\r\n"
@@ -176,6 +178,7 @@ def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..
         process.wait(PATIENCE_S)
 
 
+@pytest.mark.long
 def test_empty_variables_are_unset_ones(tmp_path: Path) -> None:
     """docker-compose passes every variable on, set or not."""
     empty = {f"AICVDS_{name}": "" for name in ("LLM_URL", "LLM_MODEL", "LLM_API_KEY", "LLM_GGUF", "MODE", "TOP_K")}

@@ -56,6 +56,7 @@ async def test_the_edge_decides_every_step_and_hears_every_outcome() -> None:
         assert 0.7 * 10 * leg.velocity - 1 <= math.dist(leg.position, after.position) <= 10 * leg.velocity + 1
 
 
+@pytest.mark.long
 async def test_the_uav_flies_on_when_the_edge_dies() -> None:
     with serving_edge(AICVDS_MODE="policy", AICVDS_STORE="none") as (url, process):
 
@@ -71,6 +72,7 @@ async def test_the_uav_flies_on_when_the_edge_dies() -> None:
     assert sum(leg.packets for leg in flown.legs[5:]) > 0
 
 
+@pytest.mark.long
 async def test_an_edge_that_forgot_the_mission_decides_on() -> None:
     with (
         serving_edge(AICVDS_MODE="policy", AICVDS_STORE="none") as (url, _),

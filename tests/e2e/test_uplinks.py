@@ -96,6 +96,7 @@ def test_delta_decides_as_full_to_the_bit_with_fewer_bytes() -> None:
     assert mean_bytes(delta) < 0.5 * mean_bytes(full)
 
 
+@pytest.mark.long
 def test_delta_is_right_where_requests_and_answers_are_lost() -> None:
     with serving_edge(AICVDS_MODE="value") as (url, _):
         lossy = LossyTransport(Deaf(), drop=0.3, jitter_ms=2, seed=0)
@@ -148,6 +149,7 @@ def test_pruned_reports_name_k_sensors_and_the_rest_is_known() -> None:
         assert {c.sensor_id for c in decision.top_k} <= set(body["sensors"]["id"])
 
 
+@pytest.mark.long
 def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot() -> None:
     with serving_edge(AICVDS_MODE="value") as (url, _):
 

@@ -115,6 +115,7 @@ def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: st
     expect(page.locator("#readout")).to_contain_text(f"UAV 0 at step {STEPS - 1}")
 
 
+@pytest.mark.long
 def test_mode_guided_shows_candidates_with_probabilities_and_trust(visit: Open, start: Start, report: Report) -> None:
     url, _ = start(AICVDS_MODE="guided")
     with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
@@ -160,6 +161,7 @@ def test_it_is_accessible_and_fits(visit: Open, flown: str, scheme: str, width: 
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+@pytest.mark.long
 def test_one_of_several_missions_is_chosen(visit: Open, edge: str, flown: str, tmp_path: Path) -> None:
     first = flown.split("=")[1]
     fly(edge, tmp_path, "--scenario", "pipeline")
@@ -202,6 +204,7 @@ def test_a_mission_that_is_deleted_and_made_again_begins_anew(visit: Open, edge:
     expect(page.locator("#feed li")).to_contain_text("step 5")
 
 
+@pytest.mark.long
 def test_a_lost_connection_is_told_and_taken_up_again(visit: Open, start: Start, report: Report) -> None:
     url, process = start(AICVDS_MODE="value")
     httpx.post(f"{url}/decide", json=report(), timeout=PATIENCE_S)
@@ -221,6 +224,7 @@ def test_a_lost_connection_is_told_and_taken_up_again(visit: Open, start: Start,
         expect(page.locator("#feed li")).to_contain_text("step 7")
 
 
+@pytest.mark.long
 def test_the_page_asks_for_a_key_where_the_edge_does(visit: Open, start: Start, report: Report, tmp_path: Path) -> None:
     keys = str(tmp_path / "keys.json")
     key = run("keys", "add", "fleet", "--file", keys, "--scopes", "decide", "admin").stdout.strip()
@@ -246,6 +250,7 @@ def test_the_page_asks_for_a_key_where_the_edge_does(visit: Open, start: Start, 
     expect(asked).to_be_visible()
 
 
+@pytest.mark.long
 def test_a_hundred_sensors_and_ten_uavs_ten_times_a_second(visit: Open, edge: str) -> None:
     with httpx.Client(base_url=edge, timeout=PATIENCE_S) as client:
         client.put("/missions/many", json={"scenario": "dense"})

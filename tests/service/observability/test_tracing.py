@@ -23,6 +23,7 @@ from tests.waiting import PATIENCE_S
 Report = Callable[..., dict[str, Any]]
 
 
+@pytest.mark.long
 def test_each_line_is_json_and_names_the_mission_and_decision_and_no_secret(tmp_path: Path, report: Report) -> None:
     keys = tmp_path / "keys.json"
     key = run("keys", "add", "fleet", "--file", str(keys), "--scopes", "decide", "admin").stdout.strip()

@@ -91,6 +91,7 @@ def test_the_same_edge_decides_the_same_and_gets_every_outcome(
     assert "cost" in replayed[0]["logged"] and "cost" not in replayed[0]["replayed"]
 
 
+@pytest.mark.long
 def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_fed_back(
     edge: Edge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,6 +121,7 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
     assert f"{24 - sum(same)} decisions were not fed back" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_outcomes_go_with_the_uavs_next_request_or_at_the_end(stub: EdgeStub, run: Path, tmp_path: Path) -> None:
     flown = read_decisions(run / "decisions.jsonl")
     summary = replay_again(run, stub.url, tmp_path / "again", "--deadline-ms", "30000")

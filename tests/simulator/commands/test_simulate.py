@@ -50,6 +50,7 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
         assert words in printed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("awaited", "polled", "message"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
 def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
     stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, message: str
@@ -61,6 +62,7 @@ def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
     assert message in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_an_old_result_is_overwritten_only_with_the_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
     assert simulate.main(arguments) == 0
@@ -125,6 +127,7 @@ def test_an_edge_that_never_decides_is_code_1(
     assert summary_in(tmp_path).by_reason == {"edge_refused": 6}
 
 
+@pytest.mark.long
 def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
     # It is interrupted while the eighth decision is waited for: the second of the third step.
     stub.script, stub.otherwise = ["ok"] * 7, "slow"

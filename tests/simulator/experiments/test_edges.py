@@ -73,6 +73,7 @@ def test_whether_there_is_an_llm_to_ask() -> None:
     assert Llm("none", edge="http://e:8000").available
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backing", [CHANCE, WORST])
 def test_an_edge_takes_a_stand_in_for_an_llm(backing: Backing, tmp_path: Path) -> None:
     with edge_for(backing, Llm(), tmp_path / "edge.log", Console(quiet=True)) as edge:

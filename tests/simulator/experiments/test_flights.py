@@ -97,6 +97,7 @@ def test_the_same_flights_give_the_same_files(tmp_path: Path) -> None:
     assert [(tmp_path / name).read_bytes() for name in files] == before
 
 
+@pytest.mark.long
 def test_two_processes_give_the_flights_of_one(tmp_path: Path) -> None:
     alone = run_in(tmp_path / "one").make([declared()])
     pair = run_in(tmp_path / "two")
@@ -149,6 +150,7 @@ def test_a_network_trained_anew_is_another_scheme(tmp_path: Path, monkeypatch: p
     assert len(hashes) == 2 and None not in hashes
 
 
+@pytest.mark.long
 def test_planners_fly_in_a_process_of_their_own_and_none_undercuts_the_bound(tmp_path: Path) -> None:
     [result] = run_in(tmp_path, seeds=2).make([declared(local("eof"), local("mpc"), BOUND)])
     least = result.bound["lost_packets"].values

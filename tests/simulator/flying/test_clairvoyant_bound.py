@@ -94,6 +94,7 @@ def test_no_policy_loses_less_than_the_bound(site: Site, seed: int) -> None:
         assert bound.lower_bound <= lost, name
 
 
+@pytest.mark.long
 def test_no_policy_learned_or_not_loses_less_than_the_bound_on_worlds_like_the_papers() -> None:
     site = Site(SCENARIOS["paper"].model_copy(update={"steps": 8, "initial_queue_min": 0.9}))
     bound = clairvoyant(site, 5, workers=1)
@@ -102,6 +103,7 @@ def test_no_policy_learned_or_not_loses_less_than_the_bound_on_worlds_like_the_p
         assert bound.lower_bound <= lost, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["paper", "pipeline"])
 def test_the_plan_loses_in_the_world_as_many_packets_as_predicted(name: str) -> None:
     site = Site(SCENARIOS[name])

@@ -68,12 +68,14 @@ def test_a_fleet_mostly_follows_its_teacher_and_sometimes_deviates(
     assert 0.4 < share < 1
 
 
+@pytest.mark.long
 def test_a_planner_has_references_after_deviations_too() -> None:
     left = [step for step in explore(SHORT, 8, "planner") if not flown_as_advised(step)]
     assert left
     assert all(step.reference is not None for step in left)
 
 
+@pytest.mark.long
 def test_a_planner_without_deviations_is_the_policy_mpc(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Planner, "deviations", 0.0)
     steps = list(explore(SHORT, 8, "planner"))

@@ -54,6 +54,7 @@ def flying(stub: EdgeStub, out: Path, port: int, steps: int) -> Iterator[subproc
         process.communicate()
 
 
+@pytest.mark.long
 def test_the_last_scrape_has_the_whole_flight(stub: EdgeStub, tmp_path: Path) -> None:
     port, last = free_port(), dict[str, float]()
     with flying(stub, tmp_path, port, steps=4) as process:
@@ -89,6 +90,7 @@ def test_a_flight_that_is_never_scraped_does_not_wait(stub: EdgeStub, tmp_path: 
     assert simulate.main(arguments) == 0
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("for_ever")
 def test_an_interrupted_flight_waits_for_no_scrape(stub: EdgeStub, tmp_path: Path) -> None:
     # The second step is never flown.
