@@ -1,4 +1,4 @@
-"""Hard rules for an LLM's answer, whatever it says and whoever made it say so.
+"""Hard rules for an LLM's answer, whatever it says and whatever made it say so.
 
 They need no judgement: a sensor that is out of the UAV's reach after the step, or whose battery is known to be flat,
 brings nothing, and one that another UAV has meanwhile fails. An answer that breaks a rule is overridden by the

@@ -167,7 +167,7 @@ def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..
     with serving_edge(AICVDS_MODE="policy") as (url, process):
         assert httpx.get(f"{url}/readyz", timeout=PATIENCE_S).status_code == 200
         door = ("127.0.0.1", int(url.rpartition(":")[2]))
-        # It stands still for longer than uvicorn's tick: who has come, and that it is to end, it finds at once.
+        # Stopped for longer than uvicorn's tick, the edge finds the connection and the signal together when it goes on.
         process.send_signal(signal.SIGSTOP)
         with socket.create_connection(door, timeout=PATIENCE_S) as early:
             early.sendall(head.encode() + body)

@@ -154,7 +154,7 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
             hasty = [report(step=step, uav_id=i, deadline_ms=500) for i in range(1, 10)]
             late = [pool.submit(client.post, "/decide", json=body) for body in hasty]
             until(partial(all_came, queue, before + 9, late))
-            # Longer than a deadline: who is still in the queue has been waiting for that long.
+            # Longer than a deadline: every UAV in the queue has waited that long.
             clock.now_s += 100.0
             slot.open()
             # The LLM's word was heard, where another has the sensor that it names too.

@@ -162,7 +162,7 @@ def test_who_was_asked_later_and_answered_later_is_no_failure(
             await never.passed()
 
     asked: list[str] = []
-    # Whoever is hung up on has been waited for longer than any deadline.
+    # By this clock, a server whose call is cancelled had longer than any deadline.
     monkeypatch.setattr("service.llm.server.time", Striding(100.0))
     with (
         serving(Slow("first", "0 7", asked).app) as first,

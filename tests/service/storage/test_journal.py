@@ -151,7 +151,7 @@ def test_while_the_store_is_locked_decisions_go_on_and_feedback_is_refused(
         try:
             first = client.post("/decide", json=report(step=3, outcome=owed[0]))
             assert (first.status_code, first.json()["stored"]) == (200, False)
-            # Nobody waits for a store that is known to fail: each that did would take two minutes here.
+            # No answer waits for a store that is known to fail: each wait would take two minutes here.
             for step in range(4, 40):
                 answer = client.post("/decide", json=report(step=step))
                 assert (answer.status_code, answer.json()["stored"]) == (200, False)

@@ -267,7 +267,7 @@ async def test_a_cancelled_call_is_not_sent_again(
         call.cancel()
         await asyncio.gather(call, return_exceptions=True)
         pause.open()
-        # Nobody is left who could.
+        # No task is left that could send it again.
         assert call.cancelled() and asyncio.all_tasks() == {asyncio.current_task()}
         assert stub.request_count == 1
 
