@@ -41,10 +41,14 @@ class Links:
     scenario: Scenario
 
     @classmethod
-    def at(cls, distance_m: ArrayLike, scenario: Scenario) -> Self:
-        """The links at these distances."""
+    def at(cls, distance_m: ArrayLike, scenario: Scenario, excess_db: ArrayLike = 0.0) -> Self:
+        """The links at these distances.
+
+        ``excess_db`` is the loss above the mean path loss, dB; distances and excess are broadcast together.
+        """
         d = np.asarray(distance_m, dtype=np.float64)
-        return cls(d, path_loss_db(d, scenario), scenario)
+        loss = np.asarray(path_loss_db(d, scenario) + np.asarray(excess_db, dtype=np.float64))
+        return cls(d if d.shape == loss.shape else np.broadcast_to(d, loss.shape), loss, scenario)
 
     def __getitem__(self, which: Any) -> Self:
         """The links at an index, which may be any index of an array."""
@@ -102,11 +106,17 @@ def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     return Links.at(distance_m, scenario).rate_bps
 
 
-def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.int64]:
-    """Whole packets that one step can move at that distance; 0 where the link fails."""
-    d = np.asarray(distance_m, dtype=np.float64)
+def packets_per_step(distance_m: ArrayLike, scenario: Scenario, excess_db: ArrayLike = 0.0) -> NDArray[np.int64]:
+    """Whole packets that one step can move at that distance; 0 where the link fails.
+
+    ``excess_db`` as for :meth:`Links.at`.
+    """
+    d, excess = np.asarray(distance_m, dtype=np.float64), np.asarray(excess_db, dtype=np.float64)
+    # Broadcasting takes as long as a small array's path loss.
+    if excess.ndim:
+        d, excess = np.broadcast_arrays(d, excess)
     packets = np.zeros(d.shape, dtype=np.int64)
     # The path loss takes most of the time, and of many sensors most are out of radio range.
     near = d <= scenario.radio_radius_m
-    packets[near] = Links.at(d[near], scenario).packets
+    packets[near] = Links.at(d[near], scenario, excess[near] if excess.ndim else excess).packets
     return packets

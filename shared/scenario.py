@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from shared.names import few_names
+from shared.unmodelled import Unmodelled
 
 Point = tuple[float, float]
 
@@ -17,11 +18,12 @@ Waypoint = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 _MAX_ARRIVALS = 10_000_000
 
 
-class Scenario(BaseModel):
+class Scenario(Unmodelled):
     """One world's numbers. The defaults are the scenario ``paper``.
 
     Lengths are in metres, times in seconds unless a field says steps, powers in watts,
     energies in joules, path losses in dB (the channel gain is minus the path loss).
+    The fields of :class:`shared.unmodelled.Unmodelled` are of this model too, and only the simulator reads them.
 
     Raises:
         pydantic.ValidationError: a field is out of bounds, or two fields contradict each other.
@@ -119,6 +121,8 @@ class Scenario(BaseModel):
         for uav, route in enumerate(self.routes):
             if len(set(route)) < 2:
                 raise ValueError(f"routes[{uav}] needs at least two different waypoints")
+        if self.dead_radios > self.sensors:
+            raise ValueError(f"dead_radios is {self.dead_radios}, there are {self.sensors} sensors")
         if self.sensors * self.steps > _MAX_ARRIVALS:
             raise ValueError(f"sensors x steps exceeds {_MAX_ARRIVALS:,}: a world draws that many arrivals at once")
         return self
@@ -144,6 +148,8 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario(name="stress", link_share=0.35, arrival_rate_min=4.0, arrival_rate_max=12.0),
         Scenario(name="dense", sensors=100, uavs=10),
         Scenario(name="lossy_uplink", uplink_drop=0.1, uplink_jitter_ms=200.0),
+        # 8 dB in all, half of the variance each.
+        Scenario(name="shadowed", shadowing_db=5.66, route_shadowing_db=5.66),
     )
 }
 

@@ -9,11 +9,12 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray, IntArray, packets_per_step, path_loss_db, rate_bps
+from shared.channel import FloatArray, IntArray
 from shared.scenario import SCENARIOS, Scenario
 from simulator.world import Cost
 from simulator.world.fleet import Fleet
 from simulator.world.sensors import Sensors, Streams
+from simulator.world.true_channel import TrueChannel
 
 
 class BatchObservation(TypedDict):
@@ -67,13 +68,14 @@ class Draw:
     """The random part of B worlds, as ``PipelineWorld.reset`` draws it from each seed.
 
     ``positions`` ``(B, J, 2)`` and ``start_m`` ``(B, I)``, metres; ``initial_queue`` ``(B, J)`` and ``arrivals``
-    ``(B, T, J)``, packets.
+    ``(B, T, J)``, packets; ``channel``, of the B worlds.
     """
 
     positions: FloatArray
     initial_queue: IntArray
     arrivals: IntArray
     start_m: FloatArray
+    channel: TrueChannel
 
     @classmethod
     def of(cls, scenario: Scenario, seeds: Sequence[int], trace: IntArray | None = None) -> Draw:
@@ -85,6 +87,7 @@ class Draw:
             initial_queue=np.stack([one.initial_queue for one in sensors]),
             arrivals=np.stack([one.arrivals for one in sensors]),
             start_m=np.stack([Fleet.draw(scenario, stream.angles).start_m for stream in streams]),
+            channel=TrueChannel.stack([TrueChannel.draw(scenario, stream) for stream in streams]),
         )
 
 
@@ -136,7 +139,7 @@ class VectorWorld:
         # Row b * J + j of the flattened true state, for entry (b, i, j) of the UAVs' observations.
         columns = np.arange(draw.initial_queue.size).reshape(-1, 1, shape[-1])
         self._row_of: IntArray = np.broadcast_to(columns, shape).ravel()
-        self._update_links()
+        self._update_links(0)
         return self._observe()
 
     def step(self, sensors: ArrayLike, velocities: ArrayLike) -> tuple[BatchObservation, BatchStep]:
@@ -148,7 +151,7 @@ class VectorWorld:
         """
         draw, chosen, velocity = self._checked(np.asarray(sensors), np.asarray(velocities))
         self._progress = self._progress + velocity * self.scenario.step_s
-        self._update_links()
+        self._update_links(self.steps_flown + 1)
         failed, moved, collected = self._collect(chosen)
         filled = self.queue + draw.arrivals[:, self.steps_flown]
         self.queue = np.minimum(filled, self.scenario.queue_capacity)
@@ -195,7 +198,7 @@ class VectorWorld:
                 raise ValueError(f"{name} are not all in 0..{last}")
         return self._draw, sensors.astype(np.int64, copy=False), velocities
 
-    def _update_links(self) -> None:
+    def _update_links(self, instant: int) -> None:
         """Update the UAVs' positions, their distances to the sensors, the sensors heard and the usable links."""
         assert self._draw is not None
         self._position = self._fleet.at(self._progress)
@@ -205,19 +208,27 @@ class VectorWorld:
         )
         # The path loss is the costliest number of a step, and is needed only within the radio radius.
         self._heard = np.flatnonzero(self._distance <= self.scenario.radio_radius_m)
-        self._loss = path_loss_db(self._distance.ravel()[self._heard], self.scenario)
+        channel = self._draw.channel
+        self._excess = channel.excess_db(self._position)
+        links = channel.links(self._distance.ravel()[self._heard], self._excess.ravel()[self._heard])
+        self._gain = links.gain_db
         self._usable = np.zeros(self._distance.shape, dtype=np.bool_)
-        self._usable.ravel()[self._heard] = self._loss < self.scenario.path_loss_limit_db
+        self._usable.ravel()[self._heard] = links.hold
+        self._usable &= channel.working(instant)
 
     def _collect(self, chosen: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """Serve the UAVs in order; returns f and the packets moved, each ``(B, I)``, and by sensor, ``(B, J)``."""
-        reach = np.take_along_axis(self._distance, chosen[..., None], axis=2)[..., 0]
-        usable = np.take_along_axis(self._usable, chosen[..., None], axis=2)[..., 0]
+        assert self._draw is not None
+        reach, excess, usable = (
+            np.take_along_axis(of_all, chosen[..., None], axis=2)[..., 0]
+            for of_all in (self._distance, self._excess, self._usable)
+        )
         budget = np.zeros(chosen.shape, dtype=np.int64)
         energy = np.full(chosen.shape, np.inf)
-        budget[usable] = packets_per_step(reach[usable], self.scenario)
+        links = self._draw.channel.links(reach[usable], excess[usable])
+        budget[usable] = links.packets
         with np.errstate(divide="ignore"):
-            airtime_s = self.scenario.packet_bits / rate_bps(reach[usable], self.scenario)
+            airtime_s = self.scenario.packet_bits / links.rate_bps
         energy[usable] = self.scenario.transmit_power_w * airtime_s
         served = np.zeros(self.queue.shape, dtype=np.bool_)
         collected = np.zeros(self.queue.shape, dtype=np.int64)
@@ -242,7 +253,7 @@ class VectorWorld:
         heard, row = self._heard, self._row_of[self._heard]
         self._heard_queue.ravel()[heard] = self.queue.ravel()[row]
         self._heard_battery.ravel()[heard] = self.battery.ravel()[row]
-        self._heard_gain.ravel()[heard] = -self._loss
+        self._heard_gain.ravel()[heard] = self._gain
         self._last_heard.ravel()[heard] = self.steps_flown
         assert self._draw is not None
         shape = self._last_heard.shape

@@ -18,6 +18,7 @@ from simulator.world.actions import checked_actions
 from simulator.world.beacons import Beacons
 from simulator.world.fleet import Fleet
 from simulator.world.sensors import Sensors, Streams
+from simulator.world.true_channel import LOSS_BOUNDS_DB, TrueChannel
 
 Cost = Literal["default", "paper"]
 
@@ -97,8 +98,9 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     ## A step
     1. All UAVs fly ``velocity x step_s`` metres along their trajectories (circles counter-clockwise, or routes).
     2. From the new positions, ``uav_0`` first, each UAV collects from its sensor. The transmission fails (f = 1) if
-       the sensor is out of the radio radius, if the path loss is at or past the threshold, if the sensor already served
-       a UAV of a lower index in this step, or if the battery cannot pay for one packet. Otherwise
+       the sensor is out of the radio radius, if the path loss is at or past the threshold, if the sensor's radio is
+       dead, if the sensor already served a UAV of a lower index in this step, or if the battery cannot pay for one
+       packet. Otherwise
        ``min(queue, packets_per_step)`` packets move, fewer if the battery cannot pay for them. An empty queue is no
        failure. A failed transmission does not count as service.
     3. Packets arrive (Poisson, each sensor at its own rate).
@@ -115,9 +117,9 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     ``cost``: as above. After ``reset`` the last four are ``False``, 0, 0 and 0.0.
 
     ## Start
-    Positions, arrival rates, initial queues, start angles and all T x J arrivals are drawn at ``reset`` from separate
-    children of ``SeedSequence(seed)``: the same seed gives the same world to the bit, whatever the actions. ``reset``
-    without a seed draws the next world of the last seed given, or of a fresh one.
+    Positions, arrival rates, initial queues, start angles, all T x J arrivals and the true channel are drawn at
+    ``reset`` from separate children of ``SeedSequence(seed)``: the same seed gives the same world to the bit, whatever
+    the actions. ``reset`` without a seed draws the next world of the last seed given, or of a fresh one.
 
     ## Episode end
     Every agent is truncated at step T; nothing terminates.
@@ -152,6 +154,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         self.tally: list[StepTally] = []
         self.sensors: Sensors
         self.fleet: Fleet
+        self.channel: TrueChannel
         levels = [scenario.sensors, scenario.max_velocity + 1]
         self._action_spaces = {agent: spaces.MultiDiscrete(levels) for agent in self.possible_agents}
         self._observation_spaces = {
@@ -182,6 +185,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         streams = Streams.of(np.random.SeedSequence(self._entropy, spawn_key=key))
         self.sensors = Sensors(self.scenario, streams, self.arrivals)
         self.fleet = Fleet.draw(self.scenario, streams.angles)
+        self.channel = TrueChannel.draw(self.scenario, streams)
         self.tally = []
         self.agents = self.possible_agents[:]
         self._beacons = Beacons(self.scenario.uavs, self.scenario.sensors)
@@ -200,13 +204,14 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         step = len(self.tally)
         position = self.fleet.advance(chosen[:, 1] * self.scenario.step_s)
         links = self._links(position)
-        failed, moved = self._collect(chosen[:, 0], links)
+        usable = links.hold & self.channel.working(step + 1)
+        failed, moved = self._collect(chosen[:, 0], links, usable)
         lost = self.sensors.arrive(step)
         collected = np.bincount(chosen[:, 0], weights=moved, minlength=self.scenario.sensors).astype(np.int64)
         tally = StepTally(step, int(failed.sum()), int(np.count_nonzero(lost)), int(lost.sum()), collected)
         self.tally.append(tally)
 
-        blamed = links.hold @ lost
+        blamed = usable @ lost
         cost = failed + blamed / self.scenario.queue_capacity
         if self.cost == "paper":
             cost = np.full(self.scenario.uavs, float(tally.events))
@@ -254,17 +259,18 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     def _links(self, position: FloatArray) -> Links:
         """The links of every UAV to every sensor, ``(I, J)``."""
         offset = position[:, None, :] - self.sensors.positions
-        return Links.at(np.hypot(offset[..., 0], offset[..., 1]), self.scenario)
+        return self.channel.links(np.hypot(offset[..., 0], offset[..., 1]), self.channel.excess_db(position))
 
-    def _collect(self, chosen: IntArray, links: Links) -> tuple[IntArray, IntArray]:
+    def _collect(self, chosen: IntArray, links: Links, usable: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
         """Serve the UAVs in order; returns f and the packets moved, each ``(I,)``."""
-        reach = links[np.arange(self.scenario.uavs), chosen]
-        usable, budget, rate = reach.hold.tolist(), reach.packets.tolist(), reach.rate_bps.tolist()
+        pairs = (np.arange(self.scenario.uavs), chosen)
+        reach, able = links[pairs], usable[pairs].tolist()
+        budget, rate = reach.packets.tolist(), reach.rate_bps.tolist()
         failed, moved = np.ones((2, self.scenario.uavs), dtype=np.int64)
         served: set[int] = set()
         for uav, sensor in enumerate(chosen.tolist()):
             packets = None
-            if usable[uav] and sensor not in served:
+            if able[uav] and sensor not in served:
                 packets = self.sensors.transmit(sensor, budget[uav], rate[uav])
             if packets is not None:
                 served.add(sensor)
@@ -332,6 +338,8 @@ def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
     The margin of 1e-6 dB covers the rounding of the sum. 0 is always within the bounds, since it marks a sensor never
     heard.
     """
+    if scenario.shadowing_db or scenario.route_shadowing_db:
+        return -LOSS_BOUNDS_DB[1], -LOSS_BOUNDS_DB[0]
     excess = (scenario.los_excess_db, scenario.nlos_excess_db)
     free_space = scenario.model_copy(update={"los_excess_db": 0.0, "nlos_excess_db": 0.0})
     nearest, farthest = path_loss_db([0.0, scenario.radio_radius_m], free_space)

@@ -19,6 +19,10 @@ class Streams(NamedTuple):
     queues: np.random.Generator
     angles: np.random.Generator
     arrivals: np.random.Generator
+    # A stream's place in this order is its seed: new ones come last.
+    shadowing: np.random.Generator
+    route_shadowing: np.random.Generator
+    radios: np.random.Generator
 
     @classmethod
     def of(cls, root: np.random.SeedSequence) -> Self:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.channel import channel_gain_db, link_holds, packets_per_step, path_loss_db, rate_bps
+from shared.channel import Links, channel_gain_db, link_holds, packets_per_step, path_loss_db, rate_bps
 from shared.scenario import SCENARIOS, Scenario
 
 PAPER = SCENARIOS["paper"]
@@ -62,3 +62,20 @@ def test_rate_is_shannons_below_the_cap_and_scales_with_the_share() -> None:
 def test_packets_are_whole() -> None:
     # 6 Mbit/s x 10 s / 7 Mbit = 8.57
     assert packets_per_step(0.0, Scenario(packet_bits=7e6)) == 8
+
+
+def test_an_excess_loss_adds_to_the_mean() -> None:
+    distance = np.array([0.0, 150.0, 300.0])
+    links, mean = Links.at(distance, PAPER, [3.0, 0.0, -2.0]), Links.at(distance, PAPER)
+    np.testing.assert_array_equal(links.loss_db, mean.loss_db + [3.0, 0.0, -2.0])
+    assert not np.any(Links.at(distance, PAPER, 60.0).hold)
+    np.testing.assert_array_equal(packets_per_step(distance, PAPER, [3.0, 0.0, -2.0]), links.packets)
+    np.testing.assert_array_equal(packets_per_step(distance, PAPER, 60.0), [0, 0, 0])
+
+
+def test_distances_and_excess_are_broadcast() -> None:
+    excess = np.array([[0.0], [40.0]])
+    links = Links.at([100.0, 200.0, 300.0], PAPER, excess)
+    assert links.distance_m.shape == links.packets.shape == (2, 3)
+    np.testing.assert_array_equal(packets_per_step([100.0, 200.0, 300.0], PAPER, excess), links.packets)
+    assert packets_per_step(100.0, PAPER, excess).shape == (2, 1)

@@ -12,7 +12,7 @@ from shared.scenario import SCENARIOS, Scenario, scenario_named
 
 
 def test_presets_are_named_as_they_are_filed() -> None:
-    assert list(SCENARIOS) == ["paper", "pipeline", "stress", "dense", "lossy_uplink"]
+    assert list(SCENARIOS) == ["paper", "pipeline", "stress", "dense", "lossy_uplink", "shadowed"]
     assert all(scenario_named(name).name == name for name in SCENARIOS)
 
 

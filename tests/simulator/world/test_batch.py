@@ -22,7 +22,8 @@ FLAT = Scenario(name="flat", battery_j=1.5)
 NO_RATE = Scenario(name="no_rate", packet_bits=1e12, steps=5)
 PLENTY = Scenario(name="plenty", battery_j=1e9, transmit_power_w=1e-6, packet_bits=1.0, bandwidth_hz=1e12, steps=5)
 SCATTERED = Scenario(name="scattered", area_m=2000.0, steps=12)
-WORLDS = [*SCENARIOS.values(), ROUTES, FLAT, NO_RATE, PLENTY, SCATTERED]
+DEAD = SCENARIOS["shadowed"].model_copy(update={"name": "dead", "dead_radios": 4})
+WORLDS = [*SCENARIOS.values(), DEAD, ROUTES, FLAT, NO_RATE, PLENTY, SCATTERED]
 
 
 def actions_of(scenario: Scenario, seeds: range) -> tuple[Any, Any]:
