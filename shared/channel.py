@@ -34,11 +34,16 @@ def path_loss_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 
 @dataclass(frozen=True)
 class Links:
-    """Transfers at horizontal distances ``(...)``, metres, with the path loss ``(...)``, dB, computed once."""
+    """Transfers at horizontal distances ``(...)``, metres, with the path loss ``(...)``, dB, computed once.
+
+    ``share``, ``(...)`` or one number, is a link's own share of the rate, besides the scenario's ``link_share``; a link
+    without any share holds no transfer.
+    """
 
     distance_m: FloatArray
     loss_db: FloatArray
     scenario: Scenario
+    share: FloatArray | float = 1.0
 
     @classmethod
     def at(cls, distance_m: ArrayLike, scenario: Scenario, excess_db: ArrayLike = 0.0) -> Self:
@@ -52,7 +57,8 @@ class Links:
 
     def __getitem__(self, which: Any) -> Self:
         """The links at an index, which may be any index of an array."""
-        return replace(self, distance_m=self.distance_m[which], loss_db=self.loss_db[which])
+        share = self.share[which] if isinstance(self.share, np.ndarray) else self.share
+        return replace(self, distance_m=self.distance_m[which], loss_db=self.loss_db[which], share=share)
 
     @property
     def gain_db(self) -> FloatArray:
@@ -63,7 +69,7 @@ class Links:
     def hold(self) -> NDArray[np.bool_]:
         """As :func:`link_holds`."""
         near = self.distance_m <= self.scenario.radio_radius_m
-        return np.asarray(near & (self.loss_db < self.scenario.path_loss_limit_db))
+        return np.asarray(near & (self.loss_db < self.scenario.path_loss_limit_db) & (self.share > 0))
 
     @cached_property
     def rate_bps(self) -> FloatArray:
@@ -73,7 +79,7 @@ class Links:
         noise_dbm = world.noise_dbm_hz + 10.0 * np.log10(world.bandwidth_hz) + world.noise_figure_db
         snr = 10.0 ** ((power_dbm - self.loss_db - noise_dbm) / 10.0)
         efficiency = np.minimum(np.log2(1.0 + snr), world.spectral_cap)
-        return np.asarray(world.link_share * world.bandwidth_hz * efficiency)
+        return np.asarray(world.link_share * world.bandwidth_hz * efficiency * self.share)
 
     @property
     def packets(self) -> NDArray[np.int64]:

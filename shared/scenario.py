@@ -123,6 +123,8 @@ class Scenario(Unmodelled):
                 raise ValueError(f"routes[{uav}] needs at least two different waypoints")
         if self.dead_radios > self.sensors:
             raise ValueError(f"dead_radios is {self.dead_radios}, there are {self.sensors} sensors")
+        if self.departures >= self.uavs:
+            raise ValueError(f"departures is {self.departures} of {self.uavs} UAVs: at least one has to stay")
         if self.sensors * self.steps > _MAX_ARRIVALS:
             raise ValueError(f"sensors x steps exceeds {_MAX_ARRIVALS:,}: a world draws that many arrivals at once")
         return self
@@ -150,6 +152,24 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario(name="lossy_uplink", uplink_drop=0.1, uplink_jitter_ms=200.0),
         # 8 dB in all, half of the variance each.
         Scenario(name="shadowed", shadowing_db=5.66, route_shadowing_db=5.66),
+        Scenario(name="fading", rician_k_db=3.0),
+        Scenario(name="bursty", burst_factor=6.0),
+        Scenario(name="windy", wind_mps=6.0, wind_from_deg=250.0, gust_mps=2.0),
+        Scenario(name="faulty", dead_radios=2, departures=1, link_share_drop=0.5),
+        Scenario(
+            name="field",
+            shadowing_db=3.0,
+            route_shadowing_db=3.0,
+            rician_k_db=10.0,
+            position_noise_m=2.0,
+            burst_factor=3.0,
+            wind_mps=3.0,
+            wind_from_deg=250.0,
+            gust_mps=1.0,
+            dead_radios=1,
+            departures=1,
+            link_share_drop=0.2,
+        ),
     )
 }
 

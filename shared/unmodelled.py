@@ -48,10 +48,65 @@ class Unmodelled(BaseModel):
         description="metres between two places at which the correlation of `route_shadowing_db` is 1/e "
         "(Gudmundson 1991; 3GPP TR 38.901 table 7.5-6: 10 to 120 m)",
     )
+    rician_k_db: float | None = _off(
+        None,
+        ge=-40,
+        le=40,
+        description="Rician K factor, dB, of small-scale fading, drawn anew for each link and step with mean power 1; "
+        "-40 is Rayleigh fading in effect, null no fading (measured air-to-ground values: survey arXiv 1801.01656)",
+    )
+    position_noise_m: float = _off(
+        0.0,
+        ge=0,
+        le=1000,
+        description="standard deviation of a reported position's error on each axis, cut at 5 of them; the reported "
+        "progress is true (GPS SPS Performance Standard 2020: horizontal error at most 8 m in 95% of all cases)",
+    )
+
+    burst_factor: float = _off(
+        1.0,
+        ge=1,
+        le=100,
+        description="a sensor's arrival rate in a burst over its rate between bursts; its mean rate stays. Arrivals "
+        "are a two-state Markov-modulated Poisson process (Fischer and Meier-Hellstern, 1993)",
+    )
+    burst_steps: float = _off(4.0, ge=1, le=10_000, description="mean length of a burst, geometric")
+    calm_steps: float = _off(12.0, ge=1, le=10_000, description="mean steps from a burst to the next, geometric")
+
+    wind_mps: float = _off(
+        0.0,
+        ge=0,
+        le=50,
+        description="mean wind. A UAV covers `velocity x step_s` times 1 + (wind along its way) / `max_velocity`, at "
+        "least 0 and at most twice as much: at rest it holds its place, at full speed it has nothing left to resist",
+    )
+    wind_from_deg: float = _off(
+        270.0, ge=0, le=360, description="where the wind comes from, degrees clockwise from north (the y axis)"
+    )
+    gust_mps: float = _off(
+        0.0,
+        ge=0,
+        le=50,
+        description="standard deviation of the wind along a UAV's way around its mean, normal, drawn anew for each UAV "
+        "and step (MIL-F-8785C, low altitude: vertical turbulence of a tenth of the wind, horizontal more)",
+    )
+
     dead_radios: int = _off(
         0,
         ge=0,
         le=10_000,
         description="number of sensors whose radio dies, each at the start of a step drawn from the whole mission: its "
         "beacons go on, and every transmission fails",
+    )
+    departures: int = _off(
+        0,
+        ge=0,
+        le=100,
+        description="number of UAVs that leave for good, each after a number of steps drawn from 1 to T - 1",
+    )
+    link_share_drop: float = _off(
+        0.0,
+        ge=0,
+        lt=1,
+        description="share of every link's rate that is lost from a step on, drawn from the mission's middle half",
     )

@@ -35,21 +35,21 @@ def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None
     share = 1.0 if guide is None else rng.uniform(0.0, guide.deviations)
     for step in range(scenario.steps):
         deviating = bool(rng.random() < share)
-        choices: list[Action] = []
-        references: list[Reference | None] = []
-        for uav in range(scenario.uavs):
-            observation, taken = observations[f"uav_{uav}"], frozenset(sensor for sensor, _ in choices)
+        choices: dict[int, Action] = {}
+        references: dict[int, Reference | None] = {}
+        for agent, uav in world.live.items():
+            observation, taken = observations[agent], frozenset(sensor for sensor, _ in choices.values())
             advised = None if guide is None else guide.refer(uav, observation, taken, deviating)
             if advised is not None and not deviating:
-                choices.append(advised)
+                choices[uav] = advised
             else:
-                choices.append(deviation.action(advised, uav, observation, taken))
-            references.append(_reference(teacher, advised))
+                choices[uav] = deviation.action(advised, uav, observation, taken)
+            references[uav] = _reference(teacher, advised)
             if guide is not None:
-                guide.flown(uav, step, choices[-1])
-        requests = [decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in range(scenario.uavs)]
-        observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in enumerate(choices)})
-        for uav, (sensor, velocity) in enumerate(choices):
+                guide.flown(uav, step, choices[uav])
+        requests = {uav: decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in choices}
+        observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in choices.items()})
+        for uav, (sensor, velocity) in choices.items():
             info = infos[f"uav_{uav}"]
             yield RolloutStep(
                 request=requests[uav],

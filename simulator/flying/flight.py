@@ -104,17 +104,17 @@ def fly(
         observations, _ = world.reset(seed=seed)
         flight.sensor_xy = np.array(observations["uav_0"]["sensor_position"], dtype=float)
         for _step in range(scenario.steps):
-            choices: list[Choice] = []
-            for uav in range(scenario.uavs):
-                taken = frozenset(choice.sensor for choice in choices)
-                choices.append(pilot.decide(uav, observations[f"uav_{uav}"], taken))
+            choices: dict[int, Choice] = {}
+            for agent, uav in world.live.items():
+                taken = frozenset(choice.sensor for choice in choices.values())
+                choices[uav] = pilot.decide(uav, observations[agent], taken)
                 if on_decision is not None:
-                    on_decision(choices[-1])
-            actions = {f"uav_{i}": np.array([c.sensor, c.velocity], dtype=np.int64) for i, c in enumerate(choices)}
+                    on_decision(choices[uav])
+            actions = {f"uav_{i}": np.array([c.sensor, c.velocity], dtype=np.int64) for i, c in choices.items()}
             before = observations
             observations, _, _, _, infos = world.step(actions)
             _record(flight, before, choices, infos, log)
-            for uav, choice in enumerate(choices):
+            for uav, choice in choices.items():
                 info = infos[f"uav_{uav}"]
                 pilot.learn(uav, choice, float(info["cost"]), bool(info["failed"]))
             flight.tally.append(world.tally[-1])
@@ -123,7 +123,7 @@ def fly(
         pilot.land()
     except KeyboardInterrupt:
         flight.interrupted = True
-        del flight.decisions[flight.steps_flown * scenario.uavs :]
+        flight.decisions = [decision for decision in flight.decisions if decision.step < flight.steps_flown]
         if log is not None:
             log.rewrite(flight.decisions)
     flight.duration_s = time.monotonic() - began
@@ -133,11 +133,11 @@ def fly(
 def _record(
     flight: Flight,
     observations: Mapping[str, Observation],
-    choices: list[Choice],
+    choices: Mapping[int, Choice],
     infos: Mapping[str, Info],
     log: DecisionLog | None,
 ) -> None:
-    for uav, choice in enumerate(choices):
+    for uav, choice in choices.items():
         observation, info = observations[f"uav_{uav}"], infos[f"uav_{uav}"]
         x, y = observation["position"].tolist()
         decision = Decision(

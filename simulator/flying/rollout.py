@@ -37,7 +37,7 @@ def rollout(
     while world.agents:
         actions: dict[str, tuple[int, int]] = {}
         taken: frozenset[int] = frozenset()
-        for uav, agent in enumerate(world.agents):
+        for agent, uav in world.live.items():
             actions[agent] = policy.decide(uav, observations[agent], taken)
             taken |= {actions[agent][0]}
         observations, *_ = world.step(actions)

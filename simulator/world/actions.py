@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,8 +11,10 @@ from shared.channel import IntArray
 from shared.scenario import Scenario
 
 
-def checked_actions(actions: Mapping[str, ArrayLike], agents: Sequence[str], scenario: Scenario) -> IntArray:
-    """The actions of all agents as ``(I, 2)`` integers: sensor, velocity.
+def checked_actions(actions: Mapping[str, ArrayLike], agents: Mapping[str, int], scenario: Scenario) -> IntArray:
+    """The actions of all agents as ``(I, 2)`` integers: sensor, velocity; zeros for UAVs that are no longer there.
+
+    ``agents`` has the UAV of each live agent.
 
     Raises:
         ValueError: an agent is unknown or has no action, or an action is not two integers within their bounds.
@@ -21,8 +23,8 @@ def checked_actions(actions: Mapping[str, ArrayLike], agents: Sequence[str], sce
         if agent not in agents:
             raise ValueError(f"{agent}: no such agent")
     limits = (("sensor", scenario.sensors - 1), ("velocity", scenario.max_velocity))
-    chosen = np.empty((scenario.uavs, 2), dtype=np.int64)
-    for uav, agent in enumerate(agents):
+    chosen = np.zeros((scenario.uavs, 2), dtype=np.int64)
+    for agent, uav in agents.items():
         if agent not in actions:
             raise ValueError(f"{agent}: no action")
         action = np.asarray(actions[agent])

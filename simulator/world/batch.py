@@ -13,12 +13,16 @@ from shared.channel import FloatArray, IntArray
 from shared.scenario import SCENARIOS, Scenario
 from simulator.world import Cost
 from simulator.world.fleet import Fleet
+from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Sensors, Streams
-from simulator.world.true_channel import TrueChannel
+from simulator.world.truth import Truth
 
 
 class BatchObservation(TypedDict):
-    """The observations of all UAVs of all worlds: the entries of ``Observation`` with leading dimensions ``(B, I)``."""
+    """The observations of all UAVs of all worlds: the entries of ``Observation`` with leading dimensions ``(B, I)``.
+
+    Those of a UAV that left mean nothing.
+    """
 
     step: IntArray
     position: FloatArray
@@ -33,6 +37,8 @@ class BatchObservation(TypedDict):
 @dataclass(frozen=True, eq=False)
 class BatchStep:
     """The outcome of one step of every world: the fields of ``Info`` per UAV, and those of ``StepTally`` per world.
+
+    Every number of a UAV that left before the step is 0.
 
     Attributes:
         failed: f, ``(B, I)``.
@@ -68,18 +74,20 @@ class Draw:
     """The random part of B worlds, as ``PipelineWorld.reset`` draws it from each seed.
 
     ``positions`` ``(B, J, 2)`` and ``start_m`` ``(B, I)``, metres; ``initial_queue`` ``(B, J)`` and ``arrivals``
-    ``(B, T, J)``, packets; ``channel``, of the B worlds.
+    ``(B, T, J)``, packets; ``truth``, of the B worlds.
     """
 
     positions: FloatArray
     initial_queue: IntArray
     arrivals: IntArray
     start_m: FloatArray
-    channel: TrueChannel
+    truth: Truth
 
     @classmethod
-    def of(cls, scenario: Scenario, seeds: Sequence[int], trace: IntArray | None = None) -> Draw:
-        """The worlds of these seeds; a trace replaces the arrivals, as it does in ``PipelineWorld``."""
+    def of(
+        cls, scenario: Scenario, seeds: Sequence[int], trace: IntArray | None = None, gains: GainTrace | None = None
+    ) -> Draw:
+        """The worlds of these seeds; the traces of arrivals and gains act as they do in ``PipelineWorld``."""
         streams = [Streams.of(np.random.SeedSequence(int(seed))) for seed in seeds]
         sensors = [Sensors(scenario, stream, trace) for stream in streams]
         return cls(
@@ -87,7 +95,7 @@ class Draw:
             initial_queue=np.stack([one.initial_queue for one in sensors]),
             arrivals=np.stack([one.arrivals for one in sensors]),
             start_m=np.stack([Fleet.draw(scenario, stream.angles).start_m for stream in streams]),
-            channel=TrueChannel.stack([TrueChannel.draw(scenario, stream) for stream in streams]),
+            truth=Truth.stack([Truth.draw(scenario, stream, gains) for stream in streams]),
         )
 
 
@@ -99,7 +107,8 @@ class VectorWorld:
     ``queue`` ``(B, J)`` and ``battery`` ``(B, J)``.
 
     Args:
-        arrivals: a trace, shape ``(at least T, J)``, instead of Poisson arrivals.
+        arrivals: a trace, shape ``(at least T, J)``, instead of drawn arrivals.
+        gains: recorded excess losses, beside the drawn ones.
         cost: the negative of the reward; see :class:`PipelineWorld`.
 
     Raises:
@@ -108,7 +117,12 @@ class VectorWorld:
     """
 
     def __init__(
-        self, scenario: Scenario = SCENARIOS["paper"], *, arrivals: IntArray | None = None, cost: Cost = "default"
+        self,
+        scenario: Scenario = SCENARIOS["paper"],
+        *,
+        arrivals: IntArray | None = None,
+        gains: GainTrace | None = None,
+        cost: Cost = "default",
     ) -> None:
         if cost not in ("default", "paper"):
             raise ValueError(f"unknown cost {cost!r}: choose one of default, paper")
@@ -118,12 +132,13 @@ class VectorWorld:
         self.queue: IntArray
         self.battery: FloatArray
         self._trace = arrivals
+        self._gains = gains
         self._fleet = Fleet.draw(scenario, np.random.default_rng(0))
         self._draw: Draw | None = None
 
     def reset(self, seeds: Sequence[int]) -> BatchObservation:
         """Draw one world a seed, and return the first observations."""
-        return self.start(Draw.of(self.scenario, seeds, self._trace))
+        return self.start(Draw.of(self.scenario, seeds, self._trace, self._gains))
 
     def start(self, draw: Draw) -> BatchObservation:
         """Begin worlds that are drawn already, and return the first observations."""
@@ -150,17 +165,20 @@ class VectorWorld:
             velocities: of each UAV, m/s, integers ``(B, I)``.
         """
         draw, chosen, velocity = self._checked(np.asarray(sensors), np.asarray(velocities))
-        self._progress = self._progress + velocity * self.scenario.step_s
+        present = draw.truth.faults.present(self.steps_flown)
+        paths = self._fleet.trajectories
+        flown = draw.truth.wind.flown_m(velocity * present, self._progress, paths, self.steps_flown)
+        self._progress = self._progress + flown
         self._update_links(self.steps_flown + 1)
-        failed, moved, collected = self._collect(chosen)
+        failed, moved, collected = self._collect(chosen, present)
         filled = self.queue + draw.arrivals[:, self.steps_flown]
         self.queue = np.minimum(filled, self.scenario.queue_capacity)
         lost: IntArray = filled - self.queue
-        blamed = np.matmul(self._usable, lost[:, :, None])[:, :, 0]
+        blamed = np.matmul(self._usable, lost[:, :, None])[:, :, 0] * present
         overflows, lost_packets = np.count_nonzero(lost, axis=1), lost.sum(axis=1)
         if self.cost == "paper":
             events = (failed.sum(axis=1) + overflows).astype(np.float64)
-            cost = np.repeat(events[:, None], self.scenario.uavs, axis=1)
+            cost = events[:, None] * present
         else:
             cost = failed + blamed / self.scenario.queue_capacity
         self.steps_flown += 1
@@ -208,24 +226,26 @@ class VectorWorld:
         )
         # The path loss is the costliest number of a step, and is needed only within the radio radius.
         self._heard = np.flatnonzero(self._distance <= self.scenario.radio_radius_m)
-        channel = self._draw.channel
-        self._excess = channel.excess_db(self._position)
-        links = channel.links(self._distance.ravel()[self._heard], self._excess.ravel()[self._heard])
+        channel = self._draw.truth.channel
+        self._excess = channel.excess_db(self._position, self._progress, instant)
+        self._share = np.broadcast_to(channel.share(self._distance, instant), self._distance.shape)
+        heard = self._heard
+        links = channel.at(*(array.ravel()[heard] for array in (self._distance, self._excess, self._share)))
         self._gain = links.gain_db
         self._usable = np.zeros(self._distance.shape, dtype=np.bool_)
-        self._usable.ravel()[self._heard] = links.hold
-        self._usable &= channel.working(instant)
+        self._usable.ravel()[heard] = links.hold
 
-    def _collect(self, chosen: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    def _collect(self, chosen: IntArray, present: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
         """Serve the UAVs in order; returns f and the packets moved, each ``(B, I)``, and by sensor, ``(B, J)``."""
         assert self._draw is not None
-        reach, excess, usable = (
+        reach, excess, share, usable = (
             np.take_along_axis(of_all, chosen[..., None], axis=2)[..., 0]
-            for of_all in (self._distance, self._excess, self._usable)
+            for of_all in (self._distance, self._excess, self._share, self._usable)
         )
+        usable &= present
         budget = np.zeros(chosen.shape, dtype=np.int64)
         energy = np.full(chosen.shape, np.inf)
-        links = self._draw.channel.links(reach[usable], excess[usable])
+        links = self._draw.truth.channel.at(reach[usable], excess[usable], share[usable])
         budget[usable] = links.packets
         with np.errstate(divide="ignore"):
             airtime_s = self.scenario.packet_bits / links.rate_bps
@@ -245,7 +265,7 @@ class VectorWorld:
             self.battery[at] = np.where(able, np.maximum(0.0, battery - spent), battery)
             served[at] |= able
             collected[at] += packets
-            failed[:, uav], moved[:, uav] = ~able, packets
+            failed[:, uav], moved[:, uav] = present[:, uav] & ~able, packets
         return failed, moved, collected
 
     def _observe(self) -> BatchObservation:
@@ -259,7 +279,7 @@ class VectorWorld:
         shape = self._last_heard.shape
         return BatchObservation(
             step=np.full((*shape[:2], 1), self.steps_flown),
-            position=self._position,
+            position=self._draw.truth.reported(self._position, self.steps_flown),
             progress=self._progress[..., None],
             sensor_position=np.broadcast_to(self._draw.positions[:, None], (*shape, 2)),
             queue=self._heard_queue,

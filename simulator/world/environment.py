@@ -11,14 +11,16 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
-from shared.channel import FloatArray, IntArray, Links, path_loss_db
+from shared.channel import FloatArray, IntArray, Links
 from shared.scenario import SCENARIOS, Scenario
-from shared.trajectory import Trajectory, trajectories
+from shared.trajectory import trajectories
 from simulator.world.actions import checked_actions
 from simulator.world.beacons import Beacons
 from simulator.world.fleet import Fleet
+from simulator.world.gain_trace import GainTrace
+from simulator.world.observation_space import observation_space
 from simulator.world.sensors import Sensors, Streams
-from simulator.world.true_channel import LOSS_BOUNDS_DB, TrueChannel
+from simulator.world.truth import Truth
 
 Cost = Literal["default", "paper"]
 
@@ -71,7 +73,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     J sensors, I UAVs, T steps and every other number named here are fields of the scenario.
 
     ## Agents
-    ``uav_0`` .. ``uav_{I-1}``. All of them act at every step until the mission ends.
+    ``uav_0`` .. ``uav_{I-1}``. All of them act at every step until the mission ends; some may leave before.
 
     ## Action space
     ``MultiDiscrete([J, max_velocity + 1])``: the sensor to collect from, and the velocity of this step in m/s.
@@ -82,7 +84,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     | key | shape, type | meaning |
     |---|---|---|
     | ``step`` | ``(1,)`` int64 | steps flown so far, 0..T |
-    | ``position`` | ``(2,)`` float64 | of this UAV, m; a trajectory may leave the area |
+    | ``position`` | ``(2,)`` float64 | of this UAV as reported, m; a trajectory may leave the area |
     | ``progress`` | ``(1,)`` float64 | of this UAV along its trajectory, m, its start included |
     | ``sensor_position`` | ``(J, 2)`` float64 | surveyed, m |
     | ``queue`` | ``(J,)`` float64 | packets waiting when last heard, 0..W |
@@ -96,15 +98,34 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     where ``last_heard == step``. UAVs do not share their observations.
 
     ## A step
-    1. All UAVs fly ``velocity x step_s`` metres along their trajectories (circles counter-clockwise, or routes).
+    1. All UAVs fly ``velocity x step_s`` metres along their trajectories (circles counter-clockwise, or routes), or
+       what the wind makes of it.
     2. From the new positions, ``uav_0`` first, each UAV collects from its sensor. The transmission fails (f = 1) if
        the sensor is out of the radio radius, if the path loss is at or past the threshold, if the sensor's radio is
        dead, if the sensor already served a UAV of a lower index in this step, or if the battery cannot pay for one
        packet. Otherwise
        ``min(queue, packets_per_step)`` packets move, fewer if the battery cannot pay for them. An empty queue is no
        failure. A failed transmission does not count as service.
-    3. Packets arrive (Poisson, each sensor at its own rate).
+    3. Packets arrive (Poisson, each sensor at its own rate, which bursts may change).
     4. Packets in excess of W at a sensor are lost (g = 1 for that sensor), and its queue is W.
+
+    ## What the model leaves out
+    An edge plans with the mean path loss, steady rates and ``velocity x step_s``. The fields of
+    :class:`shared.unmodelled.Unmodelled`, all off by default, make a world differ from that:
+
+    - **Links.** The path loss is ``mean + own_j + way_j(x, y) + fade_ijt + trace_ij``, within 0..400 dB. The normal
+      ``own_j`` is a sensor's own (``shadowing_db``). ``way_j`` is a Gaussian random field over the UAVs' places with
+      the correlation ``exp(-r / decorrelation_m)``, of each sensor another (``route_shadowing_db``). ``fade_ijt`` is
+      Rician of mean power 1, new for each UAV, sensor and step (``rician_k_db``). ``trace_ij`` is recorded (``gains``).
+      A transfer and the beacon after it meet the same loss, and ``channel_gain`` is minus all of it. Beacons are heard
+      within the radio radius at any loss.
+    - **Arrivals.** Each sensor alternates between bursts and calm (``burst_factor``, ``burst_steps``, ``calm_steps``).
+    - **Wind.** A UAV covers ``velocity x step_s x min(2, max(0, 1 + w / max_velocity))`` metres, w the wind along its
+      way (``wind_mps``, ``wind_from_deg``) and its gust of the step (``gust_mps``). ``progress`` is true.
+    - **Positions.** A reported ``position`` has a normal error on each axis (``position_noise_m``).
+    - **Faults.** All transmissions of a dead radio fail (``dead_radios``), while its beacons go on; its losses are
+      nobody's ``lost_i``. From a step on, every link has only the share ``1 - link_share_drop`` of its rate. A UAV that
+      left (``departures``) neither flies, hears nor collects.
 
     ## Rewards
     ``reward = -cost``. With ``cost="default"``, ``c_i = f_i + lost_i / W``, where ``lost_i`` are the packets lost in
@@ -117,16 +138,22 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
     ``cost``: as above. After ``reset`` the last four are ``False``, 0, 0 and 0.0.
 
     ## Start
-    Positions, arrival rates, initial queues, start angles, all T x J arrivals and the true channel are drawn at
-    ``reset`` from separate children of ``SeedSequence(seed)``: the same seed gives the same world to the bit, whatever
-    the actions. ``reset`` without a seed draws the next world of the last seed given, or of a fresh one.
+    Positions, arrival rates, initial queues, start angles, all T x J arrivals and what the model leaves out are drawn
+    at ``reset`` from separate children of ``SeedSequence(seed)``: the same seed gives the same world to the bit,
+    whatever the actions. ``reset`` without a seed draws the next world of the last seed given, or of a fresh one.
 
     ## Episode end
-    Every agent is truncated at step T; nothing terminates.
+    Every remaining agent is truncated at step T. Only a UAV that leaves before is terminated, with the observation
+    after its last step.
 
     ## For reports
-    ``scenario``; ``sensors`` (true queues and batteries); ``fleet`` (the UAVs' positions); ``tally``, one
-    :class:`StepTally` a step flown.
+    ``scenario``; ``sensors`` (true queues and batteries); ``fleet`` (the UAVs' positions); ``truth`` (what the
+    model leaves out); ``tally``, one :class:`StepTally` a step flown.
+
+    Args:
+        arrivals: a trace, shape ``(at least T, J)``, instead of drawn arrivals.
+        gains: recorded excess losses, beside the drawn ones.
+        cost: the negative of the reward.
 
     Raises:
         ValueError: ``step`` before ``reset`` or after the end, without an action of a live agent, or with an action out
@@ -140,6 +167,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         scenario: Scenario = SCENARIOS["paper"],
         *,
         arrivals: IntArray | None = None,
+        gains: GainTrace | None = None,
         cost: Cost = "default",
         render_mode: str | None = None,
     ) -> None:
@@ -147,18 +175,20 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             raise ValueError(f"unknown cost {cost!r}: choose one of default, paper")
         self.scenario = scenario
         self.arrivals = arrivals
+        self.gains = gains
         self.cost = cost
         self.render_mode = render_mode
         self.possible_agents = [f"uav_{i}" for i in range(scenario.uavs)]
+        self._index = {agent: uav for uav, agent in enumerate(self.possible_agents)}
         self.agents: list[str] = []
         self.tally: list[StepTally] = []
         self.sensors: Sensors
         self.fleet: Fleet
-        self.channel: TrueChannel
+        self.truth: Truth
         levels = [scenario.sensors, scenario.max_velocity + 1]
         self._action_spaces = {agent: spaces.MultiDiscrete(levels) for agent in self.possible_agents}
         self._observation_spaces = {
-            agent: _observation_space(scenario, path)
+            agent: observation_space(scenario, path, gains is not None)
             for agent, path in zip(self.possible_agents, trajectories(scenario), strict=True)
         }
         self.state_space = spaces.Box(-np.inf, np.inf, (1 + 2 * scenario.uavs + 4 * scenario.sensors,), np.float32)
@@ -185,12 +215,12 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         streams = Streams.of(np.random.SeedSequence(self._entropy, spawn_key=key))
         self.sensors = Sensors(self.scenario, streams, self.arrivals)
         self.fleet = Fleet.draw(self.scenario, streams.angles)
-        self.channel = TrueChannel.draw(self.scenario, streams)
+        self.truth = Truth.draw(self.scenario, streams, self.gains)
         self.tally = []
         self.agents = self.possible_agents[:]
         self._beacons = Beacons(self.scenario.uavs, self.scenario.sensors)
         position = self.fleet.positions
-        observations = self._observe(position, self._links(position))
+        observations = self._observe(position, self._links(position, 0))
         zeros = np.zeros(self.scenario.uavs, dtype=np.int64)
         return observations, self._infos(zeros, zeros, zeros, zeros.astype(np.float64))
 
@@ -200,30 +230,34 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         """Fly one step; see the class docstring."""
         if not self.agents:
             raise ValueError("step after the mission's end: reset first" if self.tally else "step before reset")
-        chosen = checked_actions(actions, self.agents, self.scenario)
+        chosen = checked_actions(actions, self.live, self.scenario)
         step = len(self.tally)
-        position = self.fleet.advance(chosen[:, 1] * self.scenario.step_s)
-        links = self._links(position)
-        usable = links.hold & self.channel.working(step + 1)
-        failed, moved = self._collect(chosen[:, 0], links, usable)
+        flown = self.truth.wind.flown_m(chosen[:, 1], self.fleet.progress_m, self.fleet.trajectories, step)
+        position = self.fleet.advance(flown)
+        links = self._links(position, step + 1)
+        failed, moved = self.sensors.serve(chosen[:, 0], self.live.values(), links)
         lost = self.sensors.arrive(step)
         collected = np.bincount(chosen[:, 0], weights=moved, minlength=self.scenario.sensors).astype(np.int64)
         tally = StepTally(step, int(failed.sum()), int(np.count_nonzero(lost)), int(lost.sum()), collected)
         self.tally.append(tally)
 
-        blamed = usable @ lost
+        blamed = links.hold @ lost
         cost = failed + blamed / self.scenario.queue_capacity
         if self.cost == "paper":
             cost = np.full(self.scenario.uavs, float(tally.events))
-        over = len(self.tally) == self.scenario.steps
         observations = self._observe(position, links)
         infos = self._infos(failed, moved, blamed, cost)
         rewards = {agent: -infos[agent]["cost"] for agent in self.agents}
-        terminations = dict.fromkeys(self.agents, False)
+        over, present = len(self.tally) == self.scenario.steps, self.truth.faults.present(step + 1)
+        terminations = {agent: not over and not bool(present[uav]) for agent, uav in self.live.items()}
         truncations = dict.fromkeys(self.agents, over)
-        if over:
-            self.agents = []
+        self.agents = [agent for agent, left in terminations.items() if not (over or left)]
         return observations, rewards, terminations, truncations, infos
+
+    @property
+    def live(self) -> dict[str, int]:
+        """The index of each live agent's UAV, in their order."""
+        return {agent: self._index[agent] for agent in self.agents}
 
     def state(self) -> NDArray[np.float32]:
         """The true state for centralised critics, flat float32 of length ``1 + 2 I + 4 J``.
@@ -256,36 +290,21 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
 
         return render_map(self)
 
-    def _links(self, position: FloatArray) -> Links:
+    def _links(self, position: FloatArray, instant: int) -> Links:
         """The links of every UAV to every sensor, ``(I, J)``."""
         offset = position[:, None, :] - self.sensors.positions
-        return self.channel.links(np.hypot(offset[..., 0], offset[..., 1]), self.channel.excess_db(position))
-
-    def _collect(self, chosen: IntArray, links: Links, usable: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
-        """Serve the UAVs in order; returns f and the packets moved, each ``(I,)``."""
-        pairs = (np.arange(self.scenario.uavs), chosen)
-        reach, able = links[pairs], usable[pairs].tolist()
-        budget, rate = reach.packets.tolist(), reach.rate_bps.tolist()
-        failed, moved = np.ones((2, self.scenario.uavs), dtype=np.int64)
-        served: set[int] = set()
-        for uav, sensor in enumerate(chosen.tolist()):
-            packets = None
-            if able[uav] and sensor not in served:
-                packets = self.sensors.transmit(sensor, budget[uav], rate[uav])
-            if packets is not None:
-                served.add(sensor)
-                failed[uav] = 0
-            moved[uav] = packets or 0
-        return failed, moved
+        distance = np.hypot(offset[..., 0], offset[..., 1])
+        return self.truth.channel.links(distance, position, self.fleet.progress_m, instant)
 
     def _observe(self, position: FloatArray, links: Links) -> dict[str, Observation]:
         """Record the beacons in range, and return a copy of every live UAV's observation."""
         step = len(self.tally)
         self._beacons.hear(step, self.sensors, links, self.scenario.radio_radius_m)
+        reported = self.truth.reported(position, step)
         return {
             agent: Observation(
                 step=np.array([step]),
-                position=position[uav].copy(),
+                position=reported[uav].copy(),
                 progress=self.fleet.progress_m[uav : uav + 1].copy(),
                 sensor_position=self.sensors.positions.copy(),
                 queue=self._beacons.queue[uav].copy(),
@@ -293,54 +312,27 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
                 channel_gain=self._beacons.gain_db[uav].copy(),
                 last_heard=self._beacons.step[uav].copy(),
             )
-            for uav, agent in enumerate(self.agents)
+            for agent, uav in self.live.items()
         }
 
     def _infos(self, failed: IntArray, moved: IntArray, blamed: IntArray, cost: FloatArray) -> dict[str, Info]:
-        selectable = self._beacons.step >= 0
-        selectable |= ~selectable.any(axis=1, keepdims=True)
-        mask = np.ones((self.scenario.uavs, self.scenario.sensors + self.scenario.max_velocity + 1), dtype=np.int8)
-        mask[:, : self.scenario.sensors] = selectable
-        rows = zip(self.agents, mask, failed.tolist(), moved.tolist(), blamed.tolist(), cost.tolist(), strict=True)
+        mask = _action_masks(self._beacons, self.scenario)
         return {
-            agent: Info(action_mask=m.copy(), failed=bool(f), collected=c, lost_packets=lost, cost=paid)
-            for agent, m, f, c, lost, paid in rows
+            agent: Info(
+                action_mask=mask[uav].copy(),
+                failed=bool(failed[uav]),
+                collected=int(moved[uav]),
+                lost_packets=int(blamed[uav]),
+                cost=float(cost[uav]),
+            )
+            for agent, uav in self.live.items()
         }
 
 
-def _observation_space(scenario: Scenario, path: Trajectory) -> spaces.Dict:
-    count = scenario.sensors
-    quietest, loudest = _gain_bounds(scenario)
-    farthest = path.length_m + scenario.steps * scenario.max_velocity * scenario.step_s
-    lowest, highest = path.bounds
-
-    def column(low: float, high: float) -> spaces.Box:
-        return spaces.Box(low, high, (count,), np.float64)
-
-    return spaces.Dict(
-        {
-            "step": spaces.Box(0, scenario.steps, (1,), np.int64),
-            # Rounding may put a circle's point slightly past its bounds.
-            "position": spaces.Box(lowest - 1e-6, highest + 1e-6, dtype=np.float64),
-            "progress": spaces.Box(0.0, farthest, (1,), np.float64),
-            "sensor_position": spaces.Box(0.0, scenario.area_m, (count, 2), np.float64),
-            "queue": column(0.0, float(scenario.queue_capacity)),
-            "battery": column(0.0, scenario.battery_j),
-            "channel_gain": column(quietest, loudest),
-            "last_heard": spaces.Box(-1, scenario.steps, (count,), np.int64),
-        }
-    )
-
-
-def _gain_bounds(scenario: Scenario) -> tuple[float, float]:
-    """Bounds of the gain within the radio radius, dB, whichever of the two excess losses is larger.
-
-    The margin of 1e-6 dB covers the rounding of the sum. 0 is always within the bounds, since it marks a sensor never
-    heard.
-    """
-    if scenario.shadowing_db or scenario.route_shadowing_db:
-        return -LOSS_BOUNDS_DB[1], -LOSS_BOUNDS_DB[0]
-    excess = (scenario.los_excess_db, scenario.nlos_excess_db)
-    free_space = scenario.model_copy(update={"los_excess_db": 0.0, "nlos_excess_db": 0.0})
-    nearest, farthest = path_loss_db([0.0, scenario.radio_radius_m], free_space)
-    return min(0.0, -farthest - max(excess) - 1e-6), max(0.0, -nearest - min(excess) + 1e-6)
+def _action_masks(beacons: Beacons, scenario: Scenario) -> NDArray[np.int8]:
+    """The ``action_mask`` of every UAV, ``(I, J + V)``."""
+    selectable = beacons.step >= 0
+    selectable |= ~selectable.any(axis=1, keepdims=True)
+    mask = np.ones((scenario.uavs, scenario.sensors + scenario.max_velocity + 1), dtype=np.int8)
+    mask[:, : scenario.sensors] = selectable
+    return mask

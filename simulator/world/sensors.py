@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from shared.channel import FloatArray, IntArray
+from shared.channel import FloatArray, IntArray, Links
 from shared.scenario import Scenario
 
 
@@ -22,7 +23,11 @@ class Streams(NamedTuple):
     # A stream's place in this order is its seed: new ones come last.
     shadowing: np.random.Generator
     route_shadowing: np.random.Generator
-    radios: np.random.Generator
+    fading: np.random.Generator
+    bursts: np.random.Generator
+    gusts: np.random.Generator
+    position_noise: np.random.Generator
+    faults: np.random.Generator
 
     @classmethod
     def of(cls, root: np.random.SeedSequence) -> Self:
@@ -35,8 +40,9 @@ class Sensors:
 
     Attributes:
         positions: shape ``(J, 2)``, metres.
-        rates: shape ``(J,)``, arrival rates, packets a step.
-        arrivals: shape ``(T, J)``, packets that arrive in each step: a trace's, else Poisson of ``rates``.
+        rates: shape ``(J,)``, mean arrival rates, packets a step.
+        arrivals: shape ``(T, J)``, packets that arrive in each step: a trace's, else Poisson of ``rates``, or of the
+            rates in and between bursts.
         initial_queue: shape ``(J,)``, packets.
         queue: shape ``(J,)``, packets waiting now, 0..W.
         battery: shape ``(J,)``, joules left.
@@ -52,13 +58,35 @@ class Sensors:
         self.rates: FloatArray = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)
         fewest = math.ceil(scenario.initial_queue_min * capacity - 1e-9)
         self.initial_queue: IntArray = streams.queues.integers(fewest, capacity, count, endpoint=True)
-        drawn = streams.arrivals.poisson(self.rates, (scenario.steps, count)) if trace is None else trace
+        drawn = trace
+        if drawn is None:
+            rates = self.rates if scenario.burst_factor == 1 else self.rates * draw_bursts(scenario, streams.bursts)
+            drawn = streams.arrivals.poisson(rates, (scenario.steps, count))
         self.arrivals: IntArray = np.asarray(drawn[: scenario.steps], dtype=np.int64)
         if self.arrivals.shape != (scenario.steps, count):
             shape = self.arrivals.shape
             raise ValueError(f"the trace has shape {shape}, the mission is {scenario.steps} steps of {count} sensors")
         self.queue = self.initial_queue.copy()
         self.battery: FloatArray = np.full(count, scenario.battery_j)
+
+    def serve(self, chosen: IntArray, uavs: Iterable[int], links: Links) -> tuple[IntArray, IntArray]:
+        """Let UAVs collect, in this order, each from its sensor; returns f and the packets moved, each ``(I,)``.
+
+        ``chosen`` has shape ``(I,)``, the links ``(I, J)``. Both numbers of a UAV that is not among ``uavs`` are 0.
+        """
+        reach = links[np.arange(len(chosen)), chosen]
+        usable, budget, rate = reach.hold.tolist(), reach.packets.tolist(), reach.rate_bps.tolist()
+        failed, moved = np.zeros((2, len(chosen)), dtype=np.int64)
+        served: set[int] = set()
+        for uav in uavs:
+            sensor, packets = int(chosen[uav]), None
+            if usable[uav] and sensor not in served:
+                packets = self.transmit(sensor, budget[uav], rate[uav])
+            if packets is not None:
+                served.add(sensor)
+            failed[uav] = packets is None
+            moved[uav] = packets or 0
+        return failed, moved
 
     def transmit(self, sensor: int, packets: int, rate_bps: float) -> int | None:
         """Move up to ``packets`` out of a sensor's queue, and take the energy from its battery.
@@ -105,3 +133,19 @@ def draw_positions(scenario: Scenario, rng: np.random.Generator) -> FloatArray:
     along = np.stack([np.interp(stops, reached, line[:, axis]) for axis in (0, 1)], axis=-1)
     spread = scenario.pipeline_spread_m
     return np.clip(along + rng.uniform(-spread, spread, shape), 0.0, scenario.area_m)
+
+
+def draw_bursts(scenario: Scenario, rng: np.random.Generator) -> FloatArray:
+    """Each sensor's arrival rate in each step, over its mean rate, shape ``(T, J)``.
+
+    Two states follow each other with geometric lengths of means ``burst_steps`` and ``calm_steps``; a mission begins
+    in the stationary distribution. The factors of the states have the ratio ``burst_factor`` and the stationary mean 1.
+    """
+    burst, calm, factor = scenario.burst_steps, scenario.calm_steps, scenario.burst_factor
+    between = (burst + calm) / (factor * burst + calm)
+    inside = rng.random(scenario.sensors) < burst / (burst + calm)
+    factors = np.empty((scenario.steps, scenario.sensors))
+    for step, changes in enumerate(rng.random(factors.shape)):
+        factors[step] = np.where(inside, factor * between, between)
+        inside ^= changes < np.where(inside, 1.0 / burst, 1.0 / calm)
+    return factors

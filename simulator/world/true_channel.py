@@ -1,48 +1,66 @@
-"""The true channel of a world: what its links lose beyond the mean path loss, and the radios that die."""
+"""The true channel of a world: what its links lose beyond the mean path loss, and the share of their rate."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shared.channel import FloatArray, IntArray, Links
+from shared.channel import FloatArray, Links
 from shared.scenario import Scenario
+from shared.trajectory import Trajectory, trajectories
+from simulator.world.faults import Faults
+from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Streams
+from simulator.world.step_noise import StepNoise
 
-# Cosines in the sum of a sensor's shadowing. The realised correlation is then within some 0.1 of the exponential.
+# Cosines in the sum of a sensor's shadowing.
 _COSINES = 128
 # The wire's bounds of a channel gain, with the sign of a loss.
 LOSS_BOUNDS_DB = (0.0, 400.0)
+# Below this power a fade counts as so deep, 100 dB.
+_DEEPEST_FADE = 1e-10
+# Losses are rounded to this many digits: then the same sum in another order, as in a batch, gives the same link.
+_DIGITS = 6
+
+
+def mean_only(scenario: Scenario, trace: GainTrace | None = None) -> bool:
+    """Whether every link of such a world has the mean path loss."""
+    return trace is None and not (
+        scenario.shadowing_db or scenario.route_shadowing_db or scenario.rician_k_db is not None
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class TrueChannel:
     """The links of one world, or of B worlds of one scenario, as they are and no edge is told.
 
-    *Instant* n is the moment after n steps of flight, 0..T: step t flies, and its transmissions and the beacons after
-    it happen at instant t + 1.
+    An *instant* is that of :class:`simulator.world.faults.Faults`.
 
     Attributes:
         scenario: of the world.
         own_db: shape ``(J,)`` or ``(B, 1, J)``, each sensor's own excess loss.
         frequencies: shape ``(2, M)`` or ``(B, 2, M)``, radians a metre, of the shadowing along the way.
         mixture: shape ``(2 M, J)`` or ``(B, 2 M, J)``, dB, the weights of their cosines and sines for each sensor.
-        dies_at: shape ``(J,)`` or ``(B, 1, J)``, the first instant of a sensor's dead radio; T + 1 for never.
+        fading: the normal numbers of small-scale fading.
+        faults: of the radios and the links' share.
+        paths: one trajectory a UAV.
+        trace: measured excess losses, added to the others.
     """
 
     scenario: Scenario
     own_db: FloatArray
     frequencies: FloatArray
     mixture: FloatArray
-    dies_at: IntArray
+    fading: StepNoise
+    faults: Faults
+    paths: tuple[Trajectory, ...]
+    trace: GainTrace | None = None
 
     @classmethod
-    def draw(cls, scenario: Scenario, streams: Streams) -> Self:
+    def draw(cls, scenario: Scenario, streams: Streams, faults: Faults, trace: GainTrace | None = None) -> Self:
         """One world's channel.
 
         The shadowing along the way is ``sigma sqrt(2 / M) sum_m cos(k_m . x + phi_mj)`` at the UAV's place x, with
@@ -51,13 +69,15 @@ class TrueChannel:
         pair over the absolute value of another normal number (Rahimi and Recht, 2007).
         """
         count, sigma = scenario.sensors, scenario.route_shadowing_db
-        own = np.round(scenario.shadowing_db * streams.shadowing.standard_normal(count), 6)
+        own = np.round(scenario.shadowing_db * streams.shadowing.standard_normal(count), _DIGITS)
         cosines = _COSINES if sigma else 0
-        pairs = streams.route_shadowing.standard_normal((2, cosines))
-        scale = scenario.decorrelation_m * np.abs(streams.route_shadowing.standard_normal(cosines))
-        phases = streams.route_shadowing.uniform(0.0, 2.0 * np.pi, (cosines, count))
+        rng = streams.route_shadowing
+        pairs = rng.standard_normal((2, cosines))
+        scale = scenario.decorrelation_m * np.abs(rng.standard_normal(cosines))
+        phases = rng.uniform(0.0, 2.0 * np.pi, (cosines, count))
         mixture = sigma * np.sqrt(2.0 / _COSINES) * np.concatenate((np.cos(phases), -np.sin(phases)))
-        return cls(scenario, own, pairs / scale, mixture, _deaths(scenario, streams.radios))
+        fading = StepNoise.draw(streams.fading)
+        return cls(scenario, own, pairs / scale, mixture, fading, faults, trajectories(scenario), trace)
 
     @classmethod
     def stack(cls, channels: Sequence[TrueChannel]) -> Self:
@@ -67,39 +87,60 @@ class TrueChannel:
             np.stack([one.own_db for one in channels])[:, None],
             np.stack([one.frequencies for one in channels]),
             np.stack([one.mixture for one in channels]),
-            np.stack([one.dies_at for one in channels])[:, None],
+            StepNoise.stack([one.fading for one in channels]),
+            Faults.stack([one.faults for one in channels]),
+            channels[0].paths,
+            channels[0].trace,
         )
 
-    @cached_property
-    def mean_only(self) -> bool:
-        """Whether every link has the mean path loss."""
-        return not (self.scenario.shadowing_db or self.scenario.route_shadowing_db)
+    def links(self, distance_m: FloatArray, position: FloatArray, progress_m: FloatArray, instant: int) -> Links:
+        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``.
 
-    def excess_db(self, position: FloatArray) -> FloatArray:
-        """The excess loss from UAVs at positions ``(..., I, 2)``, metres, to every sensor, ``(..., I, J)``, dB.
-
-        Rounded to a millionth, so that the same sum in another order gives the same link.
+        Args:
+            distance_m: horizontal, ``(..., I, J)``.
+            position: of the UAVs, metres, ``(..., I, 2)``.
+            progress_m: of the UAVs, ``(..., I)``.
+            instant: of the transmissions, and of the beacons that measure these links.
         """
-        if not self.scenario.route_shadowing_db:
-            return np.broadcast_to(self.own_db, (*position.shape[:-1], self.scenario.sensors))
-        angle = position @ self.frequencies
-        waves = np.concatenate((np.cos(angle), np.sin(angle)), axis=-1)
-        return np.round(self.own_db + waves @ self.mixture, 6)
+        return self.at(distance_m, self.excess_db(position, progress_m, instant), self.share(distance_m, instant))
 
-    def links(self, distance_m: FloatArray, excess_db: FloatArray) -> Links:
-        """The links at horizontal distances, metres, with these excess losses, dB, both of one shape."""
-        if self.mean_only:
-            return Links.at(distance_m, self.scenario)
+    def at(self, distance_m: FloatArray, excess_db: FloatArray, share: FloatArray | float) -> Links:
+        """The links at these distances, metres, with these excess losses, dB, and shares of the rate."""
         links = Links.at(distance_m, self.scenario, excess_db)
-        return replace(links, loss_db=np.clip(links.loss_db, *LOSS_BOUNDS_DB))
+        loss = links.loss_db
+        if not mean_only(self.scenario, self.trace):
+            loss = np.clip(loss, *LOSS_BOUNDS_DB)
+        return replace(links, loss_db=loss, share=share)
 
-    def working(self, instant: int) -> NDArray[np.bool_]:
-        """Whether each sensor's radio can transmit at that instant, shaped as ``dies_at``."""
-        return np.asarray(instant < self.dies_at)
+    def excess_db(self, position: FloatArray, progress_m: FloatArray, instant: int) -> FloatArray:
+        """The excess losses at an instant; shapes as of :meth:`links`."""
+        return self.place_db(position, progress_m) + self.fade_db(instant)
 
+    def place_db(self, position: FloatArray, progress_m: FloatArray) -> FloatArray:
+        """The part of the excess losses that depends on the UAVs' places alone; shapes as of :meth:`links`."""
+        count = self.scenario.sensors
+        excess = np.broadcast_to(self.own_db, (*position.shape[:-1], count))
+        if self.scenario.route_shadowing_db:
+            angle = position @ self.frequencies
+            waves = np.concatenate((np.cos(angle), np.sin(angle)), axis=-1)
+            excess = excess + np.round(waves @ self.mixture, _DIGITS)
+        if self.trace is not None:
+            excess = excess + np.round(self.trace.excess_db(progress_m, self.paths, count), _DIGITS)
+        return excess
 
-def _deaths(scenario: Scenario, rng: np.random.Generator) -> IntArray:
-    dies_at = np.full(scenario.sensors, scenario.steps + 1)
-    dead = rng.permutation(scenario.sensors)[: scenario.dead_radios]
-    dies_at[dead] = rng.integers(1, scenario.steps, len(dead), endpoint=True)
-    return dies_at
+    def fade_db(self, instant: int) -> FloatArray:
+        """The loss by small-scale fading at an instant, ``(I, J)`` or ``(B, I, J)``, dB; without fading ``()``.
+
+        The power is ``|h|^2`` with ``h = sqrt(K / (K + 1)) + n``, n complex normal of variance ``1 / (K + 1)``.
+        """
+        if self.scenario.rician_k_db is None:
+            return np.zeros(())
+        k = 10.0 ** (self.scenario.rician_k_db / 10.0)
+        scattered = self.fading.normal(instant, (len(self.paths), self.scenario.sensors, 2)) * np.sqrt(0.5 / (k + 1.0))
+        power = (np.sqrt(k / (k + 1.0)) + scattered[..., 0]) ** 2 + scattered[..., 1] ** 2
+        return np.asarray(np.round(-10.0 * np.log10(np.maximum(power, _DEEPEST_FADE)), _DIGITS))
+
+    def share(self, distance_m: FloatArray, instant: int) -> FloatArray | float:
+        """The shares of the links' rate at an instant, shaped as the distances, or one for all."""
+        share = self.faults.share(instant)
+        return share if isinstance(share, float) else np.broadcast_to(share, distance_m.shape)

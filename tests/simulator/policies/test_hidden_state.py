@@ -18,12 +18,12 @@ from simulator.policies.registry import POLICY_NAMES, policy_named
 from simulator.world import Observation, PipelineWorld
 from simulator.world.fleet import Fleet
 from simulator.world.sensors import Sensors, Streams
-from simulator.world.true_channel import TrueChannel
+from simulator.world.truth import Truth
 
 # The paper's world with radios so weak that some sensors stay unheard for a while.
 SCENARIO = SCENARIOS["paper"].model_copy(update={"radio_radius_m": 200.0})
 DECISIONS, SEED = 4, 0
-HIDDEN = (PipelineWorld, Sensors, Streams, Fleet, TrueChannel)
+HIDDEN = (PipelineWorld, Sensors, Streams, Fleet, Truth)
 Actions = list[tuple[int, int]]
 
 

@@ -23,7 +23,9 @@ NO_RATE = Scenario(name="no_rate", packet_bits=1e12, steps=5)
 PLENTY = Scenario(name="plenty", battery_j=1e9, transmit_power_w=1e-6, packet_bits=1.0, bandwidth_hz=1e12, steps=5)
 SCATTERED = Scenario(name="scattered", area_m=2000.0, steps=12)
 DEAD = SCENARIOS["shadowed"].model_copy(update={"name": "dead", "dead_radios": 4})
-WORLDS = [*SCENARIOS.values(), DEAD, ROUTES, FLAT, NO_RATE, PLENTY, SCATTERED]
+LEAVING = SCENARIOS["dense"].model_copy(update={"name": "leaving", "departures": 6, "gust_mps": 9.0, "wind_mps": 9.0})
+GONE = {"failed": False, "collected": 0, "lost_packets": 0}
+WORLDS = [*SCENARIOS.values(), DEAD, LEAVING, ROUTES, FLAT, NO_RATE, PLENTY, SCATTERED]
 
 
 def actions_of(scenario: Scenario, seeds: range) -> tuple[Any, Any]:
@@ -34,7 +36,8 @@ def actions_of(scenario: Scenario, seeds: range) -> tuple[Any, Any]:
 
 
 def same(batched: dict[str, Any], world: int, single: dict[str, Any]) -> None:
-    for uav, observation in enumerate(single.values()):
+    for agent, observation in single.items():
+        uav = int(agent.removeprefix("uav_"))
         for key, value in observation.items():
             np.testing.assert_array_equal(batched[key][world, uav], value, err_msg=f"{key} of UAV {uav}", strict=True)
 
@@ -53,13 +56,14 @@ def test_every_number_is_that_of_the_single_world(scenario: Scenario, cost: Cost
         observation, outcome = batch.step(sensors[step], velocities[step])
         for index, world in enumerate(singles):
             pairs = np.stack((sensors[step, index], velocities[step, index]), axis=-1)
-            alone, rewards, _, over, infos = world.step(dict(zip(world.agents, pairs, strict=True)))
+            alone, rewards, _, over, infos = world.step({agent: pairs[uav] for agent, uav in world.live.items()})
             same(observation, index, alone)
             tally = world.tally[-1]
-            assert outcome.reward[index].tolist() == list(rewards.values())
-            assert outcome.failed[index].tolist() == [info["failed"] for info in infos.values()]
-            assert outcome.moved[index].tolist() == [info["collected"] for info in infos.values()]
-            assert outcome.blamed[index].tolist() == [info["lost_packets"] for info in infos.values()]
+            of_all: Any = {f"uav_{uav}": GONE for uav in range(scenario.uavs)} | infos
+            assert outcome.reward[index].tolist() == [rewards.get(agent, 0.0) for agent in of_all]
+            assert outcome.failed[index].tolist() == [info["failed"] for info in of_all.values()]
+            assert outcome.moved[index].tolist() == [info["collected"] for info in of_all.values()]
+            assert outcome.blamed[index].tolist() == [info["lost_packets"] for info in of_all.values()]
             assert (outcome.failures[index], outcome.overflows[index]) == (tally.failures, tally.overflows)
             assert (outcome.lost_packets[index], outcome.events[index]) == (tally.lost_packets, tally.events)
             assert outcome.collected[index].tolist() == tally.collected.tolist()
