@@ -53,12 +53,14 @@ def with_steps(steps: int) -> PipelineWorld:
 # ---- PettingZoo
 
 
-def test_pettingzoos_api() -> None:
-    parallel_api_test(PipelineWorld(), num_cycles=100)
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_pettingzoos_api(name: str) -> None:
+    parallel_api_test(PipelineWorld(SCENARIOS[name]), num_cycles=100)
 
 
-def test_pettingzoos_seeding() -> None:
-    parallel_seed_test(PipelineWorld)
+@pytest.mark.parametrize("name", ["paper", "field"])
+def test_pettingzoos_seeding(name: str) -> None:
+    parallel_seed_test(lambda: PipelineWorld(SCENARIOS[name]))
 
 
 def test_pettingzoos_cycles() -> None:
