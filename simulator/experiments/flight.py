@@ -104,6 +104,8 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
         "arrivals": arrivals,
         "seed": seed,
     }
+    if site.gains is not None:
+        whole["gains"] = site.gains.digest()
     return hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()[:24]
 
 

@@ -14,6 +14,10 @@ such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are th
 ``arrivals.csv`` (optional): a trace, ``step,<sensor ID>,<sensor ID>,...``, whole packets, one line a step from step 0,
 for at least the mission's steps. Without it arrivals are Poisson with the scenario's rates.
 
+``gains.csv`` (optional): a gain trace, ``uav,sensor,progress_m,excess_db``, one line a point: the loss in dB above the
+scenario's mean path loss, from that UAV (0: the first trajectory) at that arc length along its trajectory to the sensor
+of that ID. Between points it is interpolated; a pair without points has no excess.
+
 A seed draws each UAV's start along its trajectory, the initial queues and, without a trace, the arrivals.
 """
 
@@ -29,6 +33,7 @@ from shared.channel import FloatArray, link_holds
 from shared.scenario import Point, Scenario
 from shared.trajectory import trajectories
 from simulator.errors import UsageError
+from simulator.sites.files.gains import read_gains
 from simulator.sites.files.overrides import read_overrides
 from simulator.sites.files.projection import in_square, to_metres
 from simulator.sites.files.reading import quoted
@@ -36,9 +41,9 @@ from simulator.sites.files.survey import Survey, read_survey
 from simulator.sites.files.trace import read_trace
 from simulator.sites.site import Site
 
-__all__ = ["ARRIVALS", "FEATURES", "OVERRIDES", "site_from_folder"]
+__all__ = ["ARRIVALS", "FEATURES", "GAINS", "OVERRIDES", "site_from_folder"]
 
-FEATURES, OVERRIDES, ARRIVALS = "world.geojson", "scenario.toml", "arrivals.csv"
+FEATURES, OVERRIDES, ARRIVALS, GAINS = "world.geojson", "scenario.toml", "arrivals.csv", "gains.csv"
 MAX_AREA_M = 1_000_000.0
 # The most sensors out of reach that a warning names.
 FAR_NAMED = 5
@@ -65,7 +70,13 @@ def site_from_folder(
     if "name" not in overrides.values:
         derived["name"] = _fit_name(folder.resolve().name)
     scenario = overrides.scenario(derived)
-    site = Site(scenario, _arrivals(folder / ARRIVALS, scenario, list(survey.sensors)))
+    names, gains = list(survey.sensors), folder / GAINS
+    lengths_m = [path.length_m for path in trajectories(scenario)]
+    site = Site(
+        scenario,
+        _arrivals(folder / ARRIVALS, scenario, names),
+        read_gains(gains, names, lengths_m) if gains.exists() else None,
+    )
     far = [name for name, near in zip(survey.sensors, _in_reach(scenario), strict=True) if not near]
     if far:
         named = ", ".join(quoted(name) for name in far[:FAR_NAMED]) + (" and others" if len(far) > FAR_NAMED else "")

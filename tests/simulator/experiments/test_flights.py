@@ -15,6 +15,7 @@ from simulator.experiments.schemes import BOUND, OFF, Scheme, at_full_speed, llm
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
+from simulator.world.gain_trace import GainTrace
 from tests.simulator.experiments.tiny_flights import TINY, declared, flown, run_in
 
 
@@ -47,6 +48,7 @@ def test_a_schemes_name_is_no_part_of_the_key() -> None:
 
 def test_decider_site_and_seed_are_part_of_the_key() -> None:
     traced = Site(TINY, np.zeros((3, 10), dtype=np.int64))
+    measured = [Site(TINY, gains=GainTrace({(0, 1): (np.zeros(1), np.full(1, loss))})) for loss in (3.0, 4.0)]
     keys = {
         flight_key(llm(), "embedded", Site(TINY), 0),
         flight_key(llm(), "embedded", Site(TINY), 1),
@@ -55,10 +57,11 @@ def test_decider_site_and_seed_are_part_of_the_key() -> None:
         flight_key(over_edge("llm", "", deadline_ms=None), "embedded", Site(TINY), 0),
         flight_key(llm(), "embedded", Site(Scenario(steps=4)), 0),
         flight_key(llm(), "embedded", traced, 0),
+        *(flight_key(llm(), "embedded", site, 0) for site in measured),
         flight_key(local("eof"), None, Site(TINY), 0),
         flight_key(at_full_speed("eof"), None, Site(TINY), 0),
     }
-    assert len(keys) == 9
+    assert len(keys) == 11
 
 
 def test_a_stored_flight_is_the_rollout_of_its_policy(tmp_path: Path) -> None:

@@ -31,7 +31,14 @@ RING = [[41.5, 39.95], [41.51, 39.95], [41.51, 39.96], [41.5, 39.95]]
 GOOD = (sensor("a"), sensor("b", 41.505), there_and_back())
 
 
-def write(folder: Path, *features: Json, toml: str | None = None, trace: str | None = None, **members: Any) -> Path:
+def write(
+    folder: Path,
+    *features: Json,
+    toml: str | None = None,
+    trace: str | None = None,
+    gains: str | None = None,
+    **members: Any,
+) -> Path:
     """Write a world's files into a folder; ``members`` are further members of the feature collection."""
     collection = {"type": "FeatureCollection", "features": list(features), **members}
     (folder / "world.geojson").write_text(json.dumps(collection), encoding="utf-8")
@@ -39,6 +46,8 @@ def write(folder: Path, *features: Json, toml: str | None = None, trace: str | N
         (folder / "scenario.toml").write_text(toml, encoding="utf-8")
     if trace is not None:
         (folder / "arrivals.csv").write_text(trace, encoding="utf-8")
+    if gains is not None:
+        (folder / "gains.csv").write_text(gains, encoding="utf-8")
     return folder
 
 

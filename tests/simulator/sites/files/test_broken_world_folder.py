@@ -39,6 +39,7 @@ def line(points: Any) -> Json:
     return feature("trajectory", "LineString", points)
 
 
+POINTS = "uav,sensor,progress_m,excess_db\n"
 NOWHERE = {"type": "Feature", "properties": {"role": "sensor", "id": "x"}, "geometry": None}
 CROWD = [feature("trajectory", "LineString", [[41.5, 39.95], [41.51, 39.955]]) for _ in range(101)]
 EXTRA: list[tuple[Any, str]] = [
@@ -176,6 +177,30 @@ def test_a_broken_trace_names_the_line(tmp_path: Path, trace: str, complaint: st
     assert complaint in error
 
 
+@pytest.mark.parametrize(
+    ("gains", "complaint"),
+    [
+        ("", "line 1: the header is uav,sensor,progress_m,excess_db"),
+        ("uav,sensor,x,y,excess_db\n", "line 1: the header is uav,sensor,progress_m,excess_db"),
+        (POINTS, "gains.csv has a header and no point"),
+        (POINTS + "0,a,1\n", "line 2: 3 values, the header has 4"),
+        (POINTS + "1,a,0,3\n", "line 2: UAV '1'; write the number of a trajectory, 0 to 0"),
+        (POINTS + "-0,a,0,3\n", "line 2: UAV '-0'"),
+        (POINTS + "0,c,0,3\n", "line 2: 'c' is no sensor of world.geojson"),
+        (POINTS + "0,a,-1,3\n", "line 2: progress_m '-1' is no number from 0 to "),
+        (POINTS + "0,a,1e9,3\n", "line 2: progress_m '1e9' is no number from 0 to "),
+        (POINTS + "0,a,5,nan\n", "line 2: excess_db 'nan' is no number from -200 to 200"),
+        (POINTS + "0,a,5,\n", "line 2: excess_db '' is no number"),
+        (POINTS + "0,a,5,1\n\n0,a,5.0,2\n", "line 4: this point of UAV 0 and sensor 'a' comes twice"),
+        (POINTS + '0,a,5,"1"x\n', "line 2: ',' expected after '\"'"),
+    ],
+)  # fmt: skip
+def test_a_broken_gain_trace_names_the_line(tmp_path: Path, gains: str, complaint: str) -> None:
+    error = error_of(write(tmp_path, *GOOD, gains=gains))
+    assert error.startswith(str(tmp_path / "gains.csv"))
+    assert complaint in error
+
+
 def test_a_short_trace_will_do_for_a_short_mission(tmp_path: Path) -> None:
     site = site_from_folder(write(tmp_path, *GOOD, trace=traced(5)), steps=5)
     assert site.arrivals is not None and site.arrivals.shape == (5, 2)
@@ -191,7 +216,7 @@ def test_more_arrivals_than_a_world_may_draw(tmp_path: Path) -> None:
 
 def fuzzed(folder: Path, change: Callable[[Path], object]) -> None:
     """Read a world after a change: it gives a site that can be flown, or a ``UsageError``."""
-    for name in ("scenario.toml", "arrivals.csv"):
+    for name in ("scenario.toml", "arrivals.csv", "gains.csv"):
         (folder / name).unlink(missing_ok=True)
     write(folder, *GOOD)
     change(folder)
@@ -239,7 +264,7 @@ def test_any_features_make_a_site_or_a_usage_error(tmp_path: Path, extra: list[A
 @quick
 @given(content=st.binary(max_size=60) | anything.map(lambda value: json.dumps(value).encode()))
 def test_any_bytes_make_a_site_or_a_usage_error(tmp_path: Path, content: bytes) -> None:
-    for name in ("world.geojson", "scenario.toml", "arrivals.csv"):
+    for name in ("world.geojson", "scenario.toml", "arrivals.csv", "gains.csv"):
         fuzzed(tmp_path, lambda folder, name=name: (folder / name).write_bytes(content))  # type: ignore[misc]
 
 
@@ -262,3 +287,14 @@ def test_any_cells_make_a_site_or_a_usage_error(tmp_path: Path, cells: list[list
     csv.writer(out, escapechar="\\").writerows([["step", "a", "b"], *([t, *row] for t, row in enumerate(cells))])
     text = out.getvalue().encode("utf-8", errors="surrogatepass")
     fuzzed(tmp_path, lambda folder: (folder / "arrivals.csv").write_bytes(text))
+
+
+@quick
+@given(
+    rows=st.lists(st.lists(st.sampled_from(["0", "a", "b", "9.5", ""]) | st.text(max_size=4), max_size=5), max_size=4)
+)
+def test_any_gains_make_a_site_or_a_usage_error(tmp_path: Path, rows: list[list[str]]) -> None:
+    out = io.StringIO()
+    csv.writer(out, escapechar="\\").writerows([POINTS.strip().split(","), *rows])
+    text = out.getvalue().encode("utf-8", errors="surrogatepass")
+    fuzzed(tmp_path, lambda folder: (folder / "gains.csv").write_bytes(text))

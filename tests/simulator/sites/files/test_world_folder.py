@@ -19,6 +19,7 @@ from simulator.policies.registry import policy_named
 from simulator.sites.files.projection import to_metres
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.site import Site
+from simulator.world.batch import VectorWorld
 from tests.simulator.sites.files.made_folder import EXAMPLE, GOOD, RING, feature, sensor, there_and_back, traced, write
 
 EARTH = Geod(ellps="WGS84")
@@ -122,6 +123,22 @@ def test_a_trace_gives_the_arrivals_and_the_seed_draws_the_rest(tmp_path: Path) 
         np.testing.assert_array_equal(world.sensors.arrivals, [(10 * t, t) for t in range(30)])
     assert one.fleet.start_m != two.fleet.start_m
     assert not np.array_equal(one.sensors.initial_queue, two.sensors.initial_queue)
+
+
+def test_a_gain_trace_is_interpolated_around_the_trajectory(tmp_path: Path) -> None:
+    plain = site_from_folder(write(tmp_path, *GOOD)).world()
+    lap = trajectories(plain.scenario)[0].length_m
+    gains = f"\ufeffuav, sensor ,progress_m,excess_db\r\n0,b,{0.5 * lap},10\r\n0, b ,{0.25 * lap},-2\r\n\r\n"
+    site = site_from_folder(write(tmp_path, *GOOD, gains=gains))
+    world = site.world()
+    observed, unaided = world.reset(seed=1)[0]["uav_0"], plain.reset(seed=1)[0]["uav_0"]
+    along = world.fleet.progress_m[0] / lap % 1
+    expected = np.interp(along, [-0.5, 0.25, 0.5, 1.25], [10, -2, 10, -2])
+    more = unaided["channel_gain"] - observed["channel_gain"]
+    np.testing.assert_allclose(more, [0.0, expected], atol=1e-5)
+    assert set(unaided["last_heard"]) == {0}
+    batch = VectorWorld(site.scenario, gains=site.gains).reset([1])
+    np.testing.assert_array_equal(batch["channel_gain"][0, 0], observed["channel_gain"])
 
 
 def test_the_same_files_are_the_same_site(tmp_path: Path) -> None:
