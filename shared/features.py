@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray, best_gain_db, channel_gain_db
 from shared.fleetplan import FleetBelief
-from shared.reach import Reach, distances_ahead
+from shared.learned_channel import ExpectedLinks, LearnedChannel
+from shared.reach import Reach, distances_between, places_ahead
 from shared.scenario import Point, Scenario
 from shared.urgency import overflow_probability, urgency_of
 from shared.wire import Features, UavState
@@ -26,7 +27,8 @@ class State:
     ``progress_m`` along the trajectory, if the UAV reported it; ``queue`` packets, ``battery`` J, ``gain`` dB,
     ``rate`` packets a step, ``since_visit`` steps, ``overflow`` (the probability of one before the next visit) and
     ``urgency`` 0..1, ``distance`` m from the UAV now. A sensor never heard (``heard`` false) has zeros
-    in the fields that only a beacon fills. Only preset ``reach`` has ``reach``.
+    in the fields that only a beacon fills. ``channel`` is the fleet's knowledge of its links; without it they follow
+    the formula. Only preset ``reach`` has ``reach``.
     """
 
     position: Point
@@ -43,6 +45,7 @@ class State:
     overflow: FloatArray
     urgency: FloatArray
     distance: FloatArray
+    channel: LearnedChannel | None = None
     reach: Reach | None = None
 
     @property
@@ -59,8 +62,17 @@ class State:
         """The UAV's reach after the next step, in any preset."""
         if self.reach is not None:
             return self.reach
-        ahead = distances_ahead(uav_id, self.position, self.progress_m, self.places, scenario)
-        return Reach.of(ahead, np.where(self.able, self.queue, 0.0), self.urgency, scenario)
+        ahead = places_ahead(uav_id, self.position, self.progress_m, scenario)
+        links = self.links(ahead, distances_between(ahead, self.places), np.arange(len(self.ids)), scenario)
+        return Reach.of(links, np.where(self.able, self.queue, 0.0), self.urgency)
+
+    def links(
+        self, places: FloatArray, distance: FloatArray, rows: NDArray[np.int64], scenario: Scenario
+    ) -> ExpectedLinks:
+        """The expected links from the UAV's places ``(P, 2)`` to the sensors in n rows, at distances ``(P, n)``."""
+        if self.channel is None:
+            return ExpectedLinks.by_formula(distance, scenario)
+        return self.channel.links(places, distance, self.ids[rows])
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """Attention's input for the n admissible sensors, ``(n, d)``, each number 0..1.
@@ -113,8 +125,8 @@ def augment(
 ) -> State:
     """Complete a UAV's report with visiting records, urgency, and the channel at its present position.
 
-    A stale channel gain is replaced by the channel model's at the present distance: the place of a sensor does
-    not change, so the model knows better than an old beacon. Admissible is a sensor heard, with a battery, and not
+    A stale channel gain is replaced by the expected one at the present distance: the place of a sensor does not change,
+    so the model knows better than an old beacon. Admissible is a sensor heard, with a battery, and not
     reserved.
 
     With a fleet's belief, queues and batteries are the values that the fleet expects now, and a sensor that no UAV has
@@ -142,11 +154,12 @@ def augment(
     urgencies = urgency_of(queue, overflow, scenario)
     given_away = np.zeros(scenario.sensors, dtype=np.bool_)
     given_away[list(reserved)] = True
-    reach = None
-    if preset == "reach":
-        ahead = distances_ahead(uav.uav_id, position, uav.progress_m, places, scenario)
-        reach = Reach.of(ahead, np.where(heard & (battery > 0), queue, 0.0), urgencies, scenario)
-    return State(
+    channel = None if belief is None else belief.channel
+    if channel is None or channel.radio_map.exact:
+        expected = channel_gain_db(distance, scenario)
+    else:
+        expected = channel.gain_db(np.asarray(position), distance, ids)
+    state = State(
         position=position,
         progress_m=uav.progress_m,
         places=places,
@@ -155,14 +168,15 @@ def augment(
         admissible=heard & (battery > 0) & ~given_away[ids],
         queue=queue,
         battery=battery,
-        gain=np.where(fresh, filled(sensors.channel_gain), channel_gain_db(distance, scenario)),
+        gain=np.where(fresh, filled(sensors.channel_gain), expected),
         rate=rate,
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
         overflow=overflow,
         urgency=urgencies,
         distance=distance,
-        reach=reach,
+        channel=channel,
     )
+    return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
 
 
 def filled(column: Sequence[float | None], missing: float = 0.0) -> FloatArray:

@@ -9,7 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, link_holds, packets_per_step
+from shared.channel import FloatArray
+from shared.learned_channel import ExpectedLinks, likely_to_hold
 from shared.scenario import Point, Scenario
 from shared.trajectory import progress_of, trajectories
 
@@ -20,23 +21,21 @@ VELOCITY_BONUS = 0.5
 LEVEL_FEATURES = 4
 
 
-def distances_ahead(
-    uav: int, position: Point, progress_m: float | None, places: FloatArray, scenario: Scenario
-) -> FloatArray:
-    """Distances after one step at each of the V velocity levels to each of the J places, m, ``(V, J)``.
+def places_ahead(uav: int, position: Point, progress_m: float | None, scenario: Scenario) -> FloatArray:
+    """A UAV's places after one step at each of the V velocity levels, m, ``(V, 2)``.
 
-    A UAV off its scenario's trajectory flies an unknown one: the distances are then from its present position.
-
-    Args:
-        places: ``(J, 2)``, metres.
+    A UAV off its scenario's trajectory flies an unknown one: its places are then the present one.
     """
     velocities = np.arange(scenario.max_velocity + 1)
     path = trajectories(scenario)[uav]
     progress = progress_of(path, position, progress_m)
     if progress is None:
-        ahead = np.broadcast_to(np.asarray(position, dtype=np.float64), (len(velocities), 2))
-    else:
-        ahead = path.at(progress + velocities * scenario.step_s)
+        return np.broadcast_to(np.asarray(position, dtype=np.float64), (len(velocities), 2))
+    return path.at(progress + velocities * scenario.step_s)
+
+
+def distances_between(ahead: FloatArray, places: FloatArray) -> FloatArray:
+    """Distances of the UAV's places ``(V, 2)`` to the sensors' ``(J, 2)``, m, ``(V, J)``."""
     # numpy's norm of pairs takes three times as long as this computation by axis.
     east, north = (places[None, :, axis] - ahead[:, None, axis] for axis in (0, 1))
     return np.asarray(np.sqrt(east * east + north * north))
@@ -46,20 +45,30 @@ def distances_ahead(
 class Reach:
     """One UAV's reach after a step at each of V velocity levels to each of J sensors; arrays ``(V, J)``.
 
-    ``distance`` m; ``packets`` that the UAV could move, ``min(q_j, packets_per_step)``, 0 for a sensor that was never
-    heard or has a flat battery; ``worth`` in urgent packets, ``U_j packets + 0.5 v``.
+    ``links``: the expected transfers. ``packets`` that are expected to move, ``P(hold) min(q_j, packets)``, 0 for a
+    sensor that was never heard or has a flat battery; ``worth`` in urgent packets, ``U_j packets + 0.5 v``.
     """
 
-    distance: FloatArray
+    links: ExpectedLinks
     packets: FloatArray
     worth: FloatArray
 
     @classmethod
-    def of(cls, distance: FloatArray, queue: FloatArray, urgency: FloatArray, scenario: Scenario) -> Self:
-        """From distances ``(V, J)``, queues and urgencies ``(J,)``; the queue is 0 for a sensor that cannot send."""
-        packets = np.minimum(queue, packets_per_step(distance, scenario)).astype(np.float64)
-        velocities = np.arange(len(distance), dtype=np.float64)
-        return cls(distance, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
+    def of(cls, links: ExpectedLinks, queue: FloatArray, urgency: FloatArray) -> Self:
+        """From links ``(V, J)``, queues and urgencies ``(J,)``; the queue is 0 for a sensor that cannot send."""
+        packets = links.movable(queue)
+        velocities = np.arange(len(packets), dtype=np.float64)
+        return cls(links, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
+
+    @property
+    def distance(self) -> FloatArray:
+        """Metres."""
+        return self.links.distance
+
+    @property
+    def likely(self) -> NDArray[np.bool_]:
+        """Whether each link is likely to hold."""
+        return likely_to_hold(self.links.hold)
 
     @cached_property
     def best(self) -> NDArray[np.int64]:
@@ -75,15 +84,15 @@ class Reach:
         """The features of preset ``reach`` beside preset ``paper``'s five, ``(J, 7)``, each 0..1.
 
         They are, at the best velocity, packets / W, urgent packets / W, and that velocity / max; then steps until
-        overflow / T, in reach at velocity 0, in reach at full speed, and half the distance at velocity 0 in radio
-        radii.
+        overflow / T, the probabilities that the link holds at velocity 0 and at full speed, and half the distance at
+        velocity 0 in radio radii.
 
         Args:
             urgency: U, ``(J,)``.
             overflow_in: ``(W - q) / rate``, steps, ``(J,)``.
         """
         packets = self.best_packets / scenario.queue_capacity
-        holds = link_holds(self.distance[[0, -1]], scenario)
+        holds = self.links.holding([0, -1])
         columns = (
             packets,
             urgency * packets,

@@ -106,4 +106,6 @@ def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief)
     belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
     places = np.array((uav.sensors.x, uav.sensors.y), dtype=np.float64).T
     belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
+    fresh = seen == step
+    belief.measure(uav.uav_id, ids[fresh], filled(uav.sensors.channel_gain)[fresh])
     records.hear(ids, seen, queue)

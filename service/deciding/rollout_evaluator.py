@@ -22,6 +22,7 @@ from shared.actions import Action
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
+from shared.learned_channel import normal_below
 from shared.reach import VELOCITY_BONUS
 from shared.scenario import Scenario
 from shared.urgency import urgency
@@ -51,8 +52,11 @@ class RolloutState:
         unknown: shape ``(n,)``, whether the queue is unknown and is sampled as the world samples it.
         age: shape ``(n,)``, steps since the queue was known.
         arrived, watched: shape ``(n,)``, shape and rate of the Gamma belief of the packets a step.
-        links: by UAV, shape ``(horizon x max_velocity + 1, n)``: the packets that the UAV can move, by the sum of its
-            velocities so far.
+        links: by UAV, shape ``(horizon x max_velocity + 1, n)``: the packets that the UAV can move over a link that
+            holds, by the sum of its velocities so far.
+        margins: by UAV, of the same shape: the link's path loss below the threshold, in standard deviations of its
+            uncertainty; empty if the links are certain.
+        alive: shape ``(n,)``, the probability that each sensor's radio works.
         decided: the velocities of the UAVs that already have a decision in this step.
         reserved: shape ``(n,)``, sensors that other UAVs have in this step.
         plans: by UAV, shape ``(steps, 2)``: planned sensors, as indices into ``sensors`` (-1: none), and velocities.
@@ -71,6 +75,8 @@ class RolloutState:
     arrived: FloatArray
     watched: FloatArray
     links: dict[int, FloatArray]
+    margins: dict[int, FloatArray]
+    alive: FloatArray
     decided: dict[int, int]
     reserved: NDArray[np.bool_]
     plans: dict[int, NDArray[np.int64]]
@@ -103,7 +109,9 @@ class RolloutState:
         # Any subset of UAVs will do, because the UAVs' distances change within the horizon.
         others = [other for other in belief.present(step) if other != uav][: _MAX_UAVS - 1]
         flown = np.arange(horizon * scenario.max_velocity + 1) * scenario.step_s
-        links = {i: belief.links(i, flown).astype(np.float64) for i in (uav, *others)}
+        expected = {i: belief.links(i, flown) for i in (uav, *others)}
+        links = {i: found.packets.astype(np.float64) for i, found in expected.items()}
+        margins = {i: found.margin for i, found in expected.items() if found.margin is not None}
         reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links.values()], axis=0))
         sensors = _most_urgent(belief, scenario, step, guidance, reached)
         decided = belief.decided(step)
@@ -114,9 +122,10 @@ class RolloutState:
         visited = belief.visited.copy()
         for other in set(decided) & set(others):
             sensor, velocity = decided[other]
-            queue[sensor] = max(0.0, float(belief.queue(step)[sensor] - links[other][velocity, sensor]))
+            link = int(expected[other].likely[velocity, sensor])
+            queue[sensor] = max(0.0, float(belief.queue(step)[sensor] - link))
             age[sensor], unknown[sensor] = 0, False
-            if links[other][velocity, sensor] > 0:
+            if link > 0:
                 visited[sensor] = step
         return cls(
             scenario=scenario,
@@ -130,6 +139,8 @@ class RolloutState:
             arrived=belief.arrived[sensors],
             watched=belief.watched[sensors],
             links={i: table[:, sensors] for i, table in links.items()},
+            margins={i: table[:, sensors] for i, table in margins.items()},
+            alive=belief.channel.failures.alive(sensors),
             decided={i: decided[i][1] for i in others if i in decided},
             reserved=np.isin(sensors, list(reserved)),
             plans={i: _indexed(sensors, actions[:horizon]) for i, actions in (plans or {}).items() if i in links},
@@ -178,7 +189,7 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     first = np.stack((np.where(known, rows, 0), [v for _, v in candidates]), axis=1)
     losses = []
     for plans in continuations:
-        world = _RolloutBatch(state, np.tile(futures.start, (count, 1)), plans)
+        world = _RolloutBatch(state, np.tile(futures.start, (count, 1)), np.tile(futures.fades, (count, 1)), plans)
         many = len(futures.start)
         cost = world.fly_first(np.repeat(first, many, axis=0), np.repeat(known, many))
         lost = world.arrive(np.tile(futures.arrivals[0], (count, 1)))
@@ -192,10 +203,15 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class _SampledFutures:
-    """M futures sampled from the belief: queues ``(M, n)`` and arrivals ``(H, M, n)``."""
+    """M futures sampled from the belief: queues ``(M, n)``, arrivals ``(H, M, n)``, and the sensors' fades ``(M, n)``.
+
+    A fade is the excess of a sensor's path losses over their means, in standard deviations, the same in all steps:
+    infinite where the radio is dead.
+    """
 
     start: FloatArray
     arrivals: FloatArray
+    fades: FloatArray
 
     @classmethod
     def of(cls, state: RolloutState, count: int) -> _SampledFutures:
@@ -209,16 +225,17 @@ class _SampledFutures:
         rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
         drawn = random.uniform(scenario.initial_queue_min * capacity, capacity, shape)
         start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age)
-        return cls(
-            start=np.minimum(start, capacity),
-            arrivals=random.poisson(rates, (state.horizon, *shape)).astype(np.float64),
-        )
+        arrivals = random.poisson(rates, (state.horizon, *shape)).astype(np.float64)
+        fades = np.where(random.uniform(size=shape) < state.alive, random.standard_normal(shape), np.inf)
+        return cls(np.minimum(start, capacity), arrivals, fades)
 
 
 class _RolloutBatch:
     """B copies of the state: queues ``(B, n)``, and the sum of each UAV's velocities so far."""
 
-    def __init__(self, state: RolloutState, queue: FloatArray, plans: Mapping[int, NDArray[np.int64]]) -> None:
+    def __init__(
+        self, state: RolloutState, queue: FloatArray, fades: FloatArray, plans: Mapping[int, NDArray[np.int64]]
+    ) -> None:
         self._state = state
         self._plans = plans
         scenario = state.scenario
@@ -235,6 +252,15 @@ class _RolloutBatch:
         self._ahead = {
             uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.links.items()
         }
+        # The same of the margins, and of the probability that the link holds.
+        self._margins = {
+            uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.margins.items()
+        }
+        self._holds = {
+            uav: sliding_window_view(normal_below(table) * state.alive, scenario.max_velocity + 1, axis=0)
+            for uav, table in state.margins.items()
+        }
+        self._fades = fades
         self._flown = {uav: np.zeros(len(queue), dtype=np.int64) for uav in self._ahead}
         self._queue = queue
         self._rows, self._columns = np.arange(len(queue)), np.arange(queue.shape[1])
@@ -249,6 +275,8 @@ class _RolloutBatch:
         velocity = first[:, 1]
         if len(self._columns):
             ahead = self._ahead[own][0].T[velocity]
+            if own in self._margins:
+                ahead = np.where(self._margins[own][0].T[velocity] > self._fades, ahead, 0.0)
             self._in_reach = ahead > 0
             served_now = self._serve(first[:, 0], np.where(collects, ahead[self._rows, first[:, 0]], 0.0), served)
             failed = np.where(served_now, 0.0, 1.0)
@@ -275,8 +303,8 @@ class _RolloutBatch:
             return
         sensor, velocity = planned[step]
         if sensor >= 0:
-            link = self._ahead[uav][self._flown[uav], sensor, velocity]
-            self._serve(np.full(len(link), sensor), link, served)
+            sensors = np.full(len(self._rows), sensor)
+            self._serve(sensors, self._link(uav, sensors, velocity), served)
         self._flown[uav] += velocity
 
     def arrive(self, arrivals: FloatArray) -> FloatArray:
@@ -295,10 +323,20 @@ class _RolloutBatch:
         ahead = self._ahead[uav][self._flown[uav]]
         urgencies = self._urgency[self._queue.astype(np.int64), self._columns]
         movable = np.minimum(ahead, np.where(served, 0.0, self._queue)[..., None])
+        if uav in self._holds:
+            movable *= self._holds[uav][self._flown[uav]]
         worth = (urgencies * self._weights)[..., None] * movable + self._bonus
         sensor, velocity = np.unravel_index(worth.reshape(len(worth), -1).argmax(axis=1), worth.shape[1:])
-        self._serve(sensor, ahead[self._rows, sensor, velocity], served)
+        self._serve(sensor, self._link(uav, sensor, velocity), served)
         self._flown[uav] += velocity
+
+    def _link(self, uav: int, sensor: NDArray[np.int64], velocity: NDArray[np.int64] | int) -> FloatArray:
+        """Packets ``(B,)`` that one more step at a velocity can move from sensors ``(B,)``, 0 where the link fails."""
+        at = self._flown[uav], sensor, velocity
+        link = self._ahead[uav][at]
+        if uav not in self._margins:
+            return np.asarray(link)
+        return np.asarray(np.where(self._margins[uav][at] > self._fades[self._rows, sensor], link, 0.0))
 
     def _serve(self, sensor: NDArray[np.int64], link: FloatArray, served: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Move packets from sensors ``(B,)`` over links with these capacities; returns where that succeeds."""

@@ -13,7 +13,6 @@ import numpy as np
 from service.deciding.attended_state import AttendedState
 from service.llm.answers import NoDecision
 from shared.actions import Action
-from shared.channel import link_holds
 
 
 def verify(state: AttendedState, answer: Action) -> None:
@@ -28,9 +27,7 @@ def verify(state: AttendedState, answer: Action) -> None:
         return
     if mission.belief.battery[sensor] <= 0:
         raise NoDecision("rule_battery", f"the battery of sensor {sensor} is flat")
-    distance = state.reach.distance
+    likely = state.reach.likely
     row = int(np.flatnonzero(state.state.ids == sensor)[0])
-    if link_holds(distance[velocity, row], mission.scenario):
-        return
-    if link_holds(distance[:, state.state.admissible], mission.scenario).any():
+    if not likely[velocity, row] and likely[:, state.state.admissible].any():
         raise NoDecision("rule_reach", f"sensor {sensor} is out of reach after a step at {velocity} m/s")

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, link_holds
+from shared.channel import FloatArray
 from shared.features import State
 from shared.guidance import Guidance
 from shared.reach import Reach
@@ -41,7 +41,7 @@ class StepGuidance:
         """
         allowed = guidance.allowed(scenario.max_velocity + 1)
         overdue = guidance.overdue(step, visits)[state.ids] > 0
-        due = overdue & state.able & link_holds(reach.distance, scenario) & allowed[:, None]
+        due = overdue & state.able & reach.likely & allowed[:, None]
         weights = guidance.weights(scenario.sensors)[state.ids]
         worth = (weights - 1.0) * state.urgency * reach.packets + scenario.queue_capacity * due
         return cls(allowed, due, np.where(allowed[:, None], worth, -np.inf))

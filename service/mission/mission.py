@@ -174,6 +174,7 @@ class Mission:
         last = self.reservations.of(decision.step, decision.uav_id)
         if last is not None and last.decision_id != decision.decision_id:
             return None
+        self.belief.settle(decision.uav_id, decision.step, outcome.failed)
         line = self.template.experience(decision.seen, decision.sensor_id, decision.velocity, outcome.cost)
         sample = decision.sample
         features = None if sample is None else sample.features[sample.chosen].copy()

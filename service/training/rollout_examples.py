@@ -19,7 +19,7 @@ from service.mission.mission import Mission
 from service.training.reward import Reward, Speed
 from shared.actions import Action
 from shared.features import State
-from shared.reach import Reach, distances_ahead
+from shared.reach import Reach, distances_between, places_ahead
 from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
 from shared.wire import Belief, Features, MissionSpec, Outcome
@@ -108,8 +108,9 @@ def _taught(mission: Mission, state: AttendedState, reference: Reference | None)
 def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
     """The reach of that sensor alone, in any feature preset."""
     row = np.flatnonzero(state.ids == sensor_id)[:1]
-    distance = distances_ahead(uav, state.position, state.progress_m, state.places[row], scenario)
-    return Reach.of(distance, state.queue[row], state.urgency[row], scenario)
+    ahead = places_ahead(uav, state.position, state.progress_m, scenario)
+    distance = distances_between(ahead, state.places[row])
+    return Reach.of(state.links(ahead, distance, row, scenario), state.queue[row], state.urgency[row])
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from shared.channel import FloatArray, IntArray, Links, packets_per_step
+from shared.channel import FloatArray, IntArray
+from shared.learned_channel import ExpectedLinks, LearnedChannel
+from shared.radio_failures import GOOD_LINK_DB
 from shared.scenario import Point, Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
@@ -24,16 +26,36 @@ _ARRAYS = ("arrived", "watched", "base", "since", "heard", "battery", "places", 
 
 
 @dataclass(slots=True)
+class Visit:
+    """A flown decision: the sensor, and what was believed of it before.
+
+    ``collected`` says whether the belief has taken packets from the sensor, and ``failed`` is the UAV's report,
+    ``None`` before it.
+    """
+
+    step: int
+    sensor: int
+    base: float
+    since: int
+    visited: int
+    collected: bool
+    failed: bool | None = None
+
+
+@dataclass(slots=True)
 class Whereabouts:
-    """A UAV's position at the start of ``step``, and its decision in that step, if known.
+    """A UAV's position at the start of ``step``, its decision in that step, if known, and its last flown one.
 
     ``progress_m`` along its trajectory is ``None`` for a UAV off its trajectory, which is assumed to stay in place.
+    ``failed`` is the reported outcome of ``action``, ``None`` before the report.
     """
 
     step: int
     position: Point
     progress_m: float | None
     action: tuple[int, int] | None = None
+    failed: bool | None = None
+    visit: Visit | None = None
 
 
 class FleetBelief:
@@ -53,6 +75,7 @@ class FleetBelief:
         arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
         visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
         uavs: by index, the UAVs that were ever located.
+        channel: learned from gains and outcomes.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -73,6 +96,7 @@ class FleetBelief:
         self.places: FloatArray = np.full((count, 2), np.nan)
         self.visited: IntArray = np.full(count, -1)
         self.uavs: dict[int, Whereabouts] = {}
+        self.channel = LearnedChannel(scenario)
 
     @property
     def rate(self) -> FloatArray:
@@ -112,34 +136,89 @@ class FleetBelief:
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
         here = (float(position[0]), float(position[1]))
-        self.uavs[uav] = Whereabouts(step, here, progress_of(self._paths[uav], here, reported_m))
+        visit = self.uavs[uav].visit if uav in self.uavs else None
+        self.uavs[uav] = Whereabouts(step, here, progress_of(self._paths[uav], here, reported_m), visit=visit)
+
+    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
+        """Take the gains ``(n,)`` of the beacons that a UAV hears where it was located.
+
+        A transmission of the UAV's last step was over the same link as the beacon now. If it failed although that link
+        is good, the sensor's radio failed.
+        """
+        last = self.uavs[uav]
+        place = np.asarray(last.position)
+        distance = np.hypot(*(self.places[ids] - place).T)
+        near = distance <= self._scenario.radio_radius_m
+        self.channel.measure(ids[near], place, distance[near], gain_db[near])
+        visit = last.visit
+        if visit is None or visit.failed is None or visit.step != last.step - 1:
+            return
+        gain = gain_db[near & (ids == visit.sensor)]
+        if len(gain) and gain[0] > GOOD_LINK_DB - self._scenario.path_loss_limit_db and self.battery[visit.sensor] > 0:
+            self.channel.failures.settle(visit.sensor, visit.failed)
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
         if uav in self.uavs and self.uavs[uav].step == step:
-            self.uavs[uav].action = sensor, velocity
+            self.uavs[uav].action, self.uavs[uav].failed = (sensor, velocity), None
+
+    def settle(self, uav: int, step: int, failed: bool) -> None:
+        """Take the outcome of a UAV's decision of a step; only that of its last one counts."""
+        if uav not in self.uavs:
+            return
+        last = self.uavs[uav]
+        if last.step == step and last.action is not None:
+            last.failed = failed
+            return
+        visit = last.visit
+        if visit is None or visit.step != step or visit.failed is not None:
+            return
+        visit.failed = failed
+        untouched = self.heard[visit.sensor] <= step
+        if failed and visit.collected and untouched and self.since[visit.sensor] == step:
+            self.base[visit.sensor], self.since[visit.sensor] = visit.base, visit.since
+            self.visited[visit.sensor] = visit.visited
+        elif not failed and not visit.collected and untouched:
+            self.collect(visit.sensor, self._movable(last.position, visit.sensor, held=True), step)
 
     def advance(self, step: int) -> None:
         """Fly the decisions of the steps before this one: move the UAVs, and subtract the packets they collected."""
         flying = sorted(uav for uav, last in self.uavs.items() if last.step < step and last.action is not None)
-        served = set[tuple[int, int]]()
+        visits = (last.visit for last in self.uavs.values())
+        served = {(visit.sensor, visit.step) for visit in visits if visit is not None and visit.collected}
         for uav in flying:
-            last = self.uavs[uav]
-            sensor, velocity = last.action or (0, 0)
-            if last.progress_m is not None:
-                last.progress_m += velocity * self._scenario.step_s
-                x, y = self._paths[uav].at(last.progress_m)
-                last.position = float(x), float(y)
-            if (sensor, last.step) not in served and (packets := self._movable(last.position, sensor)):
+            self._fly(uav, served)
+        self.channel.advance(step)
+
+    def _fly(self, uav: int, served: set[tuple[int, int]]) -> None:
+        """Fly one UAV's decision; ``served`` has the sensors and steps of the fleet's successful visits."""
+        last = self.uavs[uav]
+        sensor, velocity = last.action or (0, 0)
+        if last.progress_m is not None:
+            last.progress_m += velocity * self._scenario.step_s
+            x, y = self._paths[uav].at(last.progress_m)
+            last.position = float(x), float(y)
+        base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])
+        collected = False
+        if (sensor, last.step) not in served and not last.failed:
+            packets = self._movable(last.position, sensor, held=last.failed is False)
+            if collected := packets > 0:
                 served.add((sensor, last.step))
                 self.collect(sensor, packets, last.step)
-            last.step, last.action = last.step + 1, None
+        last.visit = Visit(last.step, sensor, base, since, visited, collected, last.failed)
+        last.step, last.action, last.failed = last.step + 1, None, None
 
-    def _movable(self, position: Point, sensor: int) -> int:
-        """Packets that a step can move from a sensor to a UAV at this position; 0 for a sensor of unknown position."""
+    def _movable(self, position: Point, sensor: int, *, held: bool) -> int:
+        """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.
+
+        0 too for a sensor of unknown position.
+        """
         metres = np.hypot(*(position - self.places[sensor]))
         # Most sensors are out of radio range, and computing one transfer takes as long as computing many.
-        return int(Links.at(metres, self._scenario).packets) if metres <= self._scenario.radio_radius_m else 0
+        if not metres <= self._scenario.radio_radius_m:
+            return 0
+        links = self.channel.links(np.array([position]), np.array([[metres]]), np.array([sensor]))
+        return int((links.packets if held else links.likely)[0, 0])
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
         """Subtract the packets that a UAV collects in a step."""
@@ -150,17 +229,32 @@ class FleetBelief:
     def state_dict(self) -> dict[str, Any]:
         """The whole belief, as copies."""
         arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
-        uavs = {uav: [u.step, list(u.position), u.progress_m, u.action] for uav, u in self.uavs.items()}
-        return {**arrays, "uavs": uavs}
+        uavs = {
+            uav: [
+                *(u.step, list(u.position), u.progress_m, u.action),
+                *(u.failed, None if u.visit is None else astuple(u.visit)),
+            ]
+            for uav, u in self.uavs.items()
+        }
+        return {**arrays, "uavs": uavs, "channel": self.channel.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a belief."""
+        """Restore a belief. One of an earlier version has neither visits nor a channel."""
         for name in _ARRAYS:
             setattr(self, name, state[name])
         self.uavs = {
-            uav: Whereabouts(step, (x, y), progress_m, None if action is None else (action[0], action[1]))
-            for uav, (step, (x, y), progress_m, action) in state["uavs"].items()
+            uav: Whereabouts(
+                step=step,
+                position=(x, y),
+                progress_m=progress_m,
+                action=None if action is None else (action[0], action[1]),
+                failed=newer[0] if newer else None,
+                visit=Visit(*newer[1]) if newer and newer[1] is not None else None,
+            )
+            for uav, (step, (x, y), progress_m, action, *newer) in state["uavs"].items()
         }
+        if "channel" in state:
+            self.channel.load_state_dict(state["channel"])
 
     def queue(self, step: int, which: Which = slice(None)) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``which``."""
@@ -181,22 +275,25 @@ class FleetBelief:
         """The UAV's trajectory."""
         return self._paths[uav]
 
-    def links(self, uav: int, metres: ArrayLike) -> NDArray[np.int64]:
-        """Packets that a step can move to the UAV after it has flown ``metres`` ``(n,)`` on: shape ``(n, J)``."""
-        return packets_per_step(self.distances(uav, metres), self._scenario)
+    def links(self, uav: int, metres: ArrayLike) -> ExpectedLinks:
+        """The links to the UAV after it has flown ``metres`` ``(n,)`` on, ``(n, J)``."""
+        return self.channel.links(self._ahead(uav, metres), self.distances(uav, metres))
 
     def distances(self, uav: int, metres: ArrayLike, which: Which = slice(None)) -> FloatArray:
         """Horizontal distances, metres, ``(n, J)``, after the UAV has flown ``metres`` ``(n,)`` on.
 
         ``which`` selects the sensors, by default all. A sensor of unknown position is far away.
         """
-        flown = np.asarray(metres, dtype=np.float64)
-        last = self.uavs[uav]
-        if last.progress_m is None:
-            ahead = np.broadcast_to(np.asarray(last.position), (len(flown), 2))
-        else:
-            ahead = self._paths[uav].at(last.progress_m + flown)
+        ahead = self._ahead(uav, metres)
         offset = ahead[:, None, :] - self.places[which]
         metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
         metres_off[np.isnan(metres_off)] = FAR_M
         return metres_off
+
+    def _ahead(self, uav: int, metres: ArrayLike) -> FloatArray:
+        """The UAV's places, ``(n, 2)``, after it has flown ``metres`` ``(n,)`` on."""
+        flown = np.asarray(metres, dtype=np.float64)
+        last = self.uavs[uav]
+        if last.progress_m is None:
+            return np.broadcast_to(np.asarray(last.position), (len(flown), 2))
+        return self._paths[uav].at(last.progress_m + flown)

@@ -15,6 +15,9 @@ quick, one for every sensor and every run of steps s..e in which more than W pac
 
 That is, without a visit in these steps the sensor loses the excess.
 
+Over an uncertain link a transfer moves the expected packets, and cancels the risk by the link's chance. The chances are
+taken in tiers: for each, ``x`` confines ``c_it`` to the values from which the link holds with at least that chance.
+
 Batteries enter only as the packets that each can pay for over its best link, all steps together. This ignores the
 higher cost of a weak link, and so keeps every plan that the world allows: the proven bound stays valid.
 """
@@ -27,27 +30,45 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from ortools.sat.python import cp_model
 
-from shared.channel import IntArray, packets_per_step, rate_bps
-from shared.fleetplan.problem import Course, FleetProblem, fly
+from shared.channel import FloatArray, IntArray, rate_bps
+from shared.fleetplan.problem import Course, FleetProblem, expected_packets, fly
 
-# The Booleans that serve a sensor in a step, and the packets that each moves.
-Visits = list[tuple[Any, int]]
+# The Booleans that serve a sensor in a step, the packets that each moves, and the chance of its link in percent.
+Visits = list[tuple[Any, int, int]]
 Links = Literal["exact", "cautious", "hopeful"]
 
+# The lowest chances of the tiers of uncertain links, percent.
+_TIERS = (35, 80)
 # The cost of a lost packet. CP-SAT's objective has integer coefficients, and an expected loss may be a fraction.
 SCALE = 100
 
 
 class Serve(NamedTuple):
-    """A UAV collects from a sensor in a step: over a link of at least ``needed`` packets, and so moves ``packets``."""
+    """A UAV collects from a sensor in a step: over a link of at least ``needed`` packets, and so moves ``packets``.
+
+    The link holds with at least the chance ``likely``, and counts as one of the ``chance``, both in percent.
+    """
 
     uav: int
     sensor: int
     step: int
     packets: int
     needed: int
+    likely: int = 100
+    chance: int = 100
+
+
+class Level(NamedTuple):
+    """A tier of a sensor's links; as the fields of :class:`Serve`, with the sums of velocities ``within`` it."""
+
+    packets: int
+    needed: int
+    likely: int
+    chance: int
+    within: NDArray[np.bool_]
 
 
 class Formulation:
@@ -112,13 +133,19 @@ class Formulation:
         row: list[Any] = np.cumsum(fixed[:, 1]).tolist()
         start = row[-1] if row else 0
         farthest = start + (problem.horizon - len(row)) * fastest
-        links = packets_per_step(problem.distance(uav, np.arange(farthest + 1)), problem.scenario)
+        summed = np.arange(farthest + 1)
+        same = problem.links is None or len(problem.links[uav]) == 1
+        first = problem.packets(uav, summed, 0)
+        links = [first if same else problem.packets(uav, summed, step) for step in range(problem.horizon)]
         for step, (sensor, _) in enumerate(fixed.tolist()):
-            packets = min(int(links[row[step], sensor]), int(self._most[step, sensor]))
+            packets = min(int(links[step][row[step], sensor]), int(self._most[step, sensor]))
             if packets and not any((s.sensor, s.step) == (sensor, step) for s in self.serves):
-                self.serves[Serve(uav, sensor, step, packets, packets)] = model.new_constant(1)
+                likely = float(problem.chance(uav, np.array(row[step]), step)[sensor])
+                moved, percent = expected_packets(packets, likely), round(100 * likely)
+                serve = Serve(uav, sensor, step, moved, packets, percent, percent)
+                self.serves[serve] = model.new_constant(1)
         for step in range(len(row), problem.horizon):
-            reached = links[start : start + (step + 1 - len(fixed)) * fastest + 1]
+            reached = links[step][start : start + (step + 1 - len(fixed)) * fastest + 1]
             now = model.new_int_var(start, start + len(reached) - 1, f"c_{uav}_{step}")
             velocity = now - (row[-1] if row else 0)
             if problem.allowed is None:
@@ -130,28 +157,34 @@ class Formulation:
         self.flown.append(row)
 
     def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray, start: int) -> None:
-        """Add a Boolean for every sensor that the UAV can serve in this step and for every level of packets."""
+        """Add a Boolean for every sensor that the UAV can serve in this step and for every level of its links."""
         servable = packets.any(axis=0)
         if self.problem.usable is not None:
             servable &= self.problem.usable[step]
+        summed = start + np.arange(len(packets))
+        chances = None if self.problem.chances is None else self.problem.chance(uav, summed, step)
         for sensor in np.flatnonzero(servable).tolist():
-            for level, needed in self._levels(packets[:, sensor]):
-                literal = self.model.new_bool_var(f"x_{uav}_{sensor}_{step}_{needed}")
-                values = (start + np.flatnonzero(packets[:, sensor] >= needed)).tolist()
-                within = cp_model.Domain.from_values(values)
+            found = (
+                self._levels(packets[:, sensor]) if chances is None else _tiers(packets[:, sensor], chances[:, sensor])
+            )
+            for level in found:
+                serve = Serve(uav, sensor, step, level.packets, level.needed, level.likely, level.chance)
+                literal = self.model.new_bool_var(f"x_{uav}_{sensor}_{step}_{level.needed}_{level.likely}")
+                within = cp_model.Domain.from_values(summed[level.within].tolist())
                 self.model.add_linear_expression_in_domain(now, within).only_enforce_if(literal)
-                self.serves[Serve(uav, sensor, step, level, needed)] = literal
+                self.serves[serve] = literal
 
-    def _levels(self, packets: IntArray) -> list[tuple[int, int]]:
-        """By level, the packets that a transfer moves in the model, and those that its link must be able to move."""
+    def _levels(self, packets: IntArray) -> list[Level]:
+        """The levels of certain links: the packets that a transfer moves, and those that its link must be able to."""
         levels = np.unique(packets[packets > 0]).tolist()
         match self._links:
             case "exact":
-                return [(level, level) for level in levels]
+                pairs = [(level, level) for level in levels]
             case "cautious":
-                return [(levels[0], levels[0])]
+                pairs = [(levels[0], levels[0])]
             case "hopeful":
-                return [(levels[-1], levels[0])]
+                pairs = [(levels[-1], levels[0])]
+        return [Level(moved, needed, 100, 100, packets >= needed) for moved, needed in pairs]
 
     def _exclude(self) -> None:
         """Let a UAV serve at most one sensor in a step, and a sensor at most one UAV."""
@@ -164,11 +197,11 @@ class Formulation:
                 self.model.add_at_most_one(literals)
 
     def _visits(self) -> list[list[Visits]]:
-        """The Booleans that serve a sensor in a step and the packets that each moves, ``[j][t]``."""
+        """The visits of each sensor in each step, ``[j][t]``."""
         problem = self.problem
         visits: list[list[Visits]] = [[[] for _ in range(problem.horizon)] for _ in range(problem.sensors)]
         for serve, literal in self.serves.items():
-            visits[serve.sensor][serve.step].append((literal, serve.packets))
+            visits[serve.sensor][serve.step].append((literal, serve.packets, serve.chance))
         return visits
 
     def _store(self, sensor: int, affordable: int, visits: list[Visits]) -> None:
@@ -181,7 +214,7 @@ class Formulation:
             filled = int(self._most[step, sensor]) + arrived
             after = model.new_int_var(min(arrived, capacity), min(filled, capacity), "")
             over = model.new_int_var(max(0, arrived - capacity), int(self._overflow[step, sensor]), "")
-            drained = _total(packets * literal for literal, packets in visits[step])
+            drained = _total(packets * literal for literal, packets, _ in visits[step])
             model.add(after + over >= queue[-1] + arrived - drained)
             if arrived > capacity:
                 model.add(after + over >= arrived)
@@ -207,7 +240,7 @@ class Formulation:
                 if excess > room:
                     break
                 if excess > 0:
-                    within = _total(literal for step in visits[start:end] for literal, _ in step)
+                    within = _total(literal for step in visits[start:end] for literal, _, _ in step)
                     self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
 
     def _expect(self, sensor: int, lost: list[Any], visits: list[Visits]) -> None:
@@ -225,8 +258,12 @@ class Formulation:
                 self.model.add(cost >= packet * lost[step])
             for since, expected in enumerate(column[: step + 1].tolist()):
                 if expected > (column[since + 1] if since < step else 0):
-                    within = _total(literal for now in visits[since : step + 1] for literal, _ in now)
-                    self.model.add(cost + expected * within >= expected)
+                    made = [visit for now in visits[since : step + 1] for visit in now]
+                    if all(chance == 100 for _, _, chance in made):
+                        self.model.add(cost + expected * _total(literal for literal, _, _ in made) >= expected)
+                    else:
+                        within = _total(chance * literal for literal, _, chance in made)
+                        self.model.add(100 * cost + expected * within >= 100 * expected)
             self._costs.append(cost)
 
     def hint(self, actions: IntArray) -> None:
@@ -251,7 +288,8 @@ class Formulation:
         best: dict[tuple[int, int], Serve] = {}
         for serve in self.serves:
             made = (serve.step, serve.uav)
-            if actions[made][0] == serve.sensor and course.link[made] >= serve.needed:
+            likely = course.chance[made] * 100 >= serve.likely - 0.5
+            if actions[made][0] == serve.sensor and course.link[made] >= serve.needed and likely:
                 best[made] = max(serve, best.get(made, serve))
         return set(best.values())
 
@@ -280,6 +318,20 @@ class Formulation:
         # With fewer sensors than UAVs: a sensor that an earlier UAV serves, otherwise the farthest.
         earlier = chosen[:uav]
         return int(earlier[0]) if len(earlier) else int(np.argmax(distance))
+
+
+def _tiers(packets: IntArray, chances: FloatArray) -> list[Level]:
+    """The levels of uncertain links, shape ``(C,)`` each."""
+    levels: list[Level] = []
+    for lowest, beyond in zip(_TIERS, (*_TIERS[1:], 101), strict=True):
+        usable = (packets > 0) & (chances * 100 >= lowest)
+        tier = usable & (chances * 100 < beyond)
+        if tier.any():
+            likely = float(chances[tier].mean())
+            needed = int(packets[usable].min())
+            moved = max(1, expected_packets(int(packets[tier].min()), likely))
+            levels.append(Level(moved, needed, lowest, round(100 * likely), usable))
+    return levels
 
 
 def _total(terms: Iterable[Any]) -> Any:

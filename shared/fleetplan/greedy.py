@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, IntArray, packets_per_step
+from shared.channel import FloatArray, IntArray
 from shared.fleetplan.problem import FleetProblem
 from shared.fleetplan.risk import normal_below
 from shared.scenario import Scenario
@@ -44,9 +44,9 @@ def look_ahead(problem: FleetProblem) -> IntArray:
         for uav in range(problem.uavs):
             if uav in fixed_now:
                 sensor, velocity = fixed_now[uav].tolist()
-                packets = _links(problem, uav, flown[uav] + np.array([velocity]))[0]
+                packets = _expected(problem, uav, flown[uav] + np.array([velocity]), step)[0]
             else:
-                links = _links(problem, uav, flown[uav] + problem.levels)
+                links = _expected(problem, uav, flown[uav] + problem.levels, step)
                 sensor, level = _best(links, queue, urgent, free, problem.levels, late)
                 velocity, packets = int(problem.levels[level]), links[level]
                 free[sensor] = False
@@ -64,12 +64,14 @@ def _urgency(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArray
     return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * normal_below((arrived - room) / np.sqrt(arrived)))
 
 
-def _links(problem: FleetProblem, uav: int, velocity: IntArray) -> IntArray:
-    return packets_per_step(problem.distance(uav, velocity), problem.scenario)
+def _expected(problem: FleetProblem, uav: int, velocity: IntArray, step: int) -> IntArray | FloatArray:
+    """The packets that links are expected to move, ``(n, J)``."""
+    packets = problem.packets(uav, velocity, step)
+    return packets if problem.chances is None else packets * problem.chance(uav, velocity, step)
 
 
 def _best(
-    links: IntArray,
+    links: IntArray | FloatArray,
     queue: FloatArray,
     urgent: FloatArray,
     usable: NDArray[np.bool_],

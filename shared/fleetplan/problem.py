@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,11 @@ class FleetProblem:
         weights: shape ``(J,)``, the factor of each sensor's lost packets; ``None``: 1.
         late: shape ``(H + 1, H + 1, J)`` as ``risk``: the price in packets of not visiting a sensor for so long,
             beside its losses. Never less for an earlier s. ``None``: 0.
+        links: by UAV, shape ``(1, C, J)`` or, if they change by the step, ``(H, C, J)``: the whole packets that a step
+            can move over the link after steps whose velocities sum to c, 0 where the link fails, with C at least
+            ``H max_velocity + 1``. ``None``: by the formula.
+        chances: of the same shapes as ``links``: the probability that each link holds. A transfer then moves the share
+            ``chance`` of its packets, the expected ones, and cancels that share of the risk. ``None``: 1.
 
     Raises:
         ValueError: a shape or a value is wrong; the message names the field.
@@ -55,6 +61,8 @@ class FleetProblem:
     allowed: NDArray[np.bool_] | None = None
     weights: FloatArray | None = None
     late: FloatArray | None = None
+    links: Sequence[IntArray] | None = None
+    chances: Sequence[FloatArray] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.places)
@@ -86,6 +94,21 @@ class FleetProblem:
             raise ValueError(f"queue has {self.queue.max()} packets, the capacity is {self.scenario.queue_capacity}")
         if self.allowed is not None and not self.allowed.any():
             raise ValueError("allowed has no velocity")
+        sums = self.horizon * self.scenario.max_velocity + 1
+        for uav, table in enumerate(self.links or ()):
+            if (
+                table.ndim != 3
+                or len(table) not in (1, self.horizon)
+                or table.shape[1] < sums
+                or table.shape[2] != count
+            ):
+                raise ValueError(
+                    f"links[{uav}] has shape {table.shape}, must be (1 or {self.horizon}, {sums}, {count})"
+                )
+        if self.links is not None and len(self.links) != self.uavs:
+            raise ValueError(f"links has tables of {len(self.links)} UAVs, there are {self.uavs}")
+        if self.chances is not None and [c.shape for c in self.chances] != [table.shape for table in self.links or ()]:
+            raise ValueError(f"chances has shapes {[c.shape for c in self.chances]}, must have those of links")
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
                 shape = actions.shape
@@ -126,6 +149,32 @@ class FleetProblem:
         offset = self.trajectories[uav].at(progress)[..., None, :] - self.places
         return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
 
+    def packets(self, uav: int, velocity: IntArray, step: int) -> IntArray:
+        """Packets that a step can move to the UAV, ``(..., J)``, after steps whose velocities sum to ``(...)``."""
+        if self.links is None:
+            return packets_per_step(self.distance(uav, velocity), self.scenario)
+        table = self.links[uav]
+        return np.asarray(table[step if len(table) > 1 else 0, np.asarray(velocity)])
+
+    def chance(self, uav: int, velocity: IntArray, step: int) -> FloatArray:
+        """The probability that each link holds, shaped as :meth:`packets`."""
+        if self.chances is None:
+            return np.ones((*np.shape(velocity), self.sensors))
+        table = self.chances[uav]
+        return np.asarray(table[step if len(table) > 1 else 0, np.asarray(velocity)])
+
+    def links_until(self, step: int) -> list[IntArray] | None:
+        """The links of the steps before this one."""
+        return None if self.links is None else [table[:step] for table in self.links]
+
+    def links_after(self, actions: IntArray) -> list[IntArray] | None:
+        """The links after these actions ``(n, I, 2)``."""
+        if self.links is None:
+            return None
+        flown = actions[:, :, 1].sum(axis=0).tolist()
+        gone = [min(len(actions), len(table) - 1) for table in self.links]
+        return [table[step:, summed:] for table, step, summed in zip(self.links, gone, flown, strict=True)]
+
 
 @dataclass(frozen=True, eq=False)
 class Course:
@@ -134,12 +183,14 @@ class Course:
     Attributes:
         queue: shape ``(H + 1, J)``, packets before each step and after the last.
         lost: shape ``(H, J)``, packets.
-        link: shape ``(H, I)``, packets that the link could move; 0 for a failed transmission.
+        link: shape ``(H, I)``, packets that the link could move if it holds; 0 for a failed transmission.
+        chance: shape ``(H, I)``, the probability that it holds.
     """
 
     queue: IntArray
     lost: IntArray
     link: IntArray
+    chance: FloatArray
 
 
 def fly(problem: FleetProblem, actions: IntArray) -> Course:
@@ -151,53 +202,79 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
     capacity = problem.scenario.queue_capacity
     queue, lost = [problem.queue], []
     battery = problem.battery.copy()
-    link = np.zeros(actions.shape[:2], dtype=np.int64)
+    link, chance = np.zeros(actions.shape[:2], dtype=np.int64), np.zeros(actions.shape[:2])
     for step, transfers in enumerate(_transfers(problem, actions)):
         left, served = queue[-1].copy(), set[int]()
-        for uav, (sensor, budget, joules) in enumerate(transfers):
+        for uav, (sensor, budget, joules, likely) in enumerate(transfers):
             affordable = int(battery[sensor] / joules + 1e-9)
             if budget is None or sensor in served or affordable < 1:
                 continue
             served.add(sensor)
-            link[step, uav] = budget
-            moved = min(int(left[sensor]), budget, affordable)
+            link[step, uav], chance[step, uav] = budget, likely
+            moved = min(int(left[sensor]), expected_packets(budget, likely), affordable)
             left[sensor] -= moved
             battery[sensor] = max(0.0, float(battery[sensor]) - moved * joules)
         filled = left + problem.arrivals[step]
         queue.append(np.minimum(filled, capacity))
         lost.append(filled - queue[-1])
-    return Course(np.array(queue), np.array(lost), link)
+    return Course(np.array(queue), np.array(lost), link, chance)
+
+
+def expected_packets(packets: int, chance: float) -> int:
+    """The expected packets of a transfer, rounded down."""
+    return packets if chance >= 1.0 else int(packets * chance + 1e-9)
 
 
 def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
-    """The lost packets of actions, and the objective of a plan: weighted losses and expected losses above them."""
+    """The lost packets of actions, and the objective of a plan: weighted losses and expected losses above them.
+
+    The expected loss in a step is the largest ``risk[s, e] (1 - P)`` of all s, with P the sum of the chances of the
+    sensor's visits from step s on. With certain links that is the risk since the last visit.
+    """
     course = fly(problem, actions)
     lost = int(course.lost.sum())
     paid = course.lost if problem.weights is None else course.lost * problem.weights
     neglect = problem.neglect
     if neglect is None:
         return lost, float(paid.sum())
-    since = np.zeros(problem.sensors, dtype=np.int64)
-    cost, every = 0.0, np.arange(problem.sensors)
-    for step in range(problem.horizon):
-        since[actions[step, course.link[step] > 0, 0]] = step + 1
-        # The risk of a sensor visited in this step begins with the next step.
-        expected = np.where(since <= step, neglect[np.minimum(since, step), step, every], 0.0)
-        cost += float(np.maximum(expected, paid[step]).sum())
-    return lost, cost + float(neglect[since, problem.horizon, every].sum())
+    visits = np.zeros((problem.horizon + 1, problem.sensors))
+    steps = np.repeat(np.arange(problem.horizon), problem.uavs)
+    np.add.at(visits, (steps, actions[:, :, 0].ravel()), course.chance.ravel())
+    cost = 0.0
+    for step in range(problem.horizon + 1):
+        # visited[s]: the chances of the visits in the steps s..e.
+        visited = np.cumsum(visits[step::-1], axis=0)[::-1]
+        expected = (neglect[: step + 1, step] * np.maximum(1.0 - visited, 0.0)).max(axis=0)
+        cost += float((expected if step == problem.horizon else np.maximum(expected, paid[step])).sum())
+    return lost, cost
 
 
-def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float]]]:
-    """By step: each UAV's sensor, the packets of its link (``None``: it does not hold), and joules a packet."""
+def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float, float]]]:
+    """By step and UAV: sensor, packets of the link (``None``: it does not hold), joules a packet, the link's chance."""
     world = problem.scenario
     flown, sensor = np.cumsum(actions[:, :, 1], axis=0), actions[:, :, 0]
-    columns = []
-    for uav in range(problem.uavs):
-        distance = problem.distance(uav, flown[:, uav])
-        columns.append(np.take_along_axis(distance, sensor[:, uav, None], axis=1)[:, 0])
-    reach = np.stack(columns, axis=1)
-    holds, budget = link_holds(reach, world), packets_per_step(reach, world)
-    joules = world.transmit_power_w * (world.packet_bits / np.maximum(rate_bps(reach, world), 1e-12))
+    chance = np.ones(sensor.shape)
+    if problem.links is None:
+        columns = []
+        for uav in range(problem.uavs):
+            distance = problem.distance(uav, flown[:, uav])
+            columns.append(np.take_along_axis(distance, sensor[:, uav, None], axis=1)[:, 0])
+        reach = np.stack(columns, axis=1)
+        holds, budget = link_holds(reach, world), packets_per_step(reach, world)
+        joules = world.transmit_power_w * (world.packet_bits / np.maximum(rate_bps(reach, world), 1e-12))
+    else:
+        budget = _chosen(problem.links, flown, sensor)
+        holds = budget > 0
+        joules = world.transmit_power_w * world.step_s / np.maximum(budget, 1)
+        if problem.chances is not None:
+            chance = _chosen(problem.chances, flown, sensor)
     for step in range(len(actions)):
-        rows = zip(*(a[step].tolist() for a in (sensor, holds, budget, joules)), strict=True)
-        yield [(j, packets if held else None, joule) for j, held, packets, joule in rows]
+        rows = zip(*(a[step].tolist() for a in (sensor, holds, budget, joules, chance)), strict=True)
+        yield [(j, packets if held else None, joule, likely) for j, held, packets, joule, likely in rows]
+
+
+def _chosen(tables: Sequence[NDArray[Any]], flown: IntArray, sensor: IntArray) -> NDArray[Any]:
+    """The tables' entries for sums of velocities and sensors ``(H, I)``."""
+    steps = np.arange(len(flown))
+    whole = [table if len(table) > 1 else np.broadcast_to(table, (len(flown), *table.shape[1:])) for table in tables]
+    return np.stack([table[steps, flown[:, uav], sensor[:, uav]] for uav, table in enumerate(whole)], axis=1)

@@ -141,6 +141,7 @@ class RecedingHorizon:
             places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
+            **self._links(present, kept, horizon),
             **self._outlook(kept, horizon),
             **self._guided(kept, horizon),
         )
@@ -178,6 +179,19 @@ class RecedingHorizon:
             room = np.where(np.isfinite(self.guidance.every(world.sensors)), -1.0, room)
         order = np.argsort(np.where(near, room, np.inf), kind="stable")
         return np.sort(order[: min(int(near.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
+
+    def _links(self, present: list[int], kept: IntArray, horizon: int) -> dict[str, Any]:
+        """The links of the fleet's UAVs, where the formula does not describe them."""
+        belief, world = self._belief, self._scenario
+        if belief.channel.by_formula:
+            return {}
+        metres = np.arange(horizon * world.max_velocity + 1) * world.step_s
+        expected = [belief.links(uav, metres) for uav in present]
+        nowhere = ((0, 0), (0, 1))
+        return {
+            "links": [np.pad(links.packets[:, kept], nowhere)[None] for links in expected],
+            "chances": [np.pad(links.hold[:, kept], nowhere)[None] for links in expected],
+        }
 
     def _usable(self, kept: IntArray, horizon: int, taken: Collection[int]) -> NDArray[np.bool_]:
         """Every sensor and step, except the sensors that other UAVs have reserved in this step."""

@@ -12,7 +12,7 @@ from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outco
 from simulator.client import EdgeClient, Exchange
 from simulator.client.observation_report import decide_request
 from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
-from simulator.policies.policy import Policy
+from simulator.policies.policy import Learner, Policy
 from simulator.policies.registry import policy_named
 from simulator.records.decision import DecidedBy
 from simulator.world import Observation
@@ -51,14 +51,18 @@ class LocalPilot:
         self._reason = f"policy_{name}"
         self._policy: Policy = policy_named(name)
         self._policy.reset(scenario, seed)
+        self._steps: dict[int, int] = {}
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
         """The policy's choice."""
+        self._steps[uav] = int(observation["step"][0])
         sensor, velocity = self._policy.decide(uav, observation, taken)
         return Choice(int(sensor), int(velocity), "onboard", self._reason)
 
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
-        """Do nothing: a local policy does not learn."""
+        """Tell the policy, if it learns."""
+        if isinstance(self._policy, Learner):
+            self._policy.learn(uav, self._steps[uav], failed)
 
     def land(self) -> None:
         """Do nothing: no outcome is pending."""

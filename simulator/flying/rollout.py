@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from simulator.policies.policy import Policy
+from simulator.policies.policy import Learner, Policy
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world import PipelineWorld, StepTally
@@ -37,10 +37,14 @@ def rollout(
     while world.agents:
         actions: dict[str, tuple[int, int]] = {}
         taken: frozenset[int] = frozenset()
-        for agent, uav in world.live.items():
+        step, live = len(world.tally), dict(world.live)
+        for agent, uav in live.items():
             actions[agent] = policy.decide(uav, observations[agent], taken)
             taken |= {actions[agent][0]}
-        observations, *_ = world.step(actions)
+        observations, _, _, _, infos = world.step(actions)
+        if isinstance(policy, Learner):
+            for agent, uav in live.items():
+                policy.learn(uav, step, infos[agent]["failed"])
         if on_step is not None:
             on_step(world.tally[-1])
     return list(world.tally)

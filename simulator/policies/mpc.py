@@ -28,18 +28,25 @@ class RecedingHorizon:
         step = int(observation["step"][0])
         self._planner.begin(step)
         self.belief.locate(uav, step, observation["position"].tolist(), float(observation["progress"][0]))
+        ids = np.arange(len(observation["queue"]))
         self.belief.hear(
-            ids=np.arange(len(observation["queue"])),
+            ids=ids,
             places=observation["sensor_position"],
             beacon=observation["last_heard"],
             queue=observation["queue"],
             battery=observation["battery"],
         )
+        fresh = observation["last_heard"] == step
+        self.belief.measure(uav, ids[fresh], observation["channel_gain"][fresh])
         sensor, velocity = self._planned(uav, taken)
         if sensor < 0 or sensor in taken:
             sensor = longest_silent(observation, taken)
         self.belief.tell(uav, step, sensor, velocity)
         return sensor, velocity
+
+    def learn(self, uav: int, step: int, failed: bool) -> None:
+        """Take the outcome of a UAV's decision of a step."""
+        self.belief.settle(uav, step, failed)
 
     def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
         """The plan's action; off the trajectory, where no plan exists, no sensor (-1) at full speed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from shared.scenario import Scenario
 from simulator.world import Observation
@@ -23,4 +23,13 @@ class Policy(Protocol):
             observation: of that UAV.
             taken: sensors chosen by earlier UAVs of this step.
         """
+        ...
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """A policy that learns from the outcomes of its decisions."""
+
+    def learn(self, uav: int, step: int, failed: bool) -> None:
+        """Take the outcome of a UAV's decision of a step: whether the transmission failed."""
         ...

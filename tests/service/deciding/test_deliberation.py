@@ -26,6 +26,8 @@ from service.prompting.candidates import CandidateSet, velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
+from shared.channel import channel_gain_db
+from shared.learned_channel import ExpectedLinks
 from shared.reach import Reach
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
@@ -151,11 +153,11 @@ def test_a_low_temperature_is_undone() -> None:
 
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
     distance = np.full((15, 1), 50.0)
-    reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
+    reach = Reach.of(ExpectedLinks.by_formula(distance, PAPER), np.array([30.0]), np.array([0.5]))
     assert velocity_options(reach, 0, 4) == [0, 5, 9, 14]
     assert velocity_options(reach, 0, 1) == [14]
     distance[:3] = distance[12:] = 1e9
-    reach = Reach.of(distance, np.array([30.0]), np.array([0.5]), PAPER)
+    reach = Reach.of(ExpectedLinks.by_formula(distance, PAPER), np.array([30.0]), np.array([0.5]))
     assert velocity_options(reach, 0, 4) == [3, 6, 8, 11]
 
 
@@ -179,6 +181,8 @@ def test_a_plan_is_judged_by_its_own_continuation_and_never_below_look_ahead() -
     places = np.array([trajectories(PAPER)[0].at(metres) for metres in (0.0, 1300.0, 1500.0)])
     state = uav(position=(places[0, 0], places[0, 1]), x=places[:, 0].tolist(), queue=[40.0, 58.0, 58.0])
     state.sensors.y[:] = places[:, 1].tolist()
+    assert state.sensors.channel_gain is not None
+    state.sensors.channel_gain[:] = channel_gain_db(np.hypot(*(places - places[0]).T), PAPER).tolist()
     mission.observe(state, 0)
 
     def lost(course: list[Action] | None) -> float:

@@ -10,7 +10,7 @@ from service.deciding.attended_state import AttendedState
 from service.prompting.row_formats import columns
 from shared.channel import link_holds, packets_per_step
 from shared.features import FEATURES
-from shared.reach import LEVEL_FEATURES, distances_ahead
+from shared.reach import LEVEL_FEATURES, distances_between, places_ahead
 from shared.scenario import SCENARIOS, Point
 from shared.trajectory import trajectories
 from shared.wire import Features, MissionSpec, PromptStyle, UavState
@@ -51,7 +51,9 @@ def test_distances_are_those_of_the_world_after_the_step(told: bool) -> None:
 def test_a_route_there_and_back_is_followed_the_way_that_the_uav_says() -> None:
     routed = PAPER.model_copy(update={"uavs": 1, "routes": (((0.0, 0.0), (1000.0, 0.0)),)})
     places = np.array([[1000.0, 0.0]])
-    out, back = (distances_ahead(0, (500.0, 0.0), told, places, routed)[14, 0] for told in (500.0, 1500.0))
+    out, back = (
+        distances_between(places_ahead(0, (500.0, 0.0), told, routed), places)[14, 0] for told in (500.0, 1500.0)
+    )
     assert (out, back) == (pytest.approx(360.0), pytest.approx(640.0))
 
 

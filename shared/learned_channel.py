@@ -1,0 +1,167 @@
+"""The channel as a fleet has learned it: the formula, the radio map, failing radios, and the rate that is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import FloatArray, IntArray, Links, link_holds, packets_per_step, path_loss_db
+from shared.radio_failures import RadioFailures
+from shared.radio_map import RadioMap
+from shared.scenario import Scenario
+
+# A link that holds with at least this probability counts as one.
+LIKELY = 0.5
+# How fast the rate share follows a visit that says something about it.
+_SHARE_STEP = 0.5
+_LEAST_SHARE = 0.05
+
+
+def normal_below(z: FloatArray) -> FloatArray:
+    """``Phi(z)`` within 0.01, by the logistic function: the standard library has no vectorised erf."""
+    return np.asarray(1.0 / (1.0 + np.exp(np.clip(-1.702 * z, -50.0, 50.0))))
+
+
+@dataclass(frozen=True)
+class ExpectedLinks:
+    """Transfers that are expected from a UAV's places to sensors; arrays ``(P, J)``.
+
+    Attributes:
+        distance: horizontal, metres.
+        packets: that a step can move if the link holds; 0 where it is most unlikely to.
+        margin: how many standard deviations the path loss lies below the threshold; None: the loss is certain.
+        alive: shape ``(J,)``, the probability that each sensor's radio works; None: 1.
+    """
+
+    distance: FloatArray
+    packets: IntArray
+    scenario: Scenario
+    margin: FloatArray | None = None
+    alive: FloatArray | None = None
+
+    @classmethod
+    def by_formula(cls, distance: FloatArray, scenario: Scenario) -> Self:
+        """The links of the mean path loss."""
+        return cls(distance, packets_per_step(distance, scenario), scenario)
+
+    @cached_property
+    def hold(self) -> FloatArray:
+        """The probability that each link holds, 0..1."""
+        return self.holding(slice(None))
+
+    def holding(self, rows: slice | Sequence[int]) -> FloatArray:
+        """The probability that the links of some places hold, ``(n, J)``."""
+        if self.margin is None:
+            likely = link_holds(self.distance[rows], self.scenario).astype(np.float64)
+        else:
+            likely = normal_below(self.margin[rows])
+        return likely if self.alive is None else likely * self.alive
+
+    @property
+    def likely(self) -> IntArray:
+        """``packets`` where the link is likely to hold, else 0."""
+        if self.margin is None and self.alive is None:
+            return self.packets
+        return np.asarray(np.where(self.hold >= LIKELY, self.packets, 0))
+
+    def movable(self, queue: FloatArray) -> FloatArray:
+        """The packets that are expected to move from queues ``(J,)``: ``P(hold) min(q, packets)``."""
+        moved = np.minimum(queue, self.packets).astype(np.float64)
+        return moved if self.margin is None and self.alive is None else moved * self.hold
+
+
+class LearnedChannel:
+    """One fleet's knowledge of its links.
+
+    Attributes:
+        radio_map: the excess loss over the formula.
+        failures: the radios that fail although their links hold.
+        share: the rate that transfers get, as a share of the formula's, 0.05..1.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self.radio_map = RadioMap(scenario.sensors)
+        self.failures = RadioFailures(scenario.sensors)
+        self.share = 1.0
+
+    @property
+    def by_formula(self) -> bool:
+        """Whether all that was seen agrees with the formula."""
+        return self.radio_map.exact and self.failures.none and self.share == 1.0
+
+    def advance(self, step: int) -> None:
+        """Go to a later step."""
+        self.failures.advance(step)
+
+    def measure(self, ids: IntArray, place: FloatArray, distance: FloatArray, gain_db: FloatArray) -> None:
+        """Take the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``."""
+        self.radio_map.measure(ids, place, -gain_db - path_loss_db(distance, self._scenario))
+
+    def links(self, places: FloatArray, distance: FloatArray, ids: IntArray | None = None) -> ExpectedLinks:
+        """The links from a UAV's places ``(P, 2)`` to sensors at distances ``(P, n)``, all or those named."""
+        world = self._scenario
+        if self.by_formula:
+            return ExpectedLinks.by_formula(distance, world)
+        near = (distance <= world.radio_radius_m).any(axis=0)
+        which = np.flatnonzero(near) if ids is None else np.asarray(ids)[near]
+        packets, margin = np.zeros(distance.shape, dtype=np.int64), np.full(distance.shape, -np.inf)
+        mean, deviation = self.radio_map.predict(places, which)
+        links = Links.at(distance[:, near], world)
+        loss = links.loss_db + mean
+        with np.errstate(divide="ignore", invalid="ignore"):
+            spare = (world.path_loss_limit_db - loss) / deviation
+        spare = np.where(np.isnan(spare), -np.inf, spare)
+        margin[:, near] = np.where(links.distance_m <= world.radio_radius_m, spare, -np.inf)
+        # If a link holds that is expected to fail, its loss is just below the threshold.
+        held = Links(links.distance_m, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
+        moved = np.floor(held.packets * self.share + 1e-9).astype(np.int64)
+        packets[:, near] = np.where(margin[:, near] > -3.0, moved, 0)
+        alive = None if self.failures.none else self.failures.alive(slice(None) if ids is None else ids)
+        return ExpectedLinks(distance, packets, world, margin, alive)
+
+    def gain_db(self, place: FloatArray, distance: FloatArray, ids: IntArray) -> FloatArray:
+        """The expected gains ``(n,)``, dB, at a UAV's place ``(2,)``."""
+        loss = path_loss_db(distance, self._scenario)
+        if self.radio_map.exact:
+            return -loss
+        return np.asarray(-(loss + self.radio_map.predict(place[None], ids)[0][0]))
+
+    def moved(self, packets: float, before: float, link: int, slack: float) -> None:
+        """Learn the rate share from a visit.
+
+        Args:
+            packets: that left the queue, estimated.
+            before: in the queue.
+            link: packets that the whole rate moves in a step.
+            slack: the estimate's error, packets.
+        """
+        if link <= 0 or abs(packets - min(before, self.share * link)) <= slack:
+            return
+        seen = packets / link
+        if packets >= before - slack:
+            # The queue was emptied: the share is at least this.
+            seen = max(seen, self.share)
+        self.share += _SHARE_STEP * (float(np.clip(seen, _LEAST_SHARE, 1.0)) - self.share)
+        if self.share > 0.97:
+            self.share = 1.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """The whole knowledge, as copies."""
+        return {"map": self.radio_map.state_dict(), "failures": self.failures.state_dict(), "share": self.share}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore it."""
+        self.radio_map.load_state_dict(state["map"])
+        self.failures.load_state_dict(state["failures"])
+        self.share = state["share"]
+
+
+def likely_to_hold(hold: FloatArray) -> NDArray[np.bool_]:
+    """Whether links with these probabilities count as links."""
+    return np.asarray(hold >= LIKELY)

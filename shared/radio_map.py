@@ -1,0 +1,230 @@
+"""The radio map: the excess of each sensor's path loss over the formula, learned from the gains of its beacons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shared.channel import FloatArray, IntArray
+
+# Measurements that a map keeps, of all sensors together and of one.
+_MOST_KEPT, _MOST_OF_ONE = 4096, 24
+# The prior of the excess loss's standard deviation, dB, and its weight in measurements. A low weight: the first report
+# of a world that equals the formula shows that it does.
+_PRIOR_DB, _PRIOR_WEIGHT = 6.0, 0.03
+# The weight of the prior of the offset that all links share, an offset of 0 dB, in independent sensors.
+_OFFSET_WEIGHT = 2.0
+# No radio differs more from the formula, dB: a report that says so is wrong, or is a lie.
+LARGEST_EXCESS_DB = 40.0
+# A measurement this many standard deviations off its prediction counts less, as in Huber's estimator.
+_HUBER = 3.0
+_HUBER_LEAST_DB = 1.0
+# Measurements that agree with the formula this closely are no sign of an excess loss, dB.
+_EXACT_DB = 0.05
+# The map compares its kinds of shadowing again when this factor more measurements came.
+_COMPARE_GROWTH = 1.3
+_COMPARE_FIRST = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Shadowing:
+    """A kind of shadowing, as shares of the excess loss's variance that sum to 1.
+
+    ``sensor``: the same at every place. ``place``: by the UAV's place, with the correlation
+    ``exp(-distance / range_m)`` (Gudmundson 1991). The rest, ``fading``, differs from step to step.
+    """
+
+    sensor: float
+    place: float
+    range_m: float
+
+    @property
+    def fading(self) -> float:
+        """The share of the variance that no earlier measurement tells anything about."""
+        return 1.0 - self.sensor - self.place
+
+    def covariance(self, apart_m: FloatArray) -> FloatArray:
+        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
+        return self.sensor + self.place * np.exp(-apart_m / self.range_m)
+
+
+# The likelihood of the measurements chooses between them. The first is the assumption before.
+KINDS = (
+    Shadowing(sensor=0.5, place=0.4, range_m=60.0),
+    Shadowing(sensor=0.996, place=0.002, range_m=60.0),
+    Shadowing(sensor=0.9, place=0.08, range_m=60.0),
+    Shadowing(sensor=0.2, place=0.75, range_m=60.0),
+    Shadowing(sensor=0.2, place=0.75, range_m=200.0),
+    Shadowing(sensor=0.4, place=0.2, range_m=60.0),
+    Shadowing(sensor=0.05, place=0.05, range_m=60.0),
+)
+
+
+class RadioMap:
+    """Simple kriging of the excess loss, by sensor and by the UAV's place.
+
+    The excess loss of a sensor is a Gaussian process over the UAV's places: an offset that all links share, plus the
+    components of a :class:`Shadowing`. The offset, the variance and the kind of shadowing are estimated from the
+    measurements of all sensors (empirical Bayes). A measurement far off its prediction is given a larger variance.
+
+    Prediction at the place x, with the n measurements r of the sensor, their covariance K and their covariances k(x)
+    with the place: mean ``mu + k K^-1 (r - mu)``, variance ``sigma^2 (1 - k K^-1 k)``.
+
+    Args:
+        sensors: J. A map of many sensors keeps fewer measurements of each.
+
+    Attributes:
+        places: shape ``(J, N, 2)``, metres, of the UAVs at the measurements.
+        excess: shape ``(J, N)``, dB, measured.
+        noise: shape ``(J, N)``, the factor of the fading's variance of each measurement, at least 1.
+        count: shape ``(J,)``, measurements kept.
+        heard: measurements so far, of all sensors.
+    """
+
+    def __init__(self, sensors: int) -> None:
+        kept = int(np.clip(_MOST_KEPT // sensors, 1, _MOST_OF_ONE))
+        self.places: FloatArray = np.zeros((sensors, kept, 2))
+        self.excess: FloatArray = np.zeros((sensors, kept))
+        self.noise: FloatArray = np.ones((sensors, kept))
+        self.count: IntArray = np.zeros(sensors, dtype=np.int64)
+        self.heard = 0
+        self.kind = KINDS[0]
+        self._compared = _COMPARE_FIRST
+        self._exact = True
+        # By sensor, K^-1, K^-1 r and K^-1 1. None until a gain differs from the formula.
+        self._inverse: FloatArray | None = None
+        self._measured: FloatArray = np.zeros((sensors, kept))
+        self._ones: FloatArray = np.zeros((sensors, kept))
+
+    @property
+    def exact(self) -> bool:
+        """Whether every measurement so far agrees with the formula."""
+        return self._exact
+
+    @property
+    def offset_db(self) -> float:
+        """``mu``, dB: the excess that all links share (generalised least squares, shrunk towards 0)."""
+        return float(self._measured.sum() / (self._ones.sum() + _OFFSET_WEIGHT))
+
+    @property
+    def deviation_db(self) -> float:
+        """``sigma``, dB: the standard deviation of the excess loss of a link that was never measured."""
+        if self._exact:
+            return 0.0 if self.heard else _PRIOR_DB
+        offset = self.offset_db
+        squares = (self.excess - offset) * (self._measured - offset * self._ones)
+        weight = _PRIOR_WEIGHT + int(self.count.sum())
+        return float(np.sqrt((_PRIOR_WEIGHT * _PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
+
+    def measure(self, ids: IntArray, place: ArrayLike, excess_db: FloatArray) -> None:
+        """Take one UAV's measurements of n sensors at its place.
+
+        Args:
+            ids: shape ``(n,)``, each sensor once.
+            place: shape ``(2,)``, metres.
+            excess_db: shape ``(n,)``, measured path loss less the formula's, dB.
+        """
+        if not len(ids):
+            return
+        excess = np.clip(excess_db, -LARGEST_EXCESS_DB, LARGEST_EXCESS_DB)
+        self.heard += len(ids)
+        here = np.asarray(place, dtype=np.float64)
+        noise = np.ones(len(ids))
+        if self._exact and np.abs(excess).max() > _EXACT_DB:
+            self._exact = False
+            self._factor(np.arange(len(self.count)))
+        if not self._exact:
+            mean, deviation = self.predict(here[None], ids)
+            off = np.abs(excess - mean[0]) / np.maximum(deviation[0], _HUBER_LEAST_DB)
+            noise = np.square(np.maximum(off / _HUBER, 1.0))
+        # A full record drops the measurement nearest to the new one, which tells the most of what that one told.
+        full = self.count[ids] == self.excess.shape[1]
+        apart = np.square(self.places[ids] - here).sum(axis=2)
+        slot = np.where(full, apart.argmin(axis=1), np.minimum(self.count[ids], self.excess.shape[1] - 1))
+        self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
+        self.count[ids] += ~full
+        if self._exact:
+            return
+        if self.heard >= self._compared:
+            self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
+            self._compare()
+        else:
+            self._factor(ids)
+
+    def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
+        shape = (len(places), len(which))
+        if self._inverse is None:
+            return np.zeros(shape), np.full(shape, self.deviation_db)
+        kept = int(self.count[which].max(initial=0))
+        offset, deviation = self.offset_db, self.deviation_db
+        if not kept:
+            return np.full(shape, offset), np.full(shape, deviation)
+        east, north = (places[None, :, None, axis] - self.places[which, None, :kept, axis] for axis in (0, 1))
+        # (n, P, kept)
+        covariance = self.kind.covariance(np.sqrt(east * east + north * north))
+        covariance *= (np.arange(kept) < self.count[which, None])[:, None]
+        left = self._measured[which, :kept] - offset * self._ones[which, :kept]
+        mean = offset + np.matmul(covariance, left[..., None])[..., 0]
+        known = (covariance @ self._inverse[which, :kept, :kept] * covariance).sum(axis=2)
+        # The fading is part of a link's variance, since it differs in the next step.
+        share = np.maximum(1.0 - known, self.kind.fading)
+        return mean.T, deviation * np.sqrt(share).T
+
+    def _factor(self, ids: IntArray) -> None:
+        """Invert the covariances of these sensors' measurements."""
+        if self._inverse is None:
+            self._inverse = np.zeros((*self.excess.shape, self.excess.shape[1]))
+        kept = int(self.count[ids].max(initial=0))
+        used = (np.arange(kept) < self.count[ids, None]).astype(np.float64)
+        inverse = np.linalg.inv(self._covariances(ids, kept))
+        self._inverse[ids, :kept, :kept] = inverse
+        both = np.stack((self.excess[ids, :kept] * used, used), axis=2)
+        solved = inverse @ both
+        self._measured[ids, :kept], self._ones[ids, :kept] = solved[..., 0], solved[..., 1]
+
+    def _covariances(self, ids: IntArray, kept: int) -> FloatArray:
+        """``K``, ``(n, kept, kept)``; the rows without a measurement are the identity's."""
+        used = np.arange(kept) < self.count[ids, None]
+        at = self.places[ids, :kept]
+        east, north = (at[:, :, None, axis] - at[:, None, :, axis] for axis in (0, 1))
+        matrix = self.kind.covariance(np.sqrt(east * east + north * north)) * (used[:, :, None] & used[:, None, :])
+        diagonal = 1.0 + self.kind.fading * (self.noise[ids, :kept] - 1.0)
+        matrix[:, np.arange(kept), np.arange(kept)] = np.where(used, diagonal, 1.0)
+        return np.asarray(matrix)
+
+    def _compare(self) -> None:
+        """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
+        every = np.flatnonzero(self.count)
+        kept = int(self.count.max())
+        likelihoods = []
+        for kind in KINDS:
+            self.kind = kind
+            self._factor(every)
+            spread = float(np.linalg.slogdet(self._covariances(every, kept))[1].sum())
+            likelihoods.append(-float(self.count.sum()) * np.log(self.deviation_db) - 0.5 * spread)
+        self.kind = KINDS[int(np.argmax(likelihoods))]
+        self._factor(every)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The measurements, as copies; the rest follows from them."""
+        arrays = {name: getattr(self, name).copy() for name in ("places", "excess", "noise", "count")}
+        return {
+            **arrays,
+            "heard": self.heard,
+            "kind": KINDS.index(self.kind),
+            "compared": self._compared,
+            "exact": self._exact,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a map, to the bit."""
+        for name in ("places", "excess", "noise", "count"):
+            setattr(self, name, state[name])
+        self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
+        self._exact = state["exact"]
+        if not self._exact:
+            self._factor(np.arange(len(self.count)))
