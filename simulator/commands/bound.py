@@ -29,7 +29,9 @@ class BoundOptions:
     that better decisions could save.
 
     Printed: the proven bound, the losses of the best plan found, the gap between them, and EOF's losses in the same
-    world. The plan is flown in the simulated world, which must lose exactly the packets of the plan.
+    world. The plan is flown in the simulated world, which must lose exactly the packets of the plan. In a scenario that
+    differs from the edge's model the bound knows the true links, wind and faults; in wind the flight is planned from
+    step to step, and the gap stays.
 
       aicvds bound --seed 0
 
@@ -44,7 +46,7 @@ class BoundOptions:
     seed: Annotated[int, arg(metavar="N")]
     """Seed of the world, 0 to 4294967295."""
     scenario: Annotated[str | None, arg(metavar="NAME")] = None
-    """A ready-made world: paper (the default), pipeline, stress, dense or lossy_uplink."""
+    """A ready-made world: paper (the default), stress, shadowed and others; `aicvds simulate --help` lists them."""
     world: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """A world of your own, instead of --scenario; `aicvds simulate --help` describes the folder."""
     steps: Annotated[int | None, arg(metavar="N")] = None

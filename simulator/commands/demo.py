@@ -36,7 +36,7 @@ class Demo:
     seed: int = 0
     """Seed of the world, 0 to 4294967295; the same seed gives the same world."""
     scenario: str | None = None
-    """A ready-made world: paper (the default), pipeline, stress, dense or lossy_uplink; `aicvds simulate --help`
+    """A ready-made world: paper (the default), stress, shadowed and others; `aicvds simulate --help`
     describes them."""
     world: Path | None = None
     """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` describes its files."""

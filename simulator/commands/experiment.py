@@ -66,7 +66,7 @@ class Options:
     model: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="FILE.gguf")] = ()
     """For llm-models: another model to embed; repeatable."""
     scenario: Annotated[str | None, arg(metavar="NAME")] = None
-    """The world: paper (default), pipeline, stress, dense or lossy_uplink; see `aicvds simulate --help`."""
+    """The world: paper (default), stress, shadowed and others; `aicvds simulate --help` lists them."""
     world: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
     workers: Annotated[int, arg(metavar="N")] = 1

@@ -54,10 +54,13 @@ class Simulate:
     """The edge's address, such as http://127.0.0.1:8000. Required, unless --policy is a local one."""
     scenario: Annotated[str | None, arg(metavar="NAME")] = None
     """A ready-made world: paper (10 sensors, 3 UAVs, 30 steps; the default), pipeline (sensors in a line), stress
-    (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost)."""
+    (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost). In the other six the world
+    differs from the edge's model: shadowed (links 8 dB off), fading, bursty (arrivals), windy, faulty (dead radios, a
+    UAV gone, half of the rate lost) and field (all of it, mild)."""
     world: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """A world of your own, instead of --scenario: a folder with world.geojson (sensors, trajectories) and, optionally,
-    scenario.toml (other numbers) and arrivals.csv (recorded traffic). examples/pipeline_world is one."""
+    scenario.toml (other numbers), arrivals.csv (recorded traffic) and gains.csv (recorded links).
+    examples/pipeline_world is one."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the world, 0 to 4294967295: it draws the sensors, queues, arrivals and starts that are not given. The
     same seed gives the same world."""

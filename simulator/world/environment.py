@@ -20,6 +20,7 @@ from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation_space import observation_space
 from simulator.world.sensors import Sensors, Streams
+from simulator.world.true_channel import mean_only
 from simulator.world.truth import Truth
 
 Cost = Literal["default", "paper"]
@@ -253,6 +254,13 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         truncations = dict.fromkeys(self.agents, over)
         self.agents = [agent for agent, left in terminations.items() if not (over or left)]
         return observations, rewards, terminations, truncations, infos
+
+    @property
+    def differs(self) -> bool:
+        """Whether its links, its wind or its UAVs differ from what an edge plans with."""
+        channel, scenario = self.truth.channel, self.scenario
+        modelled = mean_only(scenario, self.gains) and not channel.changes
+        return not modelled or self.truth.wind.blows or scenario.departures > 0
 
     @property
     def live(self) -> dict[str, int]:

@@ -93,6 +93,12 @@ class TrueChannel:
             channels[0].trace,
         )
 
+    @property
+    def changes(self) -> bool:
+        """Whether the links of one place differ between instants."""
+        world = self.scenario
+        return world.rician_k_db is not None or bool(world.dead_radios or world.link_share_drop)
+
     def links(self, distance_m: FloatArray, position: FloatArray, progress_m: FloatArray, instant: int) -> Links:
         """The links of all UAVs to all sensors at an instant, ``(..., I, J)``.
 

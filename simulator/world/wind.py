@@ -40,17 +40,26 @@ class Wind:
         """The wind of B worlds of one scenario."""
         return cls(winds[0].scenario, StepNoise.stack([one.gusts for one in winds]))
 
+    @property
+    def blows(self) -> bool:
+        """Whether there is any wind."""
+        return bool(self.scenario.wind_mps or self.scenario.gust_mps)
+
     def flown_m(
         self, velocity: IntArray, progress_m: FloatArray, paths: Sequence[Trajectory], instant: int
     ) -> FloatArray:
         """The metres that UAVs ``(..., I)`` at a progress cover in the step that begins at an instant."""
         still = np.asarray(velocity * self.scenario.step_s, dtype=np.float64)
-        if not (self.scenario.wind_mps or self.scenario.gust_mps):
+        if not self.blows:
             return still
-        along = self.along_mps(progress_m + still / 2, paths)
-        if self.scenario.gust_mps:
-            along = along + self.scenario.gust_mps * self.gusts.normal(instant, (len(paths),))
+        along = self.along_mps(progress_m + still / 2, paths) + self.gust_mps(instant, len(paths))
         return np.asarray(still * np.clip(1.0 + along / self.scenario.max_velocity, 0.0, 2.0))
+
+    def gust_mps(self, instant: int, uavs: int) -> FloatArray:
+        """Each UAV's gust along its way in the step that begins at an instant, ``(I,)`` or ``(B, I)``, m/s."""
+        if not self.scenario.gust_mps:
+            return np.zeros(uavs)
+        return self.scenario.gust_mps * self.gusts.normal(instant, (uavs,))
 
     def along_mps(self, progress_m: FloatArray, paths: Sequence[Trajectory]) -> FloatArray:
         """The mean wind's component along each UAV's way at a progress ``(..., I)``, m/s."""

@@ -51,3 +51,8 @@ def test_every_field_is_off_by_default_and_described(name: str) -> None:
     field = Scenario.model_fields[name]
     assert field.description
     assert field.exclude_if is not None and field.exclude_if(field.default)
+
+
+def test_the_documentation_has_every_scenario_and_field() -> None:
+    page = (ROOT / "docs" / "worlds.md").read_text(encoding="utf-8")
+    assert [name for name in (*SCENARIOS, *sorted(HIDDEN)) if f"`{name}`" not in page] == []
