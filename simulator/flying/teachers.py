@@ -7,6 +7,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.flying.true_problem import true_problem, velocities_towards
 from simulator.policies.mpc import RecedingHorizon
 from simulator.world import Observation, PipelineWorld
 
@@ -15,6 +16,9 @@ Action = tuple[int, int]
 
 # Deterministic seconds of search for the rest of a mission; most worlds of scenario `paper` need a third of them.
 _CLAIRVOYANT_WORK = 2.0
+# In wind it plans again in every step, only so many steps ahead.
+_WINDY_WORK = 0.3
+_WINDY_STEPS = 10
 
 
 class Teacher(Protocol):
@@ -75,32 +79,34 @@ class Clairvoyant:
         if deviating:
             return None
         step = int(observation["step"][0])
-        if self._plan is None:
-            self._plan, self._first_step = self._planned(step), step
+        if self._plan is None or step >= self._first_step + len(self._plan):
+            self._plan, self._first_step = self._planned(), step
         sensor, velocity = self._plan[step - self._first_step, uav].tolist()
         return int(sensor), int(velocity)
 
     def flown(self, uav: int, step: int, action: Action) -> None:
         """Discard the plan after another action than the plan's."""
-        if self._plan is not None and tuple(self._plan[step - self._first_step, uav]) != action:
+        row = step - self._first_step
+        if self._plan is not None and row < len(self._plan) and tuple(self._plan[row, uav]) != action:
             self._plan = None
 
-    def _planned(self, step: int) -> NDArray[np.int64]:
-        """The best flight ``(H, I, 2)`` found from the world's current state to its end."""
-        from shared.fleetplan import Budget, FleetProblem, look_ahead, plan
+    def _planned(self) -> NDArray[np.int64]:
+        """The best flight ``(H, I, 2)`` found from the world's current state to its end, in wind for one step."""
+        from shared.fleetplan import Budget, look_ahead, plan
 
-        sensors, fleet = self._world.sensors, self._world.fleet
-        problem = FleetProblem(
-            scenario=self._world.scenario,
-            trajectories=fleet.trajectories,
-            progress_m=fleet.progress_m,
-            places=sensors.positions,
-            queue=sensors.queue,
-            battery=sensors.battery,
-            arrivals=sensors.arrivals[step:],
-        )
+        world = self._world
+        blows = world.truth.wind.blows
+        problem = true_problem(world, _WINDY_STEPS if blows else None)
         # The search of simulator.flying.clairvoyant_bound ends by the clock; rollouts must repeat to the bit.
-        return plan(problem, Budget(work=_CLAIRVOYANT_WORK), "cautious", look_ahead(problem)).actions
+        budget = Budget(work=_WINDY_WORK if blows else _CLAIRVOYANT_WORK)
+        actions = plan(problem, budget, "cautious", look_ahead(problem)).actions
+        if not blows:
+            return actions
+        # In wind no step but the first one is flown as planned.
+        first = actions[:1].copy()
+        target = world.fleet.progress_m + first[0, :, 1] * world.scenario.step_s
+        first[0, :, 1] = velocities_towards(world, target)
+        return first
 
 
 TEACHERS: dict[TeacherName, type[Planner] | type[Clairvoyant]] = {"planner": Planner, "clairvoyant": Clairvoyant}

@@ -14,6 +14,7 @@ from simulator.flying.clairvoyant_bound import clairvoyant, problem_of, replay
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import LEARNED_NAMES, POLICY_NAMES, policy_named
 from simulator.sites.site import Site
+from simulator.world.gain_trace import GainTrace
 
 ROUTES = (((100.0, 100.0), (900.0, 100.0)), ((100.0, 900.0), (900.0, 900.0), (500.0, 400.0)))
 BUSY: dict[str, Any] = {"initial_queue_min": 0.8, "arrival_rate_min": 15.0, "arrival_rate_max": 25.0}
@@ -128,10 +129,55 @@ def test_the_bound_knows_recorded_arrivals() -> None:
     assert clairvoyant(flood, 0, workers=1).lower_bound >= 3 * 3 * 40
 
 
+def least_by_flying(site: Site, seed: int) -> int:
+    """The fewest packets lost over all flights, each flown in the world."""
+    world = site.scenario
+    one = list(product(range(world.sensors), range(world.max_velocity + 1)))
+    joint = list(product(one, repeat=world.uavs))
+    return min(replay(site, seed, np.array(flight)) for flight in product(joint, repeat=world.steps))
+
+
+DIFFERING: dict[str, dict[str, Any]] = {
+    "shadowed": {"shadowing_db": 25.0, "route_shadowing_db": 25.0},
+    "fading": {"rician_k_db": -5.0},
+    "bursty": {"burst_factor": 10.0},
+    "dead": {"dead_radios": 2},
+    "departed": {"departures": 1},
+    "weaker": {"link_share_drop": 0.7},
+}
+
+
+@pytest.mark.parametrize("seed", [4, 6])
+@pytest.mark.parametrize("name", DIFFERING)
+def test_the_bound_knows_the_true_world(name: str, seed: int) -> None:
+    site = small(sensors=2, steps=2, **DIFFERING[name])
+    bound = clairvoyant(site, seed, time_limit_s=10, workers=1)
+    assert bound.lower_bound == bound.lost_packets == least_by_flying(site, seed)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_in_wind_the_bound_is_below_every_flight(seed: int) -> None:
+    site = small(sensors=2, steps=2, wind_mps=1.0, gust_mps=0.5, shadowing_db=6.0, step_s=60.0)
+    bound = clairvoyant(site, seed, time_limit_s=10, workers=1)
+    assert bound.lower_bound <= least_by_flying(site, seed) <= bound.lost_packets
+    assert replay(site, seed, bound.actions) == bound.lost_packets
+
+
+def test_the_bound_knows_recorded_gains() -> None:
+    scenario = small().scenario
+    pairs = product(range(scenario.uavs), range(scenario.sensors))
+    silent = GainTrace({pair: (np.zeros(1), np.full(1, 150.0)) for pair in pairs})
+    site = Site(scenario, gains=silent)
+    idle = np.zeros((scenario.steps, scenario.uavs, 2), dtype=np.int64)
+    bound = clairvoyant(site, 0, workers=1)
+    assert bound.lower_bound == bound.lost_packets == replay(site, 0, idle)
+
+
 def test_a_plan_that_the_world_does_not_confirm_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulator.flying.clairvoyant_bound.replay", lambda site, seed, actions: -1)
-    with pytest.raises(RuntimeError, match="the plan of seed 3 loses"):
-        clairvoyant(small(), 3, workers=1)
+    for site in (small(), small(shadowing_db=4.0)):
+        with pytest.raises(RuntimeError, match="the plan of seed 3 loses"):
+            clairvoyant(site, 3, workers=1)
 
 
 @pytest.mark.parametrize("sensors, uavs, steps", [(1, 1, 1), (1, 2, 2), (4, 1, 1)])

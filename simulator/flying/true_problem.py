@@ -1,0 +1,115 @@
+"""The rest of a mission as a planning problem that knows the whole world: arrivals, links, wind and faults."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import FloatArray, IntArray, rate_bps
+from shared.scenario import Scenario
+
+# The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
+if TYPE_CHECKING:
+    from shared.fleetplan import FleetProblem
+    from simulator.world import PipelineWorld
+
+# The largest distance, in metres, between two places of one stretch of way whose links are compared.
+_SPACING_M = 5.0
+
+
+def true_problem(world: PipelineWorld, steps: int | None = None) -> FleetProblem:
+    """The next steps, by default all that are left, from the world's present state.
+
+    Where the world differs from the model, ``links`` has the packets of the true links; a UAV that has left has none.
+    In wind a plan's actions do not fly as far as it says; :func:`velocities_towards` has those that do.
+    """
+    end = world.scenario.steps if steps is None else min(len(world.tally) + steps, world.scenario.steps)
+    links = None
+    if world.differs:
+        links = _links(world, end, world.scenario.max_velocity, np.zeros(1))
+    return _problem(world, end, world.scenario, links)
+
+
+def relaxed_problem(world: PipelineWorld) -> FleetProblem:
+    """All steps that are left, as a problem whose bound holds in the world; :func:`true_problem` in still air.
+
+    In wind a UAV does not fly ``velocity x step_s``. The problem lets it fly any multiple of ``step_s`` metres up to
+    the most that the wind allows in any step, and takes the best link within half of ``step_s`` around each. Every
+    flight in the wind is such a flight, over links no better.
+    """
+    if not world.truth.wind.blows:
+        return true_problem(world)
+    fastest = _fastest(world)
+    around = np.linspace(-0.5, 0.5, math.ceil(world.scenario.step_s / _SPACING_M) + 1) * world.scenario.step_s
+    links = _links(world, world.scenario.steps, fastest, around)
+    return _problem(world, world.scenario.steps, world.scenario.model_copy(update={"max_velocity": fastest}), links)
+
+
+def velocities_towards(world: PipelineWorld, progress_m: FloatArray) -> IntArray:
+    """The velocities ``(I,)`` that bring each UAV nearest to a progress ``(I,)`` in the next step, in any wind."""
+    paths = world.fleet.trajectories
+    levels = np.arange(world.scenario.max_velocity + 1)[:, None]
+    now = np.broadcast_to(world.fleet.progress_m, (len(levels), len(paths)))
+    reached = now + world.truth.wind.flown_m(levels, now, paths, len(world.tally))
+    return np.asarray(np.abs(reached - progress_m).argmin(axis=0))
+
+
+def _problem(world: PipelineWorld, end: int, scenario: Scenario, links: list[IntArray] | None) -> FleetProblem:
+    from shared.fleetplan import FleetProblem
+
+    sensors, fleet = world.sensors, world.fleet
+    # A problem takes the price of a packet from the mean loss right above a sensor, and a true link may be cheaper.
+    battery = sensors.battery if links is None or not _cheaper(scenario) else np.full_like(sensors.battery, 1e9)
+    return FleetProblem(
+        scenario=scenario,
+        trajectories=fleet.trajectories,
+        progress_m=fleet.progress_m,
+        places=sensors.positions,
+        queue=sensors.queue,
+        battery=battery,
+        arrivals=sensors.arrivals[len(world.tally) : end],
+        links=links,
+    )
+
+
+def _fastest(world: PipelineWorld) -> int:
+    """The most multiples of ``step_s`` metres that a UAV covers in one of the steps left."""
+    scenario, wind, uavs = world.scenario, world.truth.wind, world.scenario.uavs
+    strongest = max(float(wind.gust_mps(step, uavs).max()) for step in range(len(world.tally), scenario.steps))
+    stretch = 1.0 + (scenario.wind_mps + strongest) / scenario.max_velocity
+    return math.ceil(scenario.max_velocity * min(max(stretch, 0.0), 2.0) - 1e-9)
+
+
+def _links(world: PipelineWorld, end: int, fastest: int, around: FloatArray) -> list[IntArray]:
+    """By UAV the packets of its links until a step, ``(1 or steps, C, J)``, after each number of ``step_s`` metres.
+
+    Each is the best of the links at the distances ``around`` it, metres.
+    """
+    scenario, fleet, channel = world.scenario, world.fleet, world.truth.channel
+    step, tables = len(world.tally), []
+    sums = (end - step) * fastest + 1
+    progress = fleet.progress_m + (np.arange(sums)[:, None, None] * scenario.step_s + around[:, None])
+    position = fleet.at(progress)
+    offset = position[..., None, :] - world.sensors.positions
+    distance = np.hypot(offset[..., 0], offset[..., 1])
+    near = distance <= scenario.radio_radius_m
+    place = np.broadcast_to(channel.place_db(position, progress), distance.shape)[near]
+    reach = distance[near]
+    # Without fading and faults one table is that of all steps.
+    for now in range(step, end if channel.changes or scenario.departures else step + 1):
+        fade = np.broadcast_to(channel.fade_db(now + 1), distance.shape)[near]
+        share = np.broadcast_to(channel.share(distance, now + 1), distance.shape)[near]
+        packets = np.zeros(distance.shape, dtype=np.int64)
+        packets[near] = channel.at(reach, place + fade, share).packets
+        tables.append(packets.max(axis=1) * world.truth.faults.present(now)[:, None])
+    whole: NDArray[np.int64] = np.stack(tables)
+    return [np.ascontiguousarray(whole[:, :, uav]) for uav in range(scenario.uavs)]
+
+
+def _cheaper(scenario: Scenario) -> bool:
+    """Whether the rate right above a sensor may be more than that of the mean loss."""
+    most = scenario.link_share * scenario.bandwidth_hz * scenario.spectral_cap
+    return float(rate_bps(0.0, scenario)) < most
