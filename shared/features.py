@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray, best_gain_db, channel_gain_db
+from shared.drift import Drift
 from shared.fleetplan import FleetBelief
 from shared.learned_channel import ExpectedLinks, LearnedChannel
 from shared.reach import Reach, distances_between, places_ahead
@@ -27,8 +28,8 @@ class State:
     ``progress_m`` along the trajectory, if the UAV reported it; ``queue`` packets, ``battery`` J, ``gain`` dB,
     ``rate`` packets a step, ``since_visit`` steps, ``overflow`` (the probability of one before the next visit) and
     ``urgency`` 0..1, ``distance`` m from the UAV now. A sensor never heard (``heard`` false) has zeros
-    in the fields that only a beacon fills. ``channel`` is the fleet's knowledge of its links; without it they follow
-    the formula. Only preset ``reach`` has ``reach``.
+    in the fields that only a beacon fills. ``channel`` and ``drift`` are the fleet's knowledge of its links and
+    ways; without them they follow the formula. Only preset ``reach`` has ``reach``.
     """
 
     position: Point
@@ -46,6 +47,7 @@ class State:
     urgency: FloatArray
     distance: FloatArray
     channel: LearnedChannel | None = None
+    drift: Drift | None = None
     reach: Reach | None = None
 
     @property
@@ -62,7 +64,7 @@ class State:
         """The UAV's reach after the next step, in any preset."""
         if self.reach is not None:
             return self.reach
-        ahead = places_ahead(uav_id, self.position, self.progress_m, scenario)
+        ahead = places_ahead(uav_id, self.position, self.progress_m, scenario, self.drift)
         links = self.links(ahead, distances_between(ahead, self.places), np.arange(len(self.ids)), scenario)
         return Reach.of(links, np.where(self.able, self.queue, 0.0), self.urgency)
 
@@ -175,6 +177,7 @@ def augment(
         urgency=urgencies,
         distance=distance,
         channel=channel,
+        drift=None if belief is None else belief.drift,
     )
     return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
 

@@ -141,7 +141,8 @@ class LearnedChannel:
             link: packets that the whole rate moves in a step.
             slack: the estimate's error, packets.
         """
-        if link <= 0 or abs(packets - min(before, self.share * link)) <= slack:
+        expected = abs(packets - min(before, self.share * link)) <= slack
+        if link <= 0 or (expected and self.share == 1.0):
             return
         seen = packets / link
         if packets >= before - slack:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray
+from shared.drift import Drift
 from shared.learned_channel import ExpectedLinks, likely_to_hold
 from shared.scenario import Point, Scenario
 from shared.trajectory import progress_of, trajectories
@@ -21,17 +22,21 @@ VELOCITY_BONUS = 0.5
 LEVEL_FEATURES = 4
 
 
-def places_ahead(uav: int, position: Point, progress_m: float | None, scenario: Scenario) -> FloatArray:
+def places_ahead(
+    uav: int, position: Point, progress_m: float | None, scenario: Scenario, drift: Drift | None = None
+) -> FloatArray:
     """A UAV's places after one step at each of the V velocity levels, m, ``(V, 2)``.
 
-    A UAV off its scenario's trajectory flies an unknown one: its places are then the present one.
+    A UAV off its scenario's trajectory flies an unknown one: its places are then the present one. Without a drift the
+    UAV flies ``v dt``.
     """
     velocities = np.arange(scenario.max_velocity + 1)
     path = trajectories(scenario)[uav]
     progress = progress_of(path, position, progress_m)
     if progress is None:
         return np.broadcast_to(np.asarray(position, dtype=np.float64), (len(velocities), 2))
-    return path.at(progress + velocities * scenario.step_s)
+    still = np.asarray(velocities * scenario.step_s, dtype=np.float64)
+    return path.at(progress + (still if drift is None or drift.none else drift.flown(path, progress, still)))
 
 
 def distances_between(ahead: FloatArray, places: FloatArray) -> FloatArray:

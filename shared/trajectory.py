@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike
 from shared.channel import FloatArray
 from shared.scenario import Point, Scenario
 
+# The largest error of a reported position, metres: five standard deviations of a poor receiver.
+_POSITION_ERROR_M = 25.0
+
 
 class Trajectory(Protocol):
     """A closed curve, flown in one direction. After ``length_m`` of arc a UAV is at the same point again."""
@@ -122,11 +125,11 @@ def progress_of(
 
     Args:
         position: metres.
-        reported_m: the UAV's own report of its progress, which counts if the trajectory passes its position there. It
-            decides between the ways there and back.
+        reported_m: the UAV's own report of its progress, which counts if the trajectory passes its position there, up
+            to the error of a position. It decides between the ways there and back.
         tolerance_m: the largest distance from the trajectory that counts as on it.
     """
-    if reported_m is not None and math.dist(trajectory.at(reported_m), position) <= tolerance_m:
+    if reported_m is not None and math.dist(trajectory.at(reported_m), position) <= _POSITION_ERROR_M:
         return reported_m
     progress, gap = trajectory.locate(position)
     return progress if gap <= tolerance_m else None

@@ -108,7 +108,7 @@ def _taught(mission: Mission, state: AttendedState, reference: Reference | None)
 def _reach(state: State, uav: int, sensor_id: int, scenario: Scenario) -> Reach:
     """The reach of that sensor alone, in any feature preset."""
     row = np.flatnonzero(state.ids == sensor_id)[:1]
-    ahead = places_ahead(uav, state.position, state.progress_m, scenario)
+    ahead = places_ahead(uav, state.position, state.progress_m, scenario, state.drift)
     distance = distances_between(ahead, state.places[row])
     return Reach.of(state.links(ahead, distance, row, scenario), state.queue[row], state.urgency[row])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.channel import FloatArray, IntArray
+from shared.channel import FloatArray, IntArray, Links
+from shared.drift import Drift
 from shared.learned_channel import ExpectedLinks, LearnedChannel
 from shared.radio_failures import GOOD_LINK_DB
 from shared.scenario import Point, Scenario
@@ -21,13 +23,20 @@ Which = slice | list[int]
 FAR_M = 1e9
 # A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
 _ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
-# The arrays of a belief.
+# A position further off the reported progress has an error, and the place on the trajectory counts, metres.
+_POSITION_ERROR_M = 0.01
+# The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least that is no
+# chance.
+_POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
+BURST_GOES_ON = 0.7
+# The arrays of a belief, and those that a state of an earlier version lacks.
+_NEWER_ARRAYS = ("recent", "recent_at")
 _ARRAYS = ("arrived", "watched", "base", "since", "heard", "battery", "places", "visited")
 
 
 @dataclass(slots=True)
 class Visit:
-    """A flown decision: the sensor, and what was believed of it before.
+    """A flown decision: the sensor, the velocity, where the UAV started, and what was believed of the sensor before.
 
     ``collected`` says whether the belief has taken packets from the sensor, and ``failed`` is the UAV's report,
     ``None`` before it.
@@ -39,7 +48,9 @@ class Visit:
     since: int
     visited: int
     collected: bool
-    failed: bool | None = None
+    failed: bool | None
+    velocity: int
+    start_m: float | None
 
 
 @dataclass(slots=True)
@@ -73,9 +84,12 @@ class FleetBelief:
         heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
         battery: shape ``(J,)``, joules.
         arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
+        recent: shape ``(J,)``, packets a step between the last two beacons that count, and the step of the later one is
+            ``recent_at``, -1 for none.
         visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
         uavs: by index, the UAVs that were ever located.
         channel: learned from gains and outcomes.
+        drift: learned from the UAVs' progress.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -96,7 +110,11 @@ class FleetBelief:
         self.places: FloatArray = np.full((count, 2), np.nan)
         self.visited: IntArray = np.full(count, -1)
         self.uavs: dict[int, Whereabouts] = {}
+        self.recent: FloatArray = np.zeros(count)
+        self.recent_at: IntArray = np.full(count, -1)
+        self._surprise, self._intervals = 0.0, 0
         self.channel = LearnedChannel(scenario)
+        self.drift = Drift()
 
     @property
     def rate(self) -> FloatArray:
@@ -127,17 +145,56 @@ class FleetBelief:
         newer = beacon > self.heard[ids]
         known, base, since = self.heard[ids] >= 0, self.base[ids], self.since[ids]
         counted = newer & known & (beacon > since) & (queue < self._scenario.queue_capacity)
-        self.arrived[ids] += np.where(counted, np.maximum(queue - base, 0.0), 0.0)
+        # After a visit that moved less than believed, the packets that stayed are no arrivals.
+        expected = self.rate[ids] * np.maximum(beacon - since, 0)
+        stayed = (self.visited[ids] == since) & (queue - base > expected + 4.0 * np.sqrt(expected) + 2.0)
+        counted &= ~stayed
+        came = np.maximum(queue - base, 0.0)
+        self._watch_bursts(ids[counted], came[counted], (beacon - since)[counted], beacon[counted])
+        self.arrived[ids] += np.where(counted, came, 0.0)
         self.watched[ids] += np.where(counted, beacon - since, 0)
         news = ids[newer]
         self.base[news], self.battery[news] = queue[newer], battery[newer]
         self.since[news] = self.heard[news] = beacon[newer]
 
+    def _watch_bursts(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
+        """Compare packets ``(n,)`` that came in so many steps, until these, with the rates that were believed."""
+        rate = self.rate[ids]
+        expected = rate * steps
+        variance = expected + np.square(steps) * rate / self.watched[ids]
+        self._surprise += float(np.sum(np.square(came - expected) / variance))
+        self._intervals += len(ids)
+        self.recent[ids], self.recent_at[ids] = came / steps, at
+
+    @property
+    def dispersion(self) -> float:
+        """The variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more."""
+        found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
+        return found if found > _LEAST_DISPERSION else 1.0
+
+    def burst(self, step: int) -> FloatArray:
+        """Packets above the rate that are still to come of the bursts seen, from this step on, ``(J,)``.
+
+        A burst lasts into the next step with the probability 0.7. Poisson arrivals have none.
+        """
+        if self.dispersion == 1.0:
+            return np.zeros(len(self.base))
+        above = np.where(self.recent_at >= 0, np.maximum(self.recent - self.rate, 0.0), 0.0)
+        return above * BURST_GOES_ON ** (np.maximum(step - self.recent_at, 0) + 1) / (1.0 - BURST_GOES_ON)
+
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
         here = (float(position[0]), float(position[1]))
         visit = self.uavs[uav].visit if uav in self.uavs else None
-        self.uavs[uav] = Whereabouts(step, here, progress_of(self._paths[uav], here, reported_m), visit=visit)
+        progress = progress_of(self._paths[uav], here, reported_m)
+        if reported_m is not None and progress == reported_m:
+            x, y = self._paths[uav].at(reported_m)
+            if math.hypot(x - here[0], y - here[1]) > _POSITION_ERROR_M:
+                here = float(x), float(y)
+            if visit is not None and visit.step == step - 1 and visit.start_m is not None:
+                still = visit.velocity * self._scenario.step_s
+                self.drift.learn(self._paths[uav], visit.start_m, still, reported_m - visit.start_m)
+        self.uavs[uav] = Whereabouts(step, here, progress, visit=visit)
 
     def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
         """Take the gains ``(n,)`` of the beacons that a UAV hears where it was located.
@@ -153,9 +210,18 @@ class FleetBelief:
         visit = last.visit
         if visit is None or visit.failed is None or visit.step != last.step - 1:
             return
-        gain = gain_db[near & (ids == visit.sensor)]
-        if len(gain) and gain[0] > GOOD_LINK_DB - self._scenario.path_loss_limit_db and self.battery[visit.sensor] > 0:
+        row = np.flatnonzero(near & (ids == visit.sensor))
+        if not len(row) or self.battery[visit.sensor] <= 0:
+            return
+        gain = float(gain_db[row[0]])
+        if gain > GOOD_LINK_DB - self._scenario.path_loss_limit_db:
             self.channel.failures.settle(visit.sensor, visit.failed)
+        if not visit.failed and visit.since == visit.step and self.since[visit.sensor] == last.step:
+            # The queue was known before and after: it tells what the link moved.
+            rate = float(self.rate[visit.sensor])
+            link = int(Links(distance[row[0]], np.asarray(-gain), self._scenario).packets)
+            moved = visit.base + rate - float(self.base[visit.sensor])
+            self.channel.moved(moved, visit.base, link, slack=3.0 * math.sqrt(rate) + 1.0)
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
@@ -194,8 +260,10 @@ class FleetBelief:
         """Fly one UAV's decision; ``served`` has the sensors and steps of the fleet's successful visits."""
         last = self.uavs[uav]
         sensor, velocity = last.action or (0, 0)
+        start = last.progress_m
         if last.progress_m is not None:
-            last.progress_m += velocity * self._scenario.step_s
+            still = np.array([velocity * self._scenario.step_s])
+            last.progress_m += float(self.drift.flown(self._paths[uav], last.progress_m, still)[0])
             x, y = self._paths[uav].at(last.progress_m)
             last.position = float(x), float(y)
         base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])
@@ -205,7 +273,7 @@ class FleetBelief:
             if collected := packets > 0:
                 served.add((sensor, last.step))
                 self.collect(sensor, packets, last.step)
-        last.visit = Visit(last.step, sensor, base, since, visited, collected, last.failed)
+        last.visit = Visit(last.step, sensor, base, since, visited, collected, last.failed, velocity, start)
         last.step, last.action, last.failed = last.step + 1, None, None
 
     def _movable(self, position: Point, sensor: int, *, held: bool) -> int:
@@ -228,7 +296,7 @@ class FleetBelief:
 
     def state_dict(self) -> dict[str, Any]:
         """The whole belief, as copies."""
-        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
+        arrays = {name: getattr(self, name).copy() for name in (*_ARRAYS, *_NEWER_ARRAYS)}
         uavs = {
             uav: [
                 *(u.step, list(u.position), u.progress_m, u.action),
@@ -236,7 +304,14 @@ class FleetBelief:
             ]
             for uav, u in self.uavs.items()
         }
-        return {**arrays, "uavs": uavs, "channel": self.channel.state_dict()}
+        bursts = [self._surprise, self._intervals]
+        return {
+            **arrays,
+            "uavs": uavs,
+            "bursts": bursts,
+            "channel": self.channel.state_dict(),
+            "drift": self.drift.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a belief. One of an earlier version has neither visits nor a channel."""
@@ -254,7 +329,11 @@ class FleetBelief:
             for uav, (step, (x, y), progress_m, action, *newer) in state["uavs"].items()
         }
         if "channel" in state:
+            for name in _NEWER_ARRAYS:
+                setattr(self, name, state[name])
+            self._surprise, self._intervals = state["bursts"]
             self.channel.load_state_dict(state["channel"])
+            self.drift.load_state_dict(state["drift"])
 
     def queue(self, step: int, which: Which = slice(None)) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``which``."""
@@ -296,4 +375,4 @@ class FleetBelief:
         last = self.uavs[uav]
         if last.progress_m is None:
             return np.broadcast_to(np.asarray(last.position), (len(flown), 2))
-        return self._paths[uav].at(last.progress_m + flown)
+        return self._paths[uav].at(last.progress_m + self.drift.flown(self._paths[uav], last.progress_m, flown))

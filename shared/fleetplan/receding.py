@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import IntArray
-from shared.fleetplan.belief import FAR_M, FleetBelief
+from shared.fleetplan.belief import BURST_GOES_ON, FAR_M, FleetBelief
 from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import FleetProblem, price
 from shared.fleetplan.risk import neglect
@@ -183,7 +183,7 @@ class RecedingHorizon:
     def _links(self, present: list[int], kept: IntArray, horizon: int) -> dict[str, Any]:
         """The links of the fleet's UAVs, where the formula does not describe them."""
         belief, world = self._belief, self._scenario
-        if belief.channel.by_formula:
+        if belief.channel.by_formula and belief.drift.none:
             return {}
         metres = np.arange(horizon * world.max_velocity + 1) * world.step_s
         expected = [belief.links(uav, metres) for uav in present]
@@ -202,14 +202,16 @@ class RecedingHorizon:
     def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
         """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
-        queue, rate = belief.queue(step)[kept], belief.rate[kept]
-        expected = np.rint(queue + np.arange(horizon + 1)[:, None] * rate).astype(np.int64)
+        queue, rate, burst = belief.queue(step)[kept], belief.rate[kept], belief.burst(step)[kept]
+        ahead = np.arange(horizon + 1)[:, None]
+        expected = np.rint(queue + ahead * rate + burst * (1.0 - BURST_GOES_ON**ahead)).astype(np.int64)
         risk = neglect(
-            base=belief.base[kept],
+            base=belief.base[kept] + burst,
             base_variance=belief.base_variance[kept],
             age=np.maximum(step - belief.since[kept], 0),
             rate=rate,
             rate_variance=rate / belief.watched[kept],
+            dispersion=belief.dispersion,
             capacity=world.queue_capacity,
             horizon=horizon,
             beyond=self._beyond(horizon),

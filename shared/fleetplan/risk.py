@@ -37,11 +37,12 @@ def neglect(
     capacity: int,
     horizon: int,
     beyond: int,
+    dispersion: float = 1.0,
 ) -> FloatArray:
     """The price of neglecting sensors in a plan: the ``risk`` of a :class:`~shared.fleetplan.problem.FleetProblem`.
 
-    In n steps ``n rate`` packets come on average, with the variance ``n rate + n^2 rate_variance``: the Poisson's and
-    the estimate's.
+    In n steps ``n rate`` packets come on average, with the variance ``n rate dispersion + n^2 rate_variance``: the
+    arrivals' and the estimate's.
 
     Args:
         base: the last known packets, ``(J,)``.
@@ -52,6 +53,7 @@ def neglect(
         capacity: W, packets.
         horizon: steps H of the plan.
         beyond: steps after the plan whose losses count too, at least 0.
+        dispersion: the arrivals' variance over a Poisson's.
 
     Returns:
         Shape ``(H + 1, H + 1, J)``.
@@ -59,7 +61,7 @@ def neglect(
     steps = np.arange(horizon + beyond + 3)[:, None]
 
     def lost_by(start: FloatArray | float, variance: FloatArray | float, n: NDArray[np.int64]) -> FloatArray:
-        return expected_overflow(start + n * rate, variance + n * rate + n**2 * rate_variance, capacity)
+        return expected_overflow(start + n * rate, variance + n * rate * dispersion + n**2 * rate_variance, capacity)
 
     emptied, untouched = lost_by(0.0, 0.0, steps), lost_by(base, base_variance, steps + age)
     risk = np.zeros((horizon + 1, horizon + 1, len(rate)))

@@ -83,7 +83,7 @@ class OnBoard:
     def observe(self, uav: UavState, step: int) -> None:
         """Record the UAV's report and the outcome of its last decision."""
         if uav.outcome is not None:
-            self._apply(uav.outcome)
+            self._apply(uav.uav_id, uav.outcome)
         take_report(uav, step, self._records, self._belief)
 
     def decided(self, response: DecideResponse) -> None:
@@ -95,10 +95,11 @@ class OnBoard:
         self._records.presume(response.sensor_id, response.decision_id, response.step)
         self._belief.tell(response.uav_id, response.step, response.sensor_id, response.velocity)
 
-    def _apply(self, outcome: Outcome) -> None:
+    def _apply(self, uav_id: int, outcome: Outcome) -> None:
         if self._sent is None or self._sent[0] != outcome.decision_id:
             return
         name, sensor, step = self._sent
+        self._belief.settle(uav_id, step, outcome.failed)
         if outcome.failed:
             self._records.withdraw(sensor, name)
         else:
