@@ -17,9 +17,10 @@ from shared.scenario import Scenario
 
 # A link that holds with at least this probability counts as one.
 LIKELY = 0.5
-# How fast the rate share follows a visit that says something about it.
-_SHARE_STEP = 0.5
-_LEAST_SHARE = 0.05
+# The rate share is the median of this many visits that show it: one visit proves nothing where arrivals come in bursts.
+_SHARE_VISITS = 5
+# A share above this is no loss, and the least that counts.
+_WHOLE_SHARE, _LEAST_SHARE = 0.93, 0.05
 
 
 def normal_below(z: FloatArray) -> FloatArray:
@@ -81,14 +82,19 @@ class LearnedChannel:
     Attributes:
         radio_map: the excess loss over the formula.
         failures: the radios that fail although their links hold.
-        share: the rate that transfers get, as a share of the formula's, 0.05..1.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self.radio_map = RadioMap(scenario.sensors)
         self.failures = RadioFailures(scenario.sensors)
-        self.share = 1.0
+        self._shares = [1.0] * _SHARE_VISITS
+
+    @property
+    def share(self) -> float:
+        """The rate that transfers get, as a share of the formula's, 0.05..1: the median of the last visits."""
+        median = sorted(self._shares)[_SHARE_VISITS // 2]
+        return 1.0 if median > _WHOLE_SHARE else median
 
     @property
     def by_formula(self) -> bool:
@@ -141,26 +147,24 @@ class LearnedChannel:
             link: packets that the whole rate moves in a step.
             slack: the estimate's error, packets.
         """
-        expected = abs(packets - min(before, self.share * link)) <= slack
-        if link <= 0 or (expected and self.share == 1.0):
+        if link <= 0 or (packets >= before - slack and before < self.share * link):
+            # The queue was emptied: the link may move more.
             return
-        seen = packets / link
-        if packets >= before - slack:
-            # The queue was emptied: the share is at least this.
-            seen = max(seen, self.share)
-        self.share += _SHARE_STEP * (float(np.clip(seen, _LEAST_SHARE, 1.0)) - self.share)
-        if self.share > 0.97:
-            self.share = 1.0
+        self._shares = [*self._shares[1:], min(max(packets / link, _LEAST_SHARE), 1.0)]
 
     def state_dict(self) -> dict[str, Any]:
         """The whole knowledge, as copies."""
-        return {"map": self.radio_map.state_dict(), "failures": self.failures.state_dict(), "share": self.share}
+        return {
+            "map": self.radio_map.state_dict(),
+            "failures": self.failures.state_dict(),
+            "shares": list(self._shares),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore it."""
         self.radio_map.load_state_dict(state["map"])
         self.failures.load_state_dict(state["failures"])
-        self.share = state["share"]
+        self._shares = list(state["shares"])
 
 
 def likely_to_hold(hold: FloatArray) -> NDArray[np.bool_]:

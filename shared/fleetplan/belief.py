@@ -218,10 +218,10 @@ class FleetBelief:
             self.channel.failures.settle(visit.sensor, visit.failed)
         if not visit.failed and visit.since == visit.step and self.since[visit.sensor] == last.step:
             # The queue was known before and after: it tells what the link moved.
-            rate = float(self.rate[visit.sensor])
+            rate = float(self.rate[visit.sensor] + self.burst(visit.step)[visit.sensor] * (1.0 - BURST_GOES_ON))
             link = int(Links(distance[row[0]], np.asarray(-gain), self._scenario).packets)
             moved = visit.base + rate - float(self.base[visit.sensor])
-            self.channel.moved(moved, visit.base, link, slack=3.0 * math.sqrt(rate) + 1.0)
+            self.channel.moved(moved, visit.base, link, slack=3.0 * math.sqrt(rate * self.dispersion) + 1.0)
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
