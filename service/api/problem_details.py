@@ -37,8 +37,14 @@ def problem_response(
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries for the problems of a route."""
-    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
-    return {s: {"description": HTTPStatus(s).phrase, "content": {CONTENT_TYPE: schema}} for s in statuses}
+    # Every status has dicts of its own: its example is put into them.
+    return {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {CONTENT_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+        }
+        for status in statuses
+    }
 
 
 def install(app: FastAPI) -> None:

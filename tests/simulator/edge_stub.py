@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import socket
-import threading
-import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
@@ -33,7 +30,7 @@ from shared.wire import (
     Tokens,
 )
 from tests.running import serving
-from tests.waiting import PATIENCE_S, Gate
+from tests.waiting import Gate
 
 Behaviour = Literal["ok", "busy", "busy_retry_after", "garbage", "invalid", "crash", "html", "slow", "forgot", "wrong"]
 LLM = Literal["loading", "ready", "unavailable", "off"]
@@ -223,15 +220,5 @@ def free_port() -> int:
 def stub_edge_at(port: int) -> Iterator[EdgeStub]:
     """A new stub without missions on a given port, such as that of a stub before."""
     stub = EdgeStub(url=f"http://127.0.0.1:{port}")
-    server = uvicorn.Server(uvicorn.Config(stub.app(), host="127.0.0.1", port=port, log_level="warning"))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        if not thread.is_alive():
-            raise RuntimeError(f"the stub did not start on port {port}")
-        time.sleep(0.01)
-    try:
+    with serving(stub.app(), port):
         yield stub
-    finally:
-        server.should_exit = True
-        thread.join(PATIENCE_S)

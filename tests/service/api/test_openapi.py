@@ -62,6 +62,13 @@ def test_what_is_asked_for_a_key_says_so() -> None:
     assert DOCUMENT["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
 
 
+@pytest.mark.parametrize(("method", "path"), OPERATIONS)
+def test_a_problems_example_has_its_own_status(method: str, path: str) -> None:
+    for status, response in DOCUMENT["paths"][path][method]["responses"].items():
+        for value in values(response.get("content", {}).get("application/problem+json", {})):
+            assert value["status"] == int(status)
+
+
 def test_the_schema_refuses_what_is_no_example() -> None:
     content = DOCUMENT["paths"]["/decide"]["post"]["requestBody"]["content"]["application/json"]
     with pytest.raises(jsonschema_rs.ValidationError):
