@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import shutil
+import ssl
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
@@ -13,12 +14,13 @@ from typing import Any
 
 import httpx
 import pytest
+from httpx._config import create_ssl_context
 
 from service.api.app import create_app
 from service.config.settings import Settings
 from service.prompting.tokenizer import encoding
-from service.storage.store import Store
 from tests.running import serving
+from tests.storing import StoreHere
 from tests.waiting import PATIENCE_S
 
 # An edge started as a process has no store unless a test gives one: otherwise all would share the user's store.
@@ -46,6 +48,22 @@ def vocabulary() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def certificates() -> Iterator[None]:
+    """One SSL context for all HTTP clients of this process: to read the certificates takes more than most requests."""
+    made: dict[object, ssl.SSLContext] = {}
+
+    def context(verify: Any = True, cert: Any = None, trust_env: bool = True) -> ssl.SSLContext:
+        key = verify, cert, trust_env, os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
+        if key not in made:
+            made[key] = create_ssl_context(verify, cert, trust_env)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("httpx._transports.default.create_ssl_context", context)
+        yield
+
+
 @pytest.fixture
 def edge(tmp_path: Path) -> Iterator[Edge]:
     """Starts real edges with stores and the given settings (by default no LLM), and returns a client of each.
@@ -56,7 +74,7 @@ def edge(tmp_path: Path) -> Iterator[Edge]:
     with ExitStack() as stack:
 
         def start(**settings: Any) -> httpx.Client:
-            store = Store(str(tmp_path / f"missions-{next(count)}.db"))
+            store = StoreHere(tmp_path / f"missions-{next(count)}.db")
             url = stack.enter_context(
                 serving(create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), store))
             )

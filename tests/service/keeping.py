@@ -24,6 +24,7 @@ from service.storage.operations import Change
 from service.storage.store import Store
 from service.storage.writer import Writer
 from tests.running import serving
+from tests.storing import empty_store
 from tests.waiting import PATIENCE_S, until
 
 Body = dict[str, Any]
@@ -32,6 +33,8 @@ Report = Callable[..., Body]
 
 @contextmanager
 def running(path: Path | str, **settings: Any) -> Iterator[tuple[httpx.Client, Engine]]:
+    if "://" not in str(path):
+        empty_store(Path(path))
     app = create_app(Settings(**{"mode": "value", "deadline_ms": 60_000, **settings}), Store(str(path)))
     with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         yield client, app.state.engine

@@ -1,0 +1,61 @@
+"""A store for edges whose tests are not about stores: quickly made, and written without a process beside."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgpack
+
+from service.storage.locks import FileLock
+from service.storage.operations import Change
+from service.storage.sql_statements import Statements
+from service.storage.sqlite_process import Database
+from service.storage.store import Store
+from service.storage.writer import Done, WriteFailed
+
+
+def empty_store(path: Path) -> Path:
+    """Make an empty SQLite store there, unless there is one: a copy of it needs none of alembic's work."""
+    if not path.exists():
+        path.write_bytes(_empty())
+    return path
+
+
+@cache
+def _empty() -> bytes:
+    with TemporaryDirectory() as folder:
+        made = Path(folder) / "made.db"
+        Store(str(made)).close()
+        return made.read_bytes()
+
+
+class StoreHere(Store):
+    """A SQLite store that is written in this process; tests/service/storage has the process that an edge starts."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(str(empty_store(path)))
+
+    def writer(self) -> WriterHere:
+        """A writer of the same statements."""
+        assert isinstance(self._lock, FileLock)
+        return WriterHere(Statements(self._engine.dialect), self._lock.file)
+
+
+class WriterHere:
+    """Commits as the writing process does, on the event loop."""
+
+    def __init__(self, statements: Statements, path: str) -> None:
+        self._statements, self._database = statements, Database(path)
+
+    def write(self, changes: Sequence[Change], done: Done) -> None:
+        """As ``Writer`` says."""
+        reason = self._database.commit(msgpack.unpackb(msgpack.packb(self._statements.of(changes))))
+        asyncio.get_running_loop().call_soon(done, None if reason is None else WriteFailed(reason))
+
+    def close(self) -> None:
+        """As ``Writer`` says."""
+        self._database.close()
