@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 
 import pytest
+
+from tests.simulator.undrawn import reports_undrawn
+
+
+@pytest.fixture
+def undrawn() -> Iterator[None]:
+    """Flights of this test draw no report."""
+    with reports_undrawn():
+        yield
 
 
 @pytest.fixture

@@ -21,6 +21,14 @@ from simulator.records.request_log import read_requests
 from simulator.reporting.replay_agreement import ReplaySummary
 from tests.conftest import Edge
 from tests.simulator.edge_stub import EdgeStub, stub_edge
+from tests.simulator.undrawn import reports_undrawn
+
+
+@pytest.fixture(autouse=True, scope="module")
+def undrawn() -> Iterator[None]:
+    """No flight here draws its report."""
+    with reports_undrawn():
+        yield
 
 
 @pytest.fixture

@@ -51,6 +51,7 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(("awaited", "polled", "message"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
 def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
     stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, message: str
@@ -73,6 +74,7 @@ def test_an_old_result_is_overwritten_only_with_the_option(tmp_path: Path, capsy
     assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"losses", "visits"}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
     assert simulate.main(["--policy", "round_robin", "--steps", "2", "--out", str(tmp_path)]) == 0
     summary = summary_in(tmp_path)
@@ -118,6 +120,7 @@ def test_no_edge_is_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert not out.exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_edge_that_never_decides_is_code_1(
     stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -84,14 +84,14 @@ def for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("simulator.flying.flight_metrics.LONGEST_LAST_SCRAPE_S", 3600.0)
 
 
-@pytest.mark.usefixtures("for_ever")
+@pytest.mark.usefixtures("for_ever", "undrawn")
 def test_a_flight_that_is_never_scraped_does_not_wait(stub: EdgeStub, tmp_path: Path) -> None:
     arguments = ["--edge", stub.url, "--steps", "1", "--out", str(tmp_path), "--metrics-port", str(free_port())]
     assert simulate.main(arguments) == 0
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("for_ever")
+@pytest.mark.usefixtures("for_ever", "undrawn")
 def test_an_interrupted_flight_waits_for_no_scrape(stub: EdgeStub, tmp_path: Path) -> None:
     # The second step is never flown.
     stub.script, stub.otherwise, port = ["ok"] * 3, "slow", free_port()
