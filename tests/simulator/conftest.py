@@ -18,6 +18,13 @@ def undrawn() -> Iterator[None]:
 
 
 @pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The planner searches for a tenth of its time, where its plans' quality is not the subject."""
+    monkeypatch.setattr("shared.fleetplan.receding._SAVED_WORK", 0.1)
+    monkeypatch.setattr("shared.fleetplan.receding._WORK", 0.01)
+
+
+@pytest.fixture
 def without_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate an installation without torch and TorchRL."""
     for module in [name for name in sys.modules if name.startswith("simulator.marl")]:

@@ -75,6 +75,7 @@ def test_an_exhaustive_search_of_three_sensors_two_uavs_and_three_steps() -> Non
 FEW_SENSORS = [small(steps=4, sensors=1, uavs=2), small(steps=4, sensors=2, uavs=3)]
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("site", FEW_SENSORS)
 def test_with_fewer_sensors_than_uavs_the_bound_is_below_every_flight(site: Site, seed: int) -> None:
@@ -86,8 +87,9 @@ def test_with_fewer_sensors_than_uavs_the_bound_is_below_every_flight(site: Site
 
 
 # The proofs of the other scenarios take half a minute.
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("seed", [0, 2])
-@pytest.mark.parametrize("site", [small(steps=6), small(steps=6, routes=ROUTES), small(steps=6, battery_j=20.0)])
+@pytest.mark.parametrize("site", [small(steps=5), small(steps=5, routes=ROUTES), small(steps=5, battery_j=20.0)])
 def test_no_policy_loses_less_than_the_bound(site: Site, seed: int) -> None:
     bound = clairvoyant(site, seed, workers=1)
     for name in set(POLICY_NAMES) - set(LEARNED_NAMES):

@@ -52,11 +52,13 @@ def test_without_a_teacher_there_is_no_reference() -> None:
     assert [step.reference for step in explore(SHORT, 3)] == [None] * 36
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("name", NAMES)
 def test_the_same_world_is_explored_the_same_way(name: TeacherName) -> None:
     assert list(explore(SHORT, 5, name)) == list(explore(SHORT, 5, name))
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_fleet_mostly_follows_its_teacher_and_sometimes_deviates(
     name: TeacherName, monkeypatch: pytest.MonkeyPatch

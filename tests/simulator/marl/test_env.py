@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
 from shared.scenario import Scenario
 from simulator.marl.env import PipelineEnv
 from simulator.world import PipelineWorld
+
+pytestmark = pytest.mark.long
 
 SMALL = Scenario(name="small", sensors=4, uavs=2, steps=5)
 

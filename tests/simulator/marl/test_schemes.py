@@ -17,6 +17,8 @@ from simulator.marl.training import Learner
 from simulator.policies.registry import policy_named
 from simulator.world import PipelineWorld
 
+pytestmark = pytest.mark.long
+
 PAPER = SCENARIOS["paper"]
 MAKE: dict[str, Callable[[Scenario, int, int], Learner]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
 

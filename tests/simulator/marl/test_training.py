@@ -19,6 +19,8 @@ from simulator.marl.plan import STATE, Plan
 from simulator.marl.training import _HELD_OUT, Learner, Round, Training
 from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
+pytestmark = pytest.mark.long
+
 SMALL = Scenario(name="small", sensors=4, uavs=2, steps=6)
 MAKE: dict[str, Callable[[Scenario, int, int], Learner]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
 ROUNDS = 6

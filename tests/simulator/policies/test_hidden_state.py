@@ -26,12 +26,7 @@ DECISIONS, SEED = 4, 0
 HIDDEN = (PipelineWorld, Sensors, Streams, Fleet, Truth)
 Actions = list[tuple[int, int]]
 
-
-@pytest.fixture(autouse=True)
-def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The planner searches for a tenth of its time: how well it plans is not the subject."""
-    monkeypatch.setattr("shared.fleetplan.receding._SAVED_WORK", 0.1)
-    monkeypatch.setattr("shared.fleetplan.receding._WORK", 0.01)
+pytestmark = pytest.mark.usefixtures("brief")
 
 
 def copied(observation: Observation) -> Observation:

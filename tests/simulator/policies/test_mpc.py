@@ -13,26 +13,31 @@ from simulator.policies.mpc import RecedingHorizon
 from simulator.policies.registry import policy_named
 from simulator.world import PipelineWorld
 
-SHORT = SCENARIOS["paper"].model_copy(update={"steps": 10})
+SHORT = SCENARIOS["paper"].model_copy(update={"steps": 5})
 NONE: frozenset[int] = frozenset()
 
 
 # ---- the policy
 
 
+@pytest.fixture(scope="module")
+def short() -> list[tuple[int, list[int]]]:
+    """A mission that others are compared with."""
+    return flown(SHORT, 100)
+
+
 def flown(scenario: Scenario, seed: int) -> list[tuple[int, list[int]]]:
     return [(t.lost_packets, t.collected.tolist()) for t in rollout(PipelineWorld(scenario), RecedingHorizon(), seed)]
 
 
-def test_the_same_seed_is_the_same_mission_to_the_bit() -> None:
-    assert flown(SHORT, 100) == flown(SHORT, 100)
+def test_the_same_seed_is_the_same_mission_to_the_bit(short: list[tuple[int, list[int]]]) -> None:
+    assert flown(SHORT, 100) == short
 
 
-def test_a_policy_that_flew_before_flies_as_a_new_one() -> None:
+def test_a_policy_that_flew_before_flies_as_a_new_one(short: list[tuple[int, list[int]]]) -> None:
     policy = RecedingHorizon()
     rollout(PipelineWorld(SHORT), policy, 101)
-    again = [(t.lost_packets, t.collected.tolist()) for t in rollout(PipelineWorld(SHORT), policy, 100)]
-    assert again == flown(SHORT, 100)
+    assert [(t.lost_packets, t.collected.tolist()) for t in rollout(PipelineWorld(SHORT), policy, 100)] == short
 
 
 def test_it_loses_far_less_than_eof() -> None:
@@ -69,12 +74,12 @@ def test_it_keeps_no_sensor_that_another_has_taken() -> None:
 
 def test_with_nothing_in_reach_it_still_answers() -> None:
     deaf = SHORT.model_copy(update={"radio_radius_m": 1.0})
-    assert len(flown(deaf, 100)) == 10
+    assert len(flown(deaf, 100)) == deaf.steps
 
 
 def test_with_no_time_to_search_it_still_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared.fleetplan.receding._MOST_WORK", 1e-9)
-    assert len(flown(SHORT, 100)) == 10
+    assert len(flown(SHORT, 100)) == SHORT.steps
 
 
 def test_with_no_work_saved_it_searches_briefly_and_still_loses_less_than_eof(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,6 +100,7 @@ def test_a_large_fleet_plans_uav_by_uav() -> None:
     assert sum(sum(collected) for _, collected in flown(crowd, 100)) > 6 * 30
 
 
+@pytest.mark.long
 def test_a_large_fleet_loses_less_than_half_of_eofs() -> None:
     dense = SCENARIOS["dense"].model_copy(update={"steps": 10})
     eof = sum(t.lost_packets for t in rollout(PipelineWorld(dense), policy_named("eof"), 100))

@@ -170,6 +170,7 @@ def test_a_policy_leaves_the_observation_alone(name: str) -> None:
     np.testing.assert_equal(observation, before)
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("policy", UNTRAINED)
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_policy_flies_every_preset(scenario: str, policy: str) -> None:
