@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.e2e.processes import serving_edge
+from tests.conftest import Edge
 
 ROOT = Path(__file__).parents[1]
 # Where a reader is led, not what a page loads.
@@ -85,9 +85,8 @@ def test_the_policy_shown_flies(capsys: pytest.CaptureFixture[str]) -> None:
     assert re.match(r"mine \[\d+\]\neof \[\d+\]\n$", capsys.readouterr().out)
 
 
-def test_the_client_shown_asks(capsys: pytest.CaptureFixture[str]) -> None:
-    with serving_edge(AICVDS_MODE="policy") as (url, _):
-        shown = blocks("quick-start.md")
-        assert '"http://localhost:8000"' in shown
-        exec(shown.replace('"http://localhost:8000"', f'"{url}", timeout_s=60'), {})
+def test_the_client_shown_asks(edge: Edge, capsys: pytest.CaptureFixture[str]) -> None:
+    shown = blocks("quick-start.md")
+    assert '"http://localhost:8000"' in shown
+    exec(shown.replace('"http://localhost:8000"', f'"{edge(mode="policy").base_url}", timeout_s=60'), {})
     assert re.match(r"collect from [012] at \d+ m/s: policy\n$", capsys.readouterr().out)

@@ -15,9 +15,12 @@ import numpy as np
 import torch
 from fastapi.responses import Response
 
-from tests.e2e.processes import serving_edge
+from service.api.app import create_app
+from service.config.settings import Settings
+from service.storage.store import Store
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, said, wait_for
+from tests.waiting import PATIENCE_S
 
 FOLDER = Path(__file__).with_name("store_601e8f2")
 STORE, FLIGHTS = FOLDER / "missions.db", FOLDER / "flights.json"
@@ -47,9 +50,9 @@ def answers(store: Path, requests: list[Body], llm: str, to: Path) -> list[Body]
     shutil.copy(store, to)
     stub = DrawingLlm()
     with serving(stub.app) as llm_url:
-        way = {"AICVDS_MODE": "value"} if llm == "off" else {"AICVDS_MODE": "guided", "AICVDS_LLM_URL": f"{llm_url}/v1"}
-        with serving_edge(AICVDS_STORE=str(to), **SETTINGS, **way) as (url, _), httpx.Client(base_url=url) as client:
-            client.timeout = httpx.Timeout(90.0)
+        way: Body = {"mode": "value"} if llm == "off" else {"mode": "guided", "llm_url": f"{llm_url}/v1"}
+        app = create_app(Settings(planner_ms=60_000, deadline_ms=60_000, **way), Store(str(to)))
+        with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
             wait_for(client, "off" if llm == "off" else "ready")
             return Flying(client, stub).answers(requests)
 

@@ -12,6 +12,7 @@ from service.config.settings import Settings
 from shared.guidance import GuidanceStatus
 from shared.reasons import Reason
 from shared.wire import DecideResponse
+from tests.conftest import Edge
 from tests.e2e.processes import serving_edge
 from tests.waiting import until
 
@@ -36,9 +37,8 @@ def pasted(command: str, url: str) -> str:
     return subprocess.run(["bash", "-c", f"{at_edge} --silent"], capture_output=True, text=True, check=True).stdout
 
 
-def test_the_curl_works_as_pasted() -> None:
-    with serving_edge() as (url, _):
-        decision = DecideResponse.model_validate_json(pasted(DECIDE, url))
+def test_the_curl_works_as_pasted(edge: Edge) -> None:
+    decision = DecideResponse.model_validate_json(pasted(DECIDE, str(edge().base_url)))
     assert decision.sensor_id in (0, 1, 2)
 
 

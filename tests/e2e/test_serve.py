@@ -15,14 +15,21 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.e2e.processes import output_until, run, serving_edge, started
+from tests.e2e.processes import output_until, run, run_here, serving_edge, started
 from tests.running import listening
 from tests.service.stub_llm import misbehaving, wait_for
 from tests.waiting import PATIENCE_S, Gate, until
 
 
+@pytest.fixture
+def unmarked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``aicvds serve`` in this process leaves its log and its allocator as they are for the tests after it."""
+    monkeypatch.setattr("service.observability.logs.configure", lambda *_: None)
+    monkeypatch.setattr("service.server.malloc.hand_back_memory", lambda: None)
+
+
 def test_help_names_every_command() -> None:
-    shown = run("--help")
+    shown = run_here("--help")
     assert shown.returncode == 0
     for command in ("serve", "simulate", "demo", "keys", "model"):
         assert command in shown.stdout
@@ -47,12 +54,12 @@ def test_help_imports_nothing_that_takes_long(words: list[str], without: set[str
 
 
 def test_the_version_is_that_of_the_package() -> None:
-    assert run("--version").stdout == f"aicvds {version('aic-vds')}\n"
+    assert run_here("--version").stdout == f"aicvds {version('aic-vds')}\n"
 
 
 @pytest.mark.parametrize("command", ["serve", "simulate", "demo", "keys", "model"])
 def test_every_command_explains_itself(command: str) -> None:
-    shown = run(command, "--help")
+    shown = run_here(command, "--help")
     assert shown.returncode == 0, shown.stderr
     assert f"aicvds {command}" in shown.stdout
 
@@ -70,8 +77,9 @@ def test_every_command_explains_itself(command: str) -> None:
         (["serve", "--port", "0", "--host", "0.0.0.0"], {"AICVDS_ANONYMOUS": "off"}, "AICVDS_ANONYMOUS=on"),
     ],
 )
+@pytest.mark.usefixtures("unmarked")
 def test_bad_use_is_one_clear_line_and_exit_2(args: list[str], env: dict[str, str], said: str) -> None:
-    ended = run(*args, **env)
+    ended = run_here(*args, **env)
     assert ended.returncode == 2
     assert said in ended.stderr + ended.stdout
     assert "Traceback" not in ended.stderr
@@ -97,8 +105,9 @@ def test_a_busy_port_is_one_clear_line() -> None:
     assert "Traceback" not in second.stderr
 
 
+@pytest.mark.usefixtures("unmarked")
 def test_a_misspelt_setting_is_told() -> None:
-    told = run("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
+    told = run_here("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
     assert "AICVDS_TOP_K" in told.stderr
     with started("serve", "--port", "0", AICVDS_TOPK="3") as process:
         output_until(process, "AICVDS_TOPK is no setting")

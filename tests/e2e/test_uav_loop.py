@@ -13,6 +13,7 @@ from examples.uav_loop.stub import StubPosition, StubWorld
 from examples.uav_loop.vehicle import LocalFrame, yaw_deg
 from shared.trajectory import trajectories
 from simulator.client import AsyncEdgeClient, EdgeClient
+from tests.conftest import Edge
 from tests.e2e.processes import serving_edge
 from tests.simulator.edge_stub import free_port
 
@@ -42,11 +43,10 @@ def gap_to_route(leg: Leg) -> float:
     return trajectories(world(STEPS))[0].locate(leg.position)[1]
 
 
-async def test_the_edge_decides_every_step_and_hears_every_outcome() -> None:
-    with serving_edge(AICVDS_MODE="policy", AICVDS_STORE="none") as (url, _):
-        async with AsyncEdgeClient(url, timeout_s=PATIENCE_S) as edge:
-            flown = await loop(stub(), edge).fly()
-            status = await edge.mission("loop")
+async def test_the_edge_decides_every_step_and_hears_every_outcome(edge: Edge) -> None:
+    async with AsyncEdgeClient(str(edge(mode="policy").base_url), timeout_s=PATIENCE_S) as client:
+        flown = await loop(stub(), client).fly()
+        status = await client.mission("loop")
     assert [leg.decided_by for leg in flown.legs] == ["policy"] * STEPS
     assert (status.decisions, status.feedback, flown.outcomes_told) == (STEPS, STEPS, STEPS)
     assert sum(leg.packets for leg in flown.legs) > 0

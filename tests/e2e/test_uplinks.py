@@ -20,6 +20,7 @@ from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import Choice, EdgePilot
 from simulator.sites.site import Site
 from simulator.world import Observation
+from tests.conftest import Edge
 from tests.e2e.processes import output_until, run, serving_edge, started
 from tests.simulator.edge_stub import free_port
 from tests.waiting import PATIENCE_S, until
@@ -87,9 +88,9 @@ def mean_bytes(flight: Flight) -> float:
     return sum(d.request_bytes for d in flight.decisions) / len(flight.decisions)
 
 
-def test_delta_decides_as_full_to_the_bit_with_fewer_bytes() -> None:
-    with serving_edge(AICVDS_MODE="value") as (url, _):
-        full, delta = flown(url, "full", "full"), flown(url, "delta", "delta")
+def test_delta_decides_as_full_to_the_bit_with_fewer_bytes(edge: Edge) -> None:
+    url = str(edge().base_url)
+    full, delta = flown(url, "full", "full"), flown(url, "delta", "delta")
     assert decided(delta) == decided(full)
     # A UAV's first is full.
     assert [d.request_bytes > 600 for d in delta.decisions] == [d.step == 0 for d in delta.decisions]
@@ -131,7 +132,7 @@ def test_an_edge_that_is_killed_on_the_way(tmp_path: Path) -> None:
     assert min(by_step[6]) > 1000 > max(by_step[5] + by_step[7])
 
 
-def test_pruned_reports_name_k_sensors_and_the_rest_is_known() -> None:
+def test_pruned_reports_name_k_sensors_and_the_rest_is_known(edge: Edge) -> None:
     asked: list[dict[str, Any]] = []
 
     class Tapped(httpx.HTTPTransport):
@@ -140,8 +141,7 @@ def test_pruned_reports_name_k_sensors_and_the_rest_is_known() -> None:
                 asked.append(json.loads(request.content))
             return super().handle_request(request)
 
-    with serving_edge(AICVDS_MODE="value") as (url, _):
-        flight = flown(url, "pruned", "pruned", Tapped())
+    flight = flown(str(edge().base_url), "pruned", "pruned", Tapped())
     assert [len(body["sensors"]["id"]) for body in asked] == [10] * 3 + [5] * 33
     assert [d.attention_bytes > 0 for d in flight.decisions] == [d.step in (0, 10) for d in flight.decisions]
     for body, decision in zip(asked, flight.decisions, strict=True):

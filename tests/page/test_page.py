@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,14 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page, expect
 
-from tests.e2e.processes import output_until, run, serving_edge, started
+from service.api.app import create_app
+from service.config.settings import Settings
+from simulator.commands import simulate
+from tests.e2e.processes import output_until, run, started
 from tests.page.conftest import Open, Start
+from tests.running import serving
 from tests.service.stub_llm import wait_for
+from tests.simulator.undrawn import reports_undrawn
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.needs("chromium")
@@ -31,7 +37,21 @@ HOSTILE = '<img src=x onerror="window.hacked = 1"><script>window.hacked = 1</scr
 @pytest.fixture(scope="module")
 def edge() -> Iterator[str]:
     """One for the tests that need none of their own; each has missions of its own name there."""
-    with serving_edge(AICVDS_MODE="value") as (url, _):
+    with edge_here() as url:
+        yield url
+
+
+@pytest.fixture
+def another_edge() -> Iterator[str]:
+    """One without missions, which ends after the page that looks at it."""
+    with edge_here() as url:
+        yield url
+
+
+@contextmanager
+def edge_here() -> Iterator[str]:
+    """An edge in this process, which decides by learned values."""
+    with serving(create_app(Settings(mode="value", deadline_ms=60_000))) as url:
         yield url
 
 
@@ -43,8 +63,8 @@ def flown(edge: str, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def fly(url: str, out: Path, *options: str) -> None:
-    flown = run("simulate", "--edge", url, "--steps", str(STEPS), "--out", str(out / "run"), *options)
-    assert flown.returncode == 0, flown.stderr
+    with reports_undrawn():
+        assert simulate.main(["--edge", url, "--steps", str(STEPS), "--out", str(out / "run"), *options]) == 0
 
 
 def violations(page: Page) -> list[str]:
@@ -52,8 +72,8 @@ def violations(page: Page) -> list[str]:
     return [f"{one['id']}: {one['help']}: {[node['target'] for node in one['nodes']][:3]}" for one in found]
 
 
-def test_a_mission_appears_while_it_flies(visit: Open, start: Start, tmp_path: Path) -> None:
-    url, _ = start(AICVDS_MODE="value")
+def test_a_mission_appears_while_it_flies(another_edge: str, visit: Open, tmp_path: Path) -> None:
+    url = another_edge
     page = visit(url)
     expect(page.get_by_role("heading", name="No mission yet")).to_be_visible()
     expect(page.locator("#empty-command")).to_have_text(f"aicvds simulate --edge {url} --out runs/mission")

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import httpx
 import jsonschema_rs
 import pytest
 
 from service.api.app import create_app
 from service.api.openapi_examples import ANSWERS, DECISION_ID, REQUESTS
 from service.config.settings import Settings
-from tests.e2e.processes import serving_edge
+from tests.conftest import Edge
 
 DOCUMENT = create_app(Settings(mode="value")).openapi()
 OPERATIONS = [(method, path) for path, methods in DOCUMENT["paths"].items() for method in methods]
@@ -82,28 +81,25 @@ def told(value: Json, decision_id: str) -> Json:
     return decision_id if value == DECISION_ID else value
 
 
-def test_a_real_edge_takes_every_example_and_answers_as_the_examples_do() -> None:
-    with serving_edge(AICVDS_MODE="value", AICVDS_STORE="none") as (url, _), httpx.Client(base_url=url) as http:
-        http.timeout = httpx.Timeout(60)
-        decision_id = DECISION_ID
-        # A mission before its guidance, a decision before its outcome.
-        for method, path in sorted(REQUESTS, key=lambda route: (route[0] != "put", route[1])):
-            for name, example in REQUESTS[method, path].items():
-                mission_id = name if method == "put" else "preset"
-                answer = http.request(
-                    method, path.format(mission_id=mission_id), json=told(example["value"], decision_id)
-                )
-                assert answer.status_code == 200, f"{method} {path}, example {name}: {answer.text}"
-                assert answer.json().keys() == ANSWERS[method, path].keys()
-                if path == "/decide" and name in ("paper", "held"):
-                    decision_id = answer.json()["decision_id"]
-        for method, path in ANSWERS:
-            if method == "get":
-                mission_id = "default" if "decision_id" in path else "preset"
-                answer = http.get(path.format(mission_id=mission_id, decision_id=decision_id))
-                assert answer.status_code == 200
-                assert answer.json().keys() == ANSWERS[method, path].keys()
-                check(
-                    DOCUMENT["paths"][path]["get"]["responses"]["200"]["content"]["application/json"]["schema"],
-                    answer.json(),
-                )
+def test_a_real_edge_takes_every_example_and_answers_as_the_examples_do(edge: Edge) -> None:
+    http = edge()
+    decision_id = DECISION_ID
+    # A mission before its guidance, a decision before its outcome.
+    for method, path in sorted(REQUESTS, key=lambda route: (route[0] != "put", route[1])):
+        for name, example in REQUESTS[method, path].items():
+            mission_id = name if method == "put" else "preset"
+            answer = http.request(method, path.format(mission_id=mission_id), json=told(example["value"], decision_id))
+            assert answer.status_code == 200, f"{method} {path}, example {name}: {answer.text}"
+            assert answer.json().keys() == ANSWERS[method, path].keys()
+            if path == "/decide" and name in ("paper", "held"):
+                decision_id = answer.json()["decision_id"]
+    for method, path in ANSWERS:
+        if method == "get":
+            mission_id = "default" if "decision_id" in path else "preset"
+            answer = http.get(path.format(mission_id=mission_id, decision_id=decision_id))
+            assert answer.status_code == 200
+            assert answer.json().keys() == ANSWERS[method, path].keys()
+            check(
+                DOCUMENT["paths"][path]["get"]["responses"]["200"]["content"]["application/json"]["schema"],
+                answer.json(),
+            )
