@@ -14,6 +14,7 @@ from typing import Any
 
 import httpx
 import pytest
+import torch
 from httpx._config import create_ssl_context
 
 from service.api.app import create_app
@@ -25,6 +26,9 @@ from tests.waiting import PATIENCE_S
 
 # An edge started as a process has no store unless a test gives one: otherwise all would share the user's store.
 os.environ["AICVDS_STORE"] = "none"
+
+# As in an edge: pytest's workers already take every core.
+torch.set_num_threads(1)
 
 # Set where the tests must be complete, as in CI: a test whose program is missing then fails.
 _COMPLETE = "AICVDS_TESTS_COMPLETE"
