@@ -3,11 +3,13 @@
 # (either one) and python3; fails without them. Prometheus and PostgreSQL are Debian's packages in images made here, unless
 # PROMETHEUS_IMAGE and POSTGRES_IMAGE name others. What needs other images (profiles grafana, llama, vllm, ollama) is only
 # read.
+#   compose.sh          all of it
+#   compose.sh build    the images alone, which the engine then has for the whole run
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 
 # Two runs on one engine need two names.
-readonly PROJECT=${COMPOSE_PROJECT_NAME:-aicvds-test} FLIGHT_S=300 LLM_S=120 STOP_S=10
+readonly ONLY=${1:-} PROJECT=${COMPOSE_PROJECT_NAME:-aicvds-test} FLIGHT_S=300 LLM_S=120 STOP_S=10
 WORK=$(mktemp -d)
 OFFLINE=$PROJECT-offline
 
@@ -17,6 +19,7 @@ fail() {
 }
 say() { printf '%4ds  %s\n' "$SECONDS" "$*"; }
 
+[[ $ONLY == @(|build) ]] || fail "compose.sh, or compose.sh build; not $*"
 docker info >/dev/null 2>&1 || fail "no Docker engine answers"
 if docker compose version >/dev/null 2>&1; then
   COMPOSE=(docker compose)
@@ -117,6 +120,7 @@ for profile in grafana llama vllm ollama postgres; do quietly compose --profile 
 say "Compose accepts the file with every profile"
 quietly compose build
 say "edge and simulator are built"
+[[ $ONLY != build ]] || exit 0
 
 # --- fly -------------------------------------------------------------------------------------------------------------
 # Returns when the edge is healthy and the simulator has started.
