@@ -40,8 +40,13 @@ Edge = Callable[..., httpx.Client]
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let an answer wait for a slow disk as long as necessary, unless a test sets another limit."""
+    """Let an answer wait for a slow disk as long as necessary, unless a test sets another limit.
+
+    So long an edge waits for the end of the process that writes its store, too. One that outlives its edge is a
+    ResourceWarning, and fails whatever test runs then.
+    """
     monkeypatch.setattr("service.edge.engine._STORE_S", PATIENCE_S)
+    monkeypatch.setattr("service.storage.process_writer._EXIT_S", PATIENCE_S)
 
 
 @pytest.fixture(autouse=True, scope="session")
