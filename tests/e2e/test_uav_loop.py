@@ -72,19 +72,16 @@ async def test_the_uav_flies_on_when_the_edge_dies() -> None:
     assert sum(leg.packets for leg in flown.legs[5:]) > 0
 
 
-@pytest.mark.long
-async def test_an_edge_that_forgot_the_mission_decides_on() -> None:
-    with (
-        serving_edge(AICVDS_MODE="policy", AICVDS_STORE="none") as (url, _),
-        EdgeClient(url, timeout_s=PATIENCE_S) as operator,
-    ):
+async def test_an_edge_that_forgot_the_mission_decides_on(edge: Edge) -> None:
+    url = str(edge(mode="policy").base_url)
+    with EdgeClient(url, timeout_s=PATIENCE_S) as operator:
 
         def forget(leg: Leg) -> None:
             if leg.step == 4:
                 operator.delete_mission("loop")
 
-        async with AsyncEdgeClient(url, timeout_s=PATIENCE_S) as edge:
-            flown = await loop(stub(), edge, on_leg=forget).fly()
+        async with AsyncEdgeClient(url, timeout_s=PATIENCE_S) as client:
+            flown = await loop(stub(), client, on_leg=forget).fly()
         status = operator.mission("loop")
     assert [leg.decided_by for leg in flown.legs] == ["policy"] * STEPS
     assert status.scenario == world(STEPS)

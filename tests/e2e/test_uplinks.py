@@ -21,7 +21,7 @@ from simulator.flying.pilots import Choice, EdgePilot
 from simulator.sites.site import Site
 from simulator.world import Observation
 from tests.conftest import Edge
-from tests.e2e.processes import output_until, run, serving_edge, started
+from tests.e2e.processes import output_until, run_here, serving_edge, started
 from tests.simulator.edge_stub import free_port
 from tests.waiting import PATIENCE_S, until
 
@@ -97,14 +97,13 @@ def test_delta_decides_as_full_to_the_bit_with_fewer_bytes(edge: Edge) -> None:
     assert mean_bytes(delta) < 0.5 * mean_bytes(full)
 
 
-@pytest.mark.long
-def test_delta_is_right_where_requests_and_answers_are_lost() -> None:
-    with serving_edge(AICVDS_MODE="value") as (url, _):
-        lossy = LossyTransport(Deaf(), drop=0.3, jitter_ms=2, seed=0)
-        full, delta = flown(url, "full", "full"), flown(url, "delta", "delta", lossy)
-        with EdgeClient(url, timeout_s=PATIENCE_S) as ground:
-            # What was sent again was decided once.
-            assert ground.mission("delta").decisions == len(delta.decisions)
+def test_delta_is_right_where_requests_and_answers_are_lost(edge: Edge) -> None:
+    url = str(edge().base_url)
+    lossy = LossyTransport(Deaf(), drop=0.3, jitter_ms=2, seed=0)
+    full, delta = flown(url, "full", "full"), flown(url, "delta", "delta", lossy)
+    with EdgeClient(url, timeout_s=PATIENCE_S) as ground:
+        # What was sent again was decided once.
+        assert ground.mission("delta").decisions == len(delta.decisions)
     assert max(d.attempts for d in delta.decisions) > 1
     assert decided(delta) == decided(full)
 
@@ -149,16 +148,15 @@ def test_pruned_reports_name_k_sensors_and_the_rest_is_known(edge: Edge) -> None
         assert {c.sensor_id for c in decision.top_k} <= set(body["sensors"]["id"])
 
 
-@pytest.mark.long
-def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot() -> None:
-    with serving_edge(AICVDS_MODE="value") as (url, _):
+def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot(edge: Edge) -> None:
+    url = str(edge().base_url)
 
-        def forget(flight: Flight) -> None:
-            if flight.steps_flown == 6:
-                httpx.delete(f"{url}/missions/pruned").raise_for_status()
-                httpx.put(f"{url}/missions/pruned", json={"mode": "value"}).raise_for_status()
+    def forget(flight: Flight) -> None:
+        if flight.steps_flown == 6:
+            httpx.delete(f"{url}/missions/pruned").raise_for_status()
+            httpx.put(f"{url}/missions/pruned", json={"mode": "value"}).raise_for_status()
 
-        flight = flown(url, "pruned", "pruned", on_step=forget)
+    flight = flown(url, "pruned", "pruned", on_step=forget)
     assert {d.source for d in flight.decisions} == {"value"}
     # The first UAV tells all, and where it is: the others' k sensors are known by that.
     again = [d for d in flight.decisions if d.step >= 1 and d.request_bytes > 900]
@@ -166,31 +164,20 @@ def test_pruned_reports_are_told_in_full_to_an_edge_that_forgot() -> None:
 
 
 @pytest.mark.long
-def test_simulate_tells_the_uplink_and_its_bytes(tmp_path: Path) -> None:
-    told = {}
-    with serving_edge(AICVDS_MODE="value") as (url, _):
-        for uplink in ("full", "delta", "pruned"):
-            out = tmp_path / uplink
-            done = run(
-                "simulate",
-                "--edge",
-                url,
-                "--steps",
-                "6",
-                "--deadline-ms",
-                "60000",
-                "--uplink",
-                uplink,
-                "--out",
-                str(out),
-            )
-            assert done.returncode == 0, done.stderr
-            assert f"Uplink {uplink}: " in done.stdout
-            told[uplink] = json.loads((out / "summary.json").read_text())
-            assert told[uplink]["uplink"] == uplink and f"uplink {uplink}" in (out / "report.html").read_text()
-            # In full, whatever was sent: it can be asked again.
-            lines = (out / "requests.jsonl").read_text().splitlines()[1:]
-            assert {len(json.loads(line)["sensors"]["x"]) for line in lines} == {10}
+def test_simulate_tells_the_uplink_and_its_bytes(edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Its figures for print are not looked at.
+    monkeypatch.setattr("simulator.reporting.figure_style.PaperFigure.write", lambda *_: [])
+    told, flight = {}, ("--edge", str(edge().base_url), "--steps", "6", "--deadline-ms", "60000")
+    for uplink in ("full", "delta", "pruned"):
+        out = tmp_path / uplink
+        done = run_here("simulate", *flight, "--uplink", uplink, "--out", str(out))
+        assert done.returncode == 0, done.stderr
+        assert f"Uplink {uplink}: " in done.stdout
+        told[uplink] = json.loads((out / "summary.json").read_text())
+        assert told[uplink]["uplink"] == uplink and f"uplink {uplink}" in (out / "report.html").read_text()
+        # In full, whatever was sent: it can be asked again.
+        lines = (out / "requests.jsonl").read_text().splitlines()[1:]
+        assert {len(json.loads(line)["sensors"]["x"]) for line in lines} == {10}
     sizes = {uplink: summary["uplink_bytes_mean"] for uplink, summary in told.items()}
     assert max(sizes["delta"], sizes["pruned"]) < 0.7 * sizes["full"]
     assert told["pruned"]["attention_bytes_mean"] > told["full"]["attention_bytes_mean"] == 0

@@ -1,4 +1,4 @@
-"""A world of one's own as a user flies it: the worked example, on board and against an edge that is a process."""
+"""A world of one's own as a user flies it: the worked example, on board and against an edge."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
 from simulator.records.decision_log import read_decisions
-from tests.e2e.processes import run, run_here, serving_edge
+from tests.conftest import Edge
+from tests.e2e.processes import run, run_here
+from tests.simulator.undrawn import reports_undrawn
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "pipeline_world"
 
@@ -30,25 +33,23 @@ def test_the_example_flown_on_board(tmp_path: Path) -> None:
     assert "pipeline_world" in report and "<svg" in report
 
 
-def flown_by_an_edge(mode: str, out: Path, *more: str, planner: str = "on") -> dict[str, Any]:
-    """The summary of a mission flown against an edge that has no LLM."""
-    with serving_edge(AICVDS_MODE=mode, AICVDS_LLM_GGUF="none", AICVDS_PLANNER=planner) as (url, _):
-        flown = run("simulate", "--world", str(EXAMPLE), "--edge", url, "--out", str(out), *more)
+def flown_by(edge: httpx.Client, out: Path, *more: str) -> dict[str, Any]:
+    """The summary of a mission flown against an edge; its report is not looked at."""
+    with reports_undrawn():
+        flown = run_here("simulate", "--world", str(EXAMPLE), "--edge", str(edge.base_url), "--out", str(out), *more)
     assert flown.returncode == 0, flown.stderr
     return summary_in(out)
 
 
-@pytest.mark.long
-def test_the_example_flown_by_the_edges_learned_values(tmp_path: Path) -> None:
-    summary = flown_by_an_edge("value", tmp_path, "--steps", "20")
+def test_the_example_flown_by_the_edges_learned_values(edge: Edge, tmp_path: Path) -> None:
+    summary = flown_by(edge(mode="value"), tmp_path, "--steps", "20")
     assert (summary["scenario"], summary["decisions"], summary["by_source"]["onboard"]) == ("pipeline_world", 60, 0)
     assert summary["by_source"]["value"] > 50
 
 
-@pytest.mark.long
-def test_the_example_flown_by_the_edges_look_ahead(tmp_path: Path) -> None:
+def test_the_example_flown_by_the_edges_look_ahead(edge: Edge, tmp_path: Path) -> None:
     """It looks ahead along the routes: fast as it flies, what it chooses is in reach where the UAV then is."""
-    summary = flown_by_an_edge("llm", tmp_path, planner="off")
+    summary = flown_by(edge(mode="llm", llm_gguf="none", planner="off"), tmp_path)
     assert summary["by_source"]["policy"] == summary["decisions"] == 180
     decisions = read_decisions(tmp_path / "decisions.jsonl")
     assert np.mean([d.velocity for d in decisions]) > 12
@@ -57,8 +58,8 @@ def test_the_example_flown_by_the_edges_look_ahead(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_example_flown_by_the_edges_planner(tmp_path: Path) -> None:
-    summary = flown_by_an_edge("policy", tmp_path, "--steps", "20")
+def test_the_example_flown_by_the_edges_planner(edge: Edge, tmp_path: Path) -> None:
+    summary = flown_by(edge(mode="policy"), tmp_path, "--steps", "20")
     assert summary["by_source"]["policy"] == summary["decisions"] == 60
     assert summary["failures"] <= 2
     assert summary["lost_packets"]["aic_vds"] < summary["lost_packets"]["eof"]
