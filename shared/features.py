@@ -151,7 +151,8 @@ def augment(
     queue, battery, rate = filled(sensors.queue), filled(sensors.battery), rates[ids]
     if belief is not None:
         heard = np.ones_like(heard)
-        queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], belief.rate[ids]
+        coming = belief.arrivals.coming(step, scenario.overflow_horizon_steps)
+        queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], coming[ids]
     overflow = overflow_probability(queue, rate, scenario)
     urgencies = urgency_of(queue, overflow, scenario)
     given_away = np.zeros(scenario.sensors, dtype=np.bool_)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
+from shared.fleetplan.arrivals import Arrivals
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
 from shared.learned_channel import normal_below
 from shared.reach import VELOCITY_BONUS
@@ -52,6 +53,8 @@ class RolloutState:
         unknown: shape ``(n,)``, whether the queue is unknown and is sampled as the world samples it.
         age: shape ``(n,)``, steps since the queue was known.
         arrived, watched: shape ``(n,)``, shape and rate of the Gamma belief of the packets a step.
+        dispersion: the variance of the packets of a step over a Poisson's.
+        bursts: shape ``(horizon, n)``, packets above the rate that are expected in each step.
         links: by UAV, shape ``(horizon x max_velocity + 1, n)``: the packets that the UAV can move over a link that
             holds, by the sum of its velocities so far.
         margins: by UAV, of the same shape: the link's path loss below the threshold, in standard deviations of its
@@ -74,6 +77,8 @@ class RolloutState:
     age: NDArray[np.int64]
     arrived: FloatArray
     watched: FloatArray
+    dispersion: float
+    bursts: FloatArray
     links: dict[int, FloatArray]
     margins: dict[int, FloatArray]
     alive: FloatArray
@@ -136,8 +141,12 @@ class RolloutState:
             queue=queue[sensors],
             unknown=unknown[sensors] & (belief.battery[sensors] > 0),
             age=age[sensors],
-            arrived=belief.arrived[sensors],
-            watched=belief.watched[sensors],
+            arrived=belief.arrivals.arrived[sensors],
+            watched=belief.arrivals.watched[sensors],
+            dispersion=belief.arrivals.dispersion,
+            bursts=np.diff(
+                belief.arrivals.burst(step)[sensors] * Arrivals.burst_over(np.arange(horizon + 1)[:, None]), axis=0
+            ),
             links={i: table[:, sensors] for i, table in links.items()},
             margins={i: table[:, sensors] for i, table in margins.items()},
             alive=belief.channel.failures.alive(sensors),
@@ -225,7 +234,12 @@ class _SampledFutures:
         rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
         drawn = random.uniform(scenario.initial_queue_min * capacity, capacity, shape)
         start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age)
-        arrivals = random.poisson(rates, (state.horizon, *shape)).astype(np.float64)
+        expected = rates
+        if state.dispersion > 1.0:
+            # A Poisson number of a Gamma mean has a variance above its mean.
+            spread = state.dispersion - 1.0
+            expected = random.gamma(np.maximum(rates + state.bursts[:, None], 1e-9) / spread, spread)
+        arrivals = random.poisson(expected, (state.horizon, *shape)).astype(np.float64)
         fades = np.where(random.uniform(size=shape) < state.alive, random.standard_normal(shape), np.inf)
         return cls(np.minimum(start, capacity), arrivals, fades)
 

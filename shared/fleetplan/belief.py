@@ -12,26 +12,18 @@ from numpy.typing import ArrayLike
 
 from shared.channel import FloatArray, IntArray, Links
 from shared.drift import Drift
+from shared.fleetplan.arrivals import Arrivals, Which
 from shared.learned_channel import ExpectedLinks, LearnedChannel
 from shared.radio_failures import GOOD_LINK_DB
 from shared.scenario import Point, Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
-# Sensors, by index.
-Which = slice | list[int]
 # A distance out of every reach.
 FAR_M = 1e9
-# A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
-_ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
 # A position further off the reported progress has an error, and the place on the trajectory counts, metres.
 _POSITION_ERROR_M = 0.01
-# The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least that is no
-# chance.
-_POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
-BURST_GOES_ON = 0.7
-# The arrays of a belief, and those that a state of an earlier version lacks.
-_NEWER_ARRAYS = ("recent", "recent_at")
-_ARRAYS = ("arrived", "watched", "base", "since", "heard", "battery", "places", "visited")
+# The arrays of a belief.
+_ARRAYS = ("base", "since", "heard", "battery", "places", "visited")
 
 
 @dataclass(slots=True)
@@ -74,20 +66,15 @@ class FleetBelief:
 
     A sensor never heard is assumed to have started with the mean of the scenario's initial queues.
 
-    The rate of each sensor has a Gamma prior with the mean and variance of the scenario's range (uniform). The arrivals
-    between successive beacons of queues that were not full update it.
-
     Attributes:
         places: shape ``(J, 2)``, metres; NaN for a sensor that no report has named.
         base: shape ``(J,)``, packets at the start of step ``since``, less the packets collected in that step.
         since: shape ``(J,)``, steps.
         heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
         battery: shape ``(J,)``, joules.
-        arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
-        recent: shape ``(J,)``, packets a step between the last two beacons that count, and the step of the later one is
-            ``recent_at``, -1 for none.
         visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
         uavs: by index, the UAVs that were ever located.
+        arrivals: learned from the beacons' queues.
         channel: learned from gains and outcomes.
         drift: learned from the UAVs' progress.
     """
@@ -97,12 +84,6 @@ class FleetBelief:
         self._scenario = scenario
         self._paths = trajectories(scenario)
         self._drawn_variance = ((1 - fewest) * capacity) ** 2 / 12
-        spread = (scenario.arrival_rate_max - scenario.arrival_rate_min) ** 2 / 12
-        mean = scenario.mean_arrival_rate
-        # A range without width makes the rate certain: its prior counts as very many steps. So does a rate of zero.
-        prior_steps = mean / max(spread, 1e-3) if mean > _ZERO_RATE else _CERTAIN_STEPS
-        self.arrived: FloatArray = np.full(count, mean * prior_steps)
-        self.watched: FloatArray = np.full(count, prior_steps)
         self.base: FloatArray = np.full(count, (1 + fewest) / 2 * capacity)
         self.since: IntArray = np.zeros(count, dtype=np.int64)
         self.heard: IntArray = np.full(count, -1)
@@ -110,16 +91,14 @@ class FleetBelief:
         self.places: FloatArray = np.full((count, 2), np.nan)
         self.visited: IntArray = np.full(count, -1)
         self.uavs: dict[int, Whereabouts] = {}
-        self.recent: FloatArray = np.zeros(count)
-        self.recent_at: IntArray = np.full(count, -1)
-        self._surprise, self._intervals = 0.0, 0
+        self.arrivals = Arrivals(scenario)
         self.channel = LearnedChannel(scenario)
         self.drift = Drift()
 
     @property
     def rate(self) -> FloatArray:
         """Expected packets a step, shape ``(J,)``."""
-        return self.arrived / self.watched
+        return self.arrivals.rate()
 
     @property
     def newest(self) -> int | None:
@@ -150,37 +129,10 @@ class FleetBelief:
         stayed = (self.visited[ids] == since) & (queue - base > expected + 4.0 * np.sqrt(expected) + 2.0)
         counted &= ~stayed
         came = np.maximum(queue - base, 0.0)
-        self._watch_bursts(ids[counted], came[counted], (beacon - since)[counted], beacon[counted])
-        self.arrived[ids] += np.where(counted, came, 0.0)
-        self.watched[ids] += np.where(counted, beacon - since, 0)
+        self.arrivals.take(ids[counted], came[counted], (beacon - since)[counted], beacon[counted])
         news = ids[newer]
         self.base[news], self.battery[news] = queue[newer], battery[newer]
         self.since[news] = self.heard[news] = beacon[newer]
-
-    def _watch_bursts(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
-        """Compare packets ``(n,)`` that came in so many steps, until these, with the rates that were believed."""
-        rate = self.rate[ids]
-        expected = rate * steps
-        variance = expected + np.square(steps) * rate / self.watched[ids]
-        self._surprise += float(np.sum(np.square(came - expected) / variance))
-        self._intervals += len(ids)
-        self.recent[ids], self.recent_at[ids] = came / steps, at
-
-    @property
-    def dispersion(self) -> float:
-        """The variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more."""
-        found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
-        return found if found > _LEAST_DISPERSION else 1.0
-
-    def burst(self, step: int) -> FloatArray:
-        """Packets above the rate that are still to come of the bursts seen, from this step on, ``(J,)``.
-
-        A burst lasts into the next step with the probability 0.7. Poisson arrivals have none.
-        """
-        if self.dispersion == 1.0:
-            return np.zeros(len(self.base))
-        above = np.where(self.recent_at >= 0, np.maximum(self.recent - self.rate, 0.0), 0.0)
-        return above * BURST_GOES_ON ** (np.maximum(step - self.recent_at, 0) + 1) / (1.0 - BURST_GOES_ON)
 
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
@@ -218,10 +170,11 @@ class FleetBelief:
             self.channel.failures.settle(visit.sensor, visit.failed)
         if not visit.failed and visit.since == visit.step and self.since[visit.sensor] == last.step:
             # The queue was known before and after: it tells what the link moved.
-            rate = float(self.rate[visit.sensor] + self.burst(visit.step)[visit.sensor] * (1.0 - BURST_GOES_ON))
+            soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(np.array(1))
+            rate = float((self.rate + soon)[visit.sensor])
             link = int(Links(distance[row[0]], np.asarray(-gain), self._scenario).packets)
             moved = visit.base + rate - float(self.base[visit.sensor])
-            self.channel.moved(moved, visit.base, link, slack=3.0 * math.sqrt(rate * self.dispersion) + 1.0)
+            self.channel.moved(moved, visit.base, link, slack=3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0)
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
@@ -296,7 +249,7 @@ class FleetBelief:
 
     def state_dict(self) -> dict[str, Any]:
         """The whole belief, as copies."""
-        arrays = {name: getattr(self, name).copy() for name in (*_ARRAYS, *_NEWER_ARRAYS)}
+        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
         uavs = {
             uav: [
                 *(u.step, list(u.position), u.progress_m, u.action),
@@ -304,19 +257,14 @@ class FleetBelief:
             ]
             for uav, u in self.uavs.items()
         }
-        bursts = [self._surprise, self._intervals]
-        return {
-            **arrays,
-            "uavs": uavs,
-            "bursts": bursts,
-            "channel": self.channel.state_dict(),
-            "drift": self.drift.state_dict(),
-        }
+        learned = {"channel": self.channel.state_dict(), "drift": self.drift.state_dict()}
+        return {**arrays, **self.arrivals.state_dict(), "uavs": uavs, **learned}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a belief. One of an earlier version has neither visits nor a channel."""
         for name in _ARRAYS:
             setattr(self, name, state[name])
+        self.arrivals.load_state_dict(state)
         self.uavs = {
             uav: Whereabouts(
                 step=step,
@@ -329,18 +277,17 @@ class FleetBelief:
             for uav, (step, (x, y), progress_m, action, *newer) in state["uavs"].items()
         }
         if "channel" in state:
-            for name in _NEWER_ARRAYS:
-                setattr(self, name, state[name])
-            self._surprise, self._intervals = state["bursts"]
             self.channel.load_state_dict(state["channel"])
             self.drift.load_state_dict(state["drift"])
 
     def queue(self, step: int, which: Which = slice(None)) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``which``."""
-        rate = self.arrived[which] / self.watched[which]
-        return np.minimum(
-            self.base[which] + rate * np.maximum(step - self.since[which], 0), float(self._scenario.queue_capacity)
-        )
+        rate = self.arrivals.rate(which)
+        came = rate * np.maximum(step - self.since[which], 0)
+        if self.arrivals.dispersion > 1.0:
+            since = np.minimum(self.since, step)
+            came = came + (self.arrivals.burst(since) - self.arrivals.burst(step))[which]
+        return np.minimum(self.base[which] + came, float(self._scenario.queue_capacity))
 
     def present(self, step: int) -> list[int]:
         """The UAVs located in this step or the one before."""

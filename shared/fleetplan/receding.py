@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import IntArray
-from shared.fleetplan.belief import BURST_GOES_ON, FAR_M, FleetBelief
+from shared.fleetplan.arrivals import Arrivals
+from shared.fleetplan.belief import FAR_M, FleetBelief
 from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import FleetProblem, price
 from shared.fleetplan.risk import neglect
@@ -202,16 +203,16 @@ class RecedingHorizon:
     def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
         """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
-        queue, rate, burst = belief.queue(step)[kept], belief.rate[kept], belief.burst(step)[kept]
+        queue, rate, burst = belief.queue(step)[kept], belief.rate[kept], belief.arrivals.burst(step)[kept]
         ahead = np.arange(horizon + 1)[:, None]
-        expected = np.rint(queue + ahead * rate + burst * (1.0 - BURST_GOES_ON**ahead)).astype(np.int64)
+        expected = np.rint(queue + ahead * rate + burst * Arrivals.burst_over(ahead)).astype(np.int64)
         risk = neglect(
             base=belief.base[kept] + burst,
             base_variance=belief.base_variance[kept],
             age=np.maximum(step - belief.since[kept], 0),
             rate=rate,
-            rate_variance=rate / belief.watched[kept],
-            dispersion=belief.dispersion,
+            rate_variance=rate / belief.arrivals.watched[kept],
+            dispersion=belief.arrivals.dispersion,
             capacity=world.queue_capacity,
             horizon=horizon,
             beyond=self._beyond(horizon),

@@ -158,4 +158,4 @@ def test_a_world_in_which_nothing_arrives_is_known_to_be_one(most: float) -> Non
     hear(fleet, [10.0, 58.0], [0, 0])
     np.testing.assert_allclose(fleet.rate, 0.0, atol=1e-12)
     np.testing.assert_allclose(fleet.queue(1_000_000), [10.0, 58.0])
-    assert np.isfinite(np.random.default_rng(0).gamma(fleet.arrived, 1.0 / fleet.watched)).all()
+    assert np.isfinite(np.random.default_rng(0).gamma(fleet.arrivals.arrived, 1.0 / fleet.arrivals.watched)).all()

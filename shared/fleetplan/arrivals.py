@@ -1,0 +1,101 @@
+"""The arrivals at the sensors as a fleet has seen them: rates, their uncertainty, and bursts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shared.channel import FloatArray, IntArray
+from shared.scenario import Scenario
+
+# Sensors, by index.
+Which = slice | list[int]
+# A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
+_ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
+# The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least dispersion that
+# is no chance.
+_POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
+# The probability that a burst lasts into the next step.
+_GOES_ON = 0.7
+_ARRAYS = ("arrived", "watched")
+_NEWER_ARRAYS = ("recent", "recent_at")
+
+
+class Arrivals:
+    """Each sensor's arrivals.
+
+    The rate of each sensor has a Gamma prior with the mean and variance of the scenario's range (uniform). The packets
+    that come between successive beacons of queues that are not full update it. If those vary more than a Poisson's
+    with these rates, arrivals come in bursts: a sensor that has just had more than its rate expects some more.
+
+    Attributes:
+        arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
+        recent: shape ``(J,)``, packets a step in the last interval, which ended in step ``recent_at``, -1 for none.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        count, mean = scenario.sensors, scenario.mean_arrival_rate
+        spread = (scenario.arrival_rate_max - scenario.arrival_rate_min) ** 2 / 12
+        # A range without width makes the rate certain: its prior counts as very many steps. So does a rate of zero.
+        prior_steps = mean / max(spread, 1e-3) if mean > _ZERO_RATE else _CERTAIN_STEPS
+        self.arrived: FloatArray = np.full(count, mean * prior_steps)
+        self.watched: FloatArray = np.full(count, prior_steps)
+        self.recent: FloatArray = np.zeros(count)
+        self.recent_at: IntArray = np.full(count, -1)
+        self._surprise, self._intervals = 0.0, 0
+
+    def rate(self, which: Which = slice(None)) -> FloatArray:
+        """Expected packets a step, shape ``(J,)``, or of the sensors ``which``."""
+        return np.asarray(self.arrived[which] / self.watched[which])
+
+    @property
+    def dispersion(self) -> float:
+        """The variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more."""
+        found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
+        return found if found > _LEAST_DISPERSION else 1.0
+
+    def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
+        """Take the packets ``(n,)`` that came to sensors ``(n,)`` in so many steps, until these steps."""
+        rate = self.arrived[ids] / self.watched[ids]
+        expected = rate * steps
+        variance = expected + np.square(steps) * rate / self.watched[ids]
+        self._surprise += float(np.sum(np.square(came - expected) / variance))
+        self._intervals += len(ids)
+        self.recent[ids], self.recent_at[ids] = came / steps, at
+        self.arrived[ids] += came
+        self.watched[ids] += steps
+
+    def burst(self, step: int | IntArray) -> FloatArray:
+        """Packets above the rate that are still to come of the bursts seen, from this step or steps on, ``(J,)``."""
+        if self.dispersion == 1.0:
+            return np.zeros(len(self.arrived))
+        above = np.where(self.recent_at >= 0, np.maximum(self.recent - self.rate(), 0.0), 0.0)
+        return np.asarray(above * _GOES_ON ** (np.maximum(step - self.recent_at, 0) + 1) / (1.0 - _GOES_ON))
+
+    def coming(self, step: int, horizon: float) -> FloatArray:
+        """Packets a step that are expected in the steps from this one to the horizon, ``(J,)``."""
+        if self.dispersion == 1.0:
+            return self.rate()
+        return self.rate() + self.burst(step) * float(self.burst_over(np.array(horizon))) / horizon
+
+    @staticmethod
+    def burst_over(steps: ArrayLike) -> FloatArray:
+        """The share of a burst's coming packets that come in the next steps ``(n,)``."""
+        return np.asarray(1.0 - _GOES_ON ** np.asarray(steps, dtype=np.float64))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The arrivals, as copies."""
+        arrays = {name: getattr(self, name).copy() for name in (*_ARRAYS, *_NEWER_ARRAYS)}
+        return {**arrays, "surprise": self._surprise, "intervals": self._intervals}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state; one of an earlier version knows rates alone."""
+        for name in _ARRAYS:
+            setattr(self, name, state[name])
+        if "surprise" in state:
+            for name in _NEWER_ARRAYS:
+                setattr(self, name, state[name])
+            self._surprise, self._intervals = state["surprise"], state["intervals"]
