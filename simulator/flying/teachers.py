@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.flying.true_problem import true_problem, velocities_towards
+from simulator.flying.true_problem import targets, true_problem, velocities_towards
 from simulator.policies.mpc import RecedingHorizon
 from simulator.world import Observation, PipelineWorld
 
@@ -104,8 +104,7 @@ class Clairvoyant:
             return actions
         # In wind no step but the first one is flown as planned.
         first = actions[:1].copy()
-        target = world.fleet.progress_m + first[0, :, 1] * world.scenario.step_s
-        first[0, :, 1] = velocities_towards(world, target)
+        first[0, :, 1] = velocities_towards(world, targets(world, first[0, :, 1]))
         return first
 
 

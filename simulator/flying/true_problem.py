@@ -24,12 +24,13 @@ def true_problem(world: PipelineWorld, steps: int | None = None) -> FleetProblem
     """The next steps, by default all that are left, from the world's present state.
 
     Where the world differs from the model, ``links`` has the packets of the true links; a UAV that has left has none.
-    In wind a plan's actions do not fly as far as it says; :func:`velocities_towards` has those that do.
+    In wind the links are those at the places that the mean wind lets a UAV reach; gusts are left out, and
+    :func:`velocities_towards` makes up for the next step's.
     """
     end = world.scenario.steps if steps is None else min(len(world.tally) + steps, world.scenario.steps)
     links = None
-    if world.differs:
-        links = _links(world, end, world.scenario.max_velocity, np.zeros(1))
+    if world.truth.differs:
+        links = _links(world, end, course(world, (end - len(world.tally)) * world.scenario.max_velocity + 1)[:, None])
     return _problem(world, end, world.scenario, links)
 
 
@@ -43,9 +44,27 @@ def relaxed_problem(world: PipelineWorld) -> FleetProblem:
     if not world.truth.wind.blows:
         return true_problem(world)
     fastest = _fastest(world)
-    around = np.linspace(-0.5, 0.5, math.ceil(world.scenario.step_s / _SPACING_M) + 1) * world.scenario.step_s
-    links = _links(world, world.scenario.steps, fastest, around)
+    sums = np.arange((world.scenario.steps - len(world.tally)) * fastest + 1)[:, None, None]
+    around = np.linspace(-0.5, 0.5, math.ceil(world.scenario.step_s / _SPACING_M) + 1)[:, None]
+    links = _links(world, world.scenario.steps, world.fleet.progress_m + (sums + around) * world.scenario.step_s)
     return _problem(world, world.scenario.steps, world.scenario.model_copy(update={"max_velocity": fastest}), links)
+
+
+def course(world: PipelineWorld, sums: int) -> FloatArray:
+    """The UAVs' progress after steps whose velocities sum to 0..sums - 1 in the mean wind, ``(sums, I)``, metres."""
+    fleet, wind, step_s = world.fleet, world.truth.wind, world.scenario.step_s
+    if not wind.blows:
+        return fleet.progress_m + np.arange(sums)[:, None] * step_s
+    reached = [fleet.progress_m]
+    for _ in range(sums - 1):
+        middle = reached[-1] + step_s / 2
+        reached.append(reached[-1] + step_s * wind.stretch(middle, fleet.trajectories))
+    return np.array(reached)
+
+
+def targets(world: PipelineWorld, velocity: IntArray) -> FloatArray:
+    """The progress that a plan's velocities ``(I,)`` in the next step aim at, ``(I,)``, metres."""
+    return np.asarray(course(world, world.scenario.max_velocity + 1)[velocity, np.arange(len(velocity))])
 
 
 def velocities_towards(world: PipelineWorld, progress_m: FloatArray) -> IntArray:
@@ -83,15 +102,13 @@ def _fastest(world: PipelineWorld) -> int:
     return math.ceil(scenario.max_velocity * min(max(stretch, 0.0), 2.0) - 1e-9)
 
 
-def _links(world: PipelineWorld, end: int, fastest: int, around: FloatArray) -> list[IntArray]:
-    """By UAV the packets of its links until a step, ``(1 or steps, C, J)``, after each number of ``step_s`` metres.
+def _links(world: PipelineWorld, end: int, progress: FloatArray) -> list[IntArray]:
+    """By UAV the packets of its links until a step, ``(1 or steps, C, J)``, at a progress ``(C, n, I)``, metres.
 
-    Each is the best of the links at the distances ``around`` it, metres.
+    Each is the best of the n links.
     """
     scenario, fleet, channel = world.scenario, world.fleet, world.truth.channel
     step, tables = len(world.tally), []
-    sums = (end - step) * fastest + 1
-    progress = fleet.progress_m + (np.arange(sums)[:, None, None] * scenario.step_s + around[:, None])
     position = fleet.at(progress)
     offset = position[..., None, :] - world.sensors.positions
     distance = np.hypot(offset[..., 0], offset[..., 1])

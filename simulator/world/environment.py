@@ -20,7 +20,6 @@ from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation_space import observation_space
 from simulator.world.sensors import Sensors, Streams
-from simulator.world.true_channel import mean_only
 from simulator.world.truth import Truth
 
 Cost = Literal["default", "paper"]
@@ -223,7 +222,8 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         position = self.fleet.positions
         observations = self._observe(position, self._links(position, 0))
         zeros = np.zeros(self.scenario.uavs, dtype=np.int64)
-        return observations, self._infos(zeros, zeros, zeros, zeros.astype(np.float64))
+        mask = _action_masks(self._beacons, self.scenario)
+        return observations, _infos(self.live, mask, zeros, zeros, zeros, zeros.astype(np.float64))
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -247,20 +247,13 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         if self.cost == "paper":
             cost = np.full(self.scenario.uavs, float(tally.events))
         observations = self._observe(position, links)
-        infos = self._infos(failed, moved, blamed, cost)
+        infos = _infos(self.live, _action_masks(self._beacons, self.scenario), failed, moved, blamed, cost)
         rewards = {agent: -infos[agent]["cost"] for agent in self.agents}
         over, present = len(self.tally) == self.scenario.steps, self.truth.faults.present(step + 1)
         terminations = {agent: not over and not bool(present[uav]) for agent, uav in self.live.items()}
         truncations = dict.fromkeys(self.agents, over)
         self.agents = [agent for agent, left in terminations.items() if not (over or left)]
         return observations, rewards, terminations, truncations, infos
-
-    @property
-    def differs(self) -> bool:
-        """Whether its links, its wind or its UAVs differ from what an edge plans with."""
-        channel, scenario = self.truth.channel, self.scenario
-        modelled = mean_only(scenario, self.gains) and not channel.changes
-        return not modelled or self.truth.wind.blows or scenario.departures > 0
 
     @property
     def live(self) -> dict[str, int]:
@@ -323,18 +316,26 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             for agent, uav in self.live.items()
         }
 
-    def _infos(self, failed: IntArray, moved: IntArray, blamed: IntArray, cost: FloatArray) -> dict[str, Info]:
-        mask = _action_masks(self._beacons, self.scenario)
-        return {
-            agent: Info(
-                action_mask=mask[uav].copy(),
-                failed=bool(failed[uav]),
-                collected=int(moved[uav]),
-                lost_packets=int(blamed[uav]),
-                cost=float(cost[uav]),
-            )
-            for agent, uav in self.live.items()
-        }
+
+def _infos(
+    live: Mapping[str, int],
+    mask: NDArray[np.int8],
+    failed: IntArray,
+    moved: IntArray,
+    blamed: IntArray,
+    cost: FloatArray,
+) -> dict[str, Info]:
+    """The info of every live agent from the numbers of all UAVs."""
+    return {
+        agent: Info(
+            action_mask=mask[uav].copy(),
+            failed=bool(failed[uav]),
+            collected=int(moved[uav]),
+            lost_packets=int(blamed[uav]),
+            cost=float(cost[uav]),
+        )
+        for agent, uav in live.items()
+    }
 
 
 def _action_masks(beacons: Beacons, scenario: Scenario) -> NDArray[np.int8]:

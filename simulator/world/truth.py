@@ -14,7 +14,7 @@ from simulator.world.faults import Faults
 from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Streams
 from simulator.world.step_noise import StepNoise
-from simulator.world.true_channel import TrueChannel
+from simulator.world.true_channel import TrueChannel, mean_only
 from simulator.world.wind import Wind
 
 # The largest error of a reported position on each axis, in standard deviations.
@@ -46,6 +46,13 @@ class Truth:
             Faults.stack([one.faults for one in truths]),
             StepNoise.stack([one.position_noise for one in truths]),
         )
+
+    @property
+    def differs(self) -> bool:
+        """Whether links, wind or the fleet differ from what an edge plans with."""
+        channel = self.channel
+        modelled = mean_only(channel.scenario, channel.trace) and not channel.changes
+        return not modelled or self.wind.blows or channel.scenario.departures > 0
 
     def reported(self, position: FloatArray, instant: int) -> FloatArray:
         """The positions that UAVs at ``(..., I, 2)`` report at an instant, metres."""

@@ -53,7 +53,14 @@ class Wind:
         if not self.blows:
             return still
         along = self.along_mps(progress_m + still / 2, paths) + self.gust_mps(instant, len(paths))
-        return np.asarray(still * np.clip(1.0 + along / self.scenario.max_velocity, 0.0, 2.0))
+        return np.asarray(still * self._stretch(along))
+
+    def stretch(self, progress_m: FloatArray, paths: Sequence[Trajectory]) -> FloatArray:
+        """What the mean wind makes of a metre of way at a progress ``(..., I)``, 0..2."""
+        return self._stretch(self.along_mps(progress_m, paths))
+
+    def _stretch(self, along_mps: FloatArray) -> FloatArray:
+        return np.asarray(np.clip(1.0 + along_mps / self.scenario.max_velocity, 0.0, 2.0))
 
     def gust_mps(self, instant: int, uavs: int) -> FloatArray:
         """Each UAV's gust along its way in the step that begins at an instant, ``(I,)`` or ``(B, I)``, m/s."""
