@@ -53,11 +53,16 @@ class Shadowing:
 
 # The likelihood of the measurements chooses between them. The first is the assumption before.
 KINDS = (
-    Shadowing(sensor=0.5, place=0.4, range_m=60.0),
+    Shadowing(sensor=0.4, place=0.4, range_m=60.0),
+    *(
+        Shadowing(sensor=sensor * (1 - fading), place=(1 - sensor) * (1 - fading), range_m=range_m)
+        for sensor in (0.2, 0.6)
+        for range_m in (50.0, 150.0)
+        for fading in (0.02, 0.2)
+    ),
+    # A sensor's own excess alone, and fading alone.
     Shadowing(sensor=0.996, place=0.002, range_m=60.0),
     Shadowing(sensor=0.9, place=0.08, range_m=60.0),
-    Shadowing(sensor=0.2, place=0.75, range_m=60.0),
-    Shadowing(sensor=0.2, place=0.75, range_m=200.0),
     Shadowing(sensor=0.4, place=0.2, range_m=60.0),
     Shadowing(sensor=0.05, place=0.05, range_m=60.0),
 )
