@@ -34,16 +34,18 @@ class Drift:
         """``w``, shape ``(2,)``: east and north, as a share of the commanded way."""
         return np.asarray(np.linalg.solve(self._normal, self._moment))
 
-    def learn(self, path: Trajectory, start_m: float, still_m: float, flown_m: float) -> None:
+    def learn(self, path: Trajectory, start_m: float, still_m: float, end_m: float) -> None:
         """Take one step of a UAV.
 
         Args:
             start_m: progress at its start, metres.
             still_m: the commanded way ``v dt``, metres.
-            flown_m: the way flown, metres.
+            end_m: progress at its end, metres.
         """
         if still_m <= 0:
             return
+        # A progress may begin anew with every lap.
+        flown_m = end_m - start_m + (path.length_m if end_m < start_m else 0.0)
         share = min(max(flown_m / still_m, 0.0), _FASTEST) - 1.0
         if self.none and abs(share) <= _NOTHING:
             return
@@ -51,6 +53,10 @@ class Drift:
         heading = _headings(path, np.array([start_m + still_m / 2]))[0]
         self._normal = _KEPT * self._normal + (1 - _KEPT) * np.eye(2) * _PRIOR_STEPS + np.outer(heading, heading)
         self._moment = _KEPT * self._moment + heading * share
+
+    def flown_step(self, path: Trajectory, start_m: float, still_m: float) -> float:
+        """The metres flown for one commanded way."""
+        return still_m if self.none else float(self.flown(path, start_m, np.array([still_m]))[0])
 
     def flown(self, path: Trajectory, start_m: float, still_m: FloatArray) -> FloatArray:
         """The metres flown, shape ``(n,)``, for commanded ways ``(n,)`` from a progress on."""

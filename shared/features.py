@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,16 +65,14 @@ class State:
         if self.reach is not None:
             return self.reach
         ahead = places_ahead(uav_id, self.position, self.progress_m, scenario, self.drift)
-        links = self.links(ahead, distances_between(ahead, self.places), np.arange(len(self.ids)), scenario)
+        links = _links(self.channel, ahead, distances_between(ahead, self.places), self.ids, scenario)
         return Reach.of(links, np.where(self.able, self.queue, 0.0), self.urgency)
 
     def links(
         self, places: FloatArray, distance: FloatArray, rows: NDArray[np.int64], scenario: Scenario
     ) -> ExpectedLinks:
         """The expected links from the UAV's places ``(P, 2)`` to the sensors in n rows, at distances ``(P, n)``."""
-        if self.channel is None:
-            return ExpectedLinks.by_formula(distance, scenario)
-        return self.channel.links(places, distance, self.ids[rows])
+        return _links(self.channel, places, distance, self.ids[rows], scenario)
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """Attention's input for the n admissible sensors, ``(n, d)``, each number 0..1.
@@ -162,7 +160,12 @@ def augment(
         expected = channel_gain_db(distance, scenario)
     else:
         expected = channel.gain_db(np.asarray(position), distance, ids)
-    state = State(
+    reach, drift = None, None if belief is None else belief.drift
+    if preset == "reach":
+        ahead = places_ahead(uav.uav_id, position, uav.progress_m, scenario, drift)
+        links = _links(channel, ahead, distances_between(ahead, places), ids, scenario)
+        reach = Reach.of(links, np.where(heard & (battery > 0), queue, 0.0), urgencies)
+    return State(
         position=position,
         progress_m=uav.progress_m,
         places=places,
@@ -178,9 +181,17 @@ def augment(
         urgency=urgencies,
         distance=distance,
         channel=channel,
-        drift=None if belief is None else belief.drift,
+        drift=drift,
+        reach=reach,
     )
-    return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
+
+
+def _links(
+    channel: LearnedChannel | None, places: FloatArray, distance: FloatArray, ids: NDArray[np.int64], scenario: Scenario
+) -> ExpectedLinks:
+    if channel is None:
+        return ExpectedLinks.by_formula(distance, scenario)
+    return channel.links(places, distance, ids)
 
 
 def filled(column: Sequence[float | None], missing: float = 0.0) -> FloatArray:

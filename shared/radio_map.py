@@ -134,10 +134,11 @@ class RadioMap:
         """
         if not len(ids):
             return
-        excess = np.clip(excess_db, -LARGEST_EXCESS_DB, LARGEST_EXCESS_DB)
+        # For a few numbers np.clip takes several times as long.
+        excess = np.minimum(np.maximum(excess_db, -LARGEST_EXCESS_DB), LARGEST_EXCESS_DB)
         self.heard += len(ids)
         here = np.asarray(place, dtype=np.float64)
-        noise = np.ones(len(ids))
+        noise: FloatArray | float = 1.0
         if self._exact and np.abs(excess).max() > _EXACT_DB:
             self._exact = False
             self._factor(np.arange(len(self.count)))
@@ -146,9 +147,10 @@ class RadioMap:
             off = np.abs(excess - mean[0]) / np.maximum(deviation[0], _HUBER_LEAST_DB)
             noise = np.square(np.maximum(off / _HUBER, 1.0))
         # A full record drops the measurement nearest to the new one, which tells the most of what that one told.
-        full = self.count[ids] == self.excess.shape[1]
-        apart = np.square(self.places[ids] - here).sum(axis=2)
-        slot = np.where(full, apart.argmin(axis=1), np.minimum(self.count[ids], self.excess.shape[1] - 1))
+        slot = self.count[ids]
+        full = slot == self.excess.shape[1]
+        if full.any():
+            slot = np.where(full, np.square(self.places[ids] - here).sum(axis=2).argmin(axis=1), slot)
         self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
         self.count[ids] += ~full
         if self._exact:

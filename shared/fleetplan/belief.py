@@ -138,14 +138,14 @@ class FleetBelief:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
         here = (float(position[0]), float(position[1]))
         visit = self.uavs[uav].visit if uav in self.uavs else None
-        progress = progress_of(self._paths[uav], here, reported_m)
+        path = self._paths[uav]
+        progress = progress_of(path, here, reported_m)
         if reported_m is not None and progress == reported_m:
-            x, y = self._paths[uav].at(reported_m)
+            x, y = path.at(reported_m).tolist()
             if math.hypot(x - here[0], y - here[1]) > _POSITION_ERROR_M:
-                here = float(x), float(y)
+                here = x, y
             if visit is not None and visit.step == step - 1 and visit.start_m is not None:
-                still = visit.velocity * self._scenario.step_s
-                self.drift.learn(self._paths[uav], visit.start_m, still, reported_m - visit.start_m)
+                self.drift.learn(path, visit.start_m, visit.velocity * self._scenario.step_s, reported_m)
         self.uavs[uav] = Whereabouts(step, here, progress, visit=visit)
 
     def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
@@ -156,14 +156,18 @@ class FleetBelief:
         """
         last = self.uavs[uav]
         place = np.asarray(last.position)
-        distance = np.hypot(*(self.places[ids] - place).T)
+        offset = self.places[ids] - place
+        distance = np.hypot(offset[:, 0], offset[:, 1])
         near = distance <= self._scenario.radio_radius_m
         self.channel.measure(ids[near], place, distance[near], gain_db[near])
         visit = last.visit
         if visit is None or visit.failed is None or visit.step != last.step - 1:
             return
         row = np.flatnonzero(near & (ids == visit.sensor))
-        if not len(row) or self.battery[visit.sensor] <= 0:
+        others = (other.visit for index, other in self.uavs.items() if index != uav)
+        contested = any(o is not None and (o.sensor, o.step) == (visit.sensor, visit.step) for o in others)
+        # A sensor serves one UAV in a step, and a flat battery sends nothing, whatever the radio does.
+        if not len(row) or contested or self.battery[visit.sensor] <= 0:
             return
         gain = float(gain_db[row[0]])
         if gain > GOOD_LINK_DB - self._scenario.path_loss_limit_db:
@@ -215,8 +219,9 @@ class FleetBelief:
         sensor, velocity = last.action or (0, 0)
         start = last.progress_m
         if last.progress_m is not None:
-            still = np.array([velocity * self._scenario.step_s])
-            last.progress_m += float(self.drift.flown(self._paths[uav], last.progress_m, still)[0])
+            last.progress_m += self.drift.flown_step(
+                self._paths[uav], last.progress_m, velocity * self._scenario.step_s
+            )
             x, y = self._paths[uav].at(last.progress_m)
             last.position = float(x), float(y)
         base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])

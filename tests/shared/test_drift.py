@@ -24,7 +24,7 @@ def learned(wind: tuple[float, float], steps: int = 20) -> Drift:
     drift, progress = Drift(), 100.0
     for _ in range(steps):
         way = flown_in(wind, progress, 140.0)
-        drift.learn(LAP, progress, 140.0, way)
+        drift.learn(LAP, progress, 140.0, progress + way)
         progress += way
     return drift
 
