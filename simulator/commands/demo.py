@@ -6,13 +6,15 @@ import os
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.console import Console
+from tyro.conf import FlagCreatePairsOff
 
 from simulator.cli.options import check_between, check_seed, check_wait, chosen_site
 from simulator.cli.running import command_main
 from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
-from simulator.flying.run import Job, conduct, new_mission_id
+from simulator.flying.run import BOUND_S, Job, conduct, new_mission_id
 from simulator.records.run_folder import fresh_folder, refuse_old_result
 
 EDGE_LOG = "edge.log"
@@ -44,6 +46,8 @@ class Demo:
     """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
     wait_s: float = 300.0
     """Seconds that the edge may take to start and to load its LLM."""
+    bound: Annotated[bool, FlagCreatePairsOff] = True
+    """Leave out the search, of at most 10 s after the flight, for the fewest packets that any fleet could have lost."""
 
 
 def main(argv: list[str]) -> int:
@@ -75,6 +79,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         command=command,
         edge=f"http://{HOST}:{port}",
         wait_s=options.wait_s,
+        bound_s=BOUND_S if options.bound else 0.0,
     )
     log = options.out / EDGE_LOG
     # A store of its own, apart from that of another edge on this machine.

@@ -15,7 +15,7 @@ from shared.wire import Mode, Uplink
 from simulator.cli.options import check_between, check_deadline, check_seed, check_wait, checked_edge, chosen_site
 from simulator.cli.running import INTERRUPTED, command_main
 from simulator.errors import UsageError
-from simulator.flying.run import Job, conduct, new_mission_id
+from simulator.flying.run import BOUND_S, Job, conduct, new_mission_id
 from simulator.records.run_folder import refuse_old_result
 
 
@@ -86,6 +86,8 @@ class Simulate:
     """Seconds to wait during the flight for a lost edge and its LLM, in all per outage, 0 to 3600; 0 never waits."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder to write to, made if missing. Default: runs/ and the mission's ID, such as runs/paper-0-1f6c09ab."""
+    bound: Annotated[bool, FlagCreatePairsOff] = True
+    """Leave out the search, of at most 10 s after the flight, for the fewest packets that any fleet could have lost."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
     """Overwrite an earlier mission's result."""
     metrics_port: Annotated[int, arg(metavar="0-65535")] = 0
@@ -127,6 +129,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         wait_s=options.wait_s,
         wait_out=("loading", "unavailable") if options.await_llm == "on" else ("loading",),
         reconnect_s=options.reconnect_s,
+        bound_s=BOUND_S if options.bound else 0.0,
     )
     refuse_old_result(job.out, options.overwrite)
     metrics = FlightMetrics(site.scenario.steps)

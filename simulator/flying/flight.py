@@ -168,6 +168,7 @@ def exchange_fields(exchange: Exchange | None) -> dict[str, Any]:
         "model": answer.model,
         "decision_id": answer.decision_id,
         "top_k": answer.top_k,
+        "trust": {} if answer.guided is None else answer.guided.trust,
         "tokens": answer.tokens,
         "latency_ms": answer.latency_ms,
         "deadline_ms": answer.deadline_ms,

@@ -24,7 +24,7 @@ from simulator.client.lossy_transport import LossyTransport
 from simulator.records.decision_log import DecisionLog
 from simulator.records.request_log import RequestLog, resolved
 from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, fresh_folder, naming_out
-from simulator.records.summary import BySource, sources_text, summarise
+from simulator.records.summary import BySource, Summary, sources_text, summarise
 from simulator.sites.site import Site
 
 # The world and matplotlib take a second to import; `--help` and usage errors do without them.
@@ -39,6 +39,8 @@ DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
 # The timeout of a readiness probe during an outage, short beside the wait for the edge.
 PROBE_TIMEOUT_S = 2.0
+# Seconds of search for the bound on a mission's losses. Scenario `paper` takes about one.
+BOUND_S = 10.0
 
 
 def new_mission_id(scenario: Scenario, seed: int) -> str:
@@ -51,7 +53,8 @@ class Job:
     """One mission to conduct.
 
     ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. Before take-off the mission waits,
-    at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``.
+    at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses
+    is searched for ``bound_s`` seconds at most; 0 searches none.
     """
 
     site: Site
@@ -67,6 +70,7 @@ class Job:
     wait_s: float = 120.0
     wait_out: tuple[str, ...] = ("loading",)
     reconnect_s: float = 0.0
+    bound_s: float = BOUND_S
 
 
 def conduct(
@@ -223,6 +227,18 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
     return flight
 
 
+def _bounded(job: Job, flight: Flight, summary: Summary, console: Console) -> Summary:
+    """The summary with the bound on the losses, unless none is wanted."""
+    if not job.bound_s:
+        return summary
+    from simulator.flying.mission_bound import mission_bound
+
+    with console.status("Searching for the least that could have been lost"):
+        bound = mission_bound(job.site, job.seed, flight.steps_flown, job.bound_s)
+    known = {"bound_missing": bound} if isinstance(bound, str) else {"bound": bound}
+    return summary.model_copy(update=known)
+
+
 def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, console: Console) -> int:
     from simulator.flying.rollout import baselines
 
@@ -239,7 +255,7 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
         deadline_ms=job.deadline_ms,
         command=job.command,
     )
-    summary = summarise(facts, flight.decisions, tallies)
+    summary = _bounded(job, flight, summarise(facts, flight.decisions, tallies), console)
     with console.status("Drawing the report"), naming_out(job.out):
         (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
         from simulator.reporting.html_report import write_report

@@ -17,7 +17,8 @@ class Decision(Record):
     ``position`` is the UAV's position at the decision, metres. ``source`` is ``onboard`` for a decision of the UAV
     itself; then ``decision_id``, ``tokens``, ``deadline_ms`` and ``rtt_ms`` are ``null``, and ``attempts``,
     ``request_bytes``, ``response_bytes`` and ``attention_bytes`` are 0. ``rtt_ms`` includes retries. ``lost_packets``
-    and ``cost`` are this UAV's share.
+    and ``cost`` are this UAV's share. ``trust`` is the weight of each adviser before a decision of mode ``guided``;
+    the weights sum to 1.
     """
 
     step: int
@@ -30,6 +31,7 @@ class Decision(Record):
     model: str | None = None
     decision_id: str | None = None
     top_k: list[Candidate] = []
+    trust: dict[str, float] = {}
     tokens: Tokens | None = None
     latency_ms: dict[str, float] = {}
     deadline_ms: int | None = None

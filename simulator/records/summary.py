@@ -57,6 +57,18 @@ class RoundTrips(Record):
     p99: float | None = None
 
 
+class LossBound(Record):
+    """The least that any fleet could have lost in the flown world, found with all arrivals known beforehand.
+
+    No flight loses fewer packets than ``lower_bound``. The best flight found loses ``best_flight``; where the two are
+    equal, it is proven to be the best. ``seconds`` is the time of the search.
+    """
+
+    lower_bound: int
+    best_flight: int
+    seconds: float
+
+
 class FlightFacts(Record):
     """The facts of a mission beyond its decisions.
 
@@ -93,7 +105,8 @@ class Summary(FlightFacts):
     ms. ``jain`` is Jain's index of the sensors' successful visits, ``null`` without any. ``failures`` are failed
     transmissions. ``llm_asked`` counts decisions for which the LLM was queried, with a usable answer or not.
     ``uplink_bytes_mean`` is the mean size of a request, ``attention_bytes_mean`` the mean size of the attention weights
-    that a UAV fetched for its decision.
+    that a UAV fetched for its decision. ``trust`` is the mean weight of each adviser over the decisions of source
+    ``guided``. ``bound`` is ``null`` where ``bound_missing`` says why.
     """
 
     decisions: int
@@ -109,6 +122,9 @@ class Summary(FlightFacts):
     attention_bytes_mean: float | None = None
     jain: float | None
     llm_asked: int = 0
+    trust: dict[str, float] = {}
+    bound: LossBound | None = None
+    bound_missing: str | None = None
 
 
 class Tally(Protocol):
@@ -146,6 +162,7 @@ def summarise(flown: FlightFacts, decisions: Sequence[Decision], tallies: Mappin
         attention_bytes_mean=mean([d.attention_bytes for d in from_edge]),
         jain=jain_index(visits_per_sensor(decisions, flown.sensors)),
         llm_asked=sum(queried_llm(d) for d in decisions),
+        trust=_mean_trust([d.trust for d in decisions if d.source == "guided" and d.trust]),
     )
 
 
@@ -153,6 +170,13 @@ def round_trips(decisions: Iterable[Decision]) -> RoundTrips:
     """The percentiles over the edge's decisions."""
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
     return RoundTrips(p50=percentile(trips, 50), p99=percentile(trips, 99))
+
+
+def _mean_trust(weights: list[dict[str, float]]) -> dict[str, float]:
+    """The mean weight of each adviser, the largest first."""
+    names = dict.fromkeys(name for one in weights for name in one)
+    means = {name: sum(one.get(name, 0.0) for one in weights) / len(weights) for name in names}
+    return dict(sorted(means.items(), key=lambda item: -item[1]))
 
 
 def _is_late(decision: Decision) -> bool:

@@ -43,6 +43,8 @@ _UNDATED: dict[str, dict[str, Any]] = {
     "svg": {"Date": None, "Creator": None},
     "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
+# Colours of the page's theme, in place of those that are right on white paper only.
+_THEMED = {"#ffffff": "var(--card)", "#000000": "var(--ink)", "#222222": "var(--ink)", "#dddddd": "var(--line)"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,10 @@ def _inline_svg(figure: Figure, name: str, width_in: float) -> str:
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
     svg = re.sub(r'href="#', f'href="#{name}-', svg)
     svg = re.sub(r"url\(#", f"url(#{name}-", svg)
+    for on_paper, themed in _THEMED.items():
+        svg = svg.replace(f": {on_paper}", f": {themed}")
     # Its share of the page's width, so that letters have the same size in all figures.
-    share = f'style="max-width: {100 * width_in / DOUBLE_IN:.0f}%"'
+    width = "double" if width_in == DOUBLE_IN else "single"
+    share = f'class="{width}" style="max-width: {100 * width_in / DOUBLE_IN:.0f}%"'
     svg = re.sub(r'width="[\d.]+pt" height="[\d.]+pt"', share, svg, count=1)
     return svg.replace("<svg", f'<svg role="img" aria-labelledby="{name}-caption"', 1)

@@ -16,14 +16,15 @@ from simulator.records.run_folder import FIGURES
 from simulator.records.summary import Summary, Tally
 from simulator.reporting import figures
 from simulator.reporting.figure_style import PaperFigure
-from simulator.reporting.wording import llm_notice, number, policy_labels, verdict
+from simulator.reporting.wording import ADVISERS, bound_text, llm_notice, number, percent, policy_labels, verdict
 
 COSTLIEST_DECISIONS = 15
 
 
 def costliest(decisions: Sequence[Decision]) -> list[Decision]:
-    """The decisions with the highest cost; of equals the earlier one first."""
-    return sorted(decisions, key=lambda d: (-d.cost, d.step, d.uav_id))[:COSTLIEST_DECISIONS]
+    """The decisions with the highest cost above 0; of equals the earlier one first."""
+    costly = [d for d in decisions if d.cost > 0]
+    return sorted(costly, key=lambda d: (-d.cost, d.step, d.uav_id))[:COSTLIEST_DECISIONS]
 
 
 def drawings(
@@ -62,12 +63,15 @@ def render_report(
     pages = Environment(loader=PackageLoader("simulator.reporting", "."), autoescape=True, undefined=StrictUndefined)
     pages.trim_blocks = pages.lstrip_blocks = True
     pages.filters["number"] = number
+    pages.filters["percent"] = percent
     labels = policy_labels(summary)
     return pages.get_template("report.html.j2").render(
         s=summary,
         ours=next(iter(summary.lost_packets)),
         labels=labels,
         verdict=verdict(summary),
+        bound=bound_text(summary),
+        advisers={name: ADVISERS.get(name, name) for name in summary.trust},
         notice=llm_notice(summary),
         sources=summary.by_source.present(),
         scenario=scenario,

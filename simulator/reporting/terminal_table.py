@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
-from simulator.records.summary import Summary, sources_text
-from simulator.reporting.wording import llm_notice, policy_labels
+from simulator.records.summary import Summary
+from simulator.reporting.wording import bound_text, deciders_text, llm_notice, policy_labels
 
 
 def show(summary: Summary, console: Console) -> None:
@@ -21,9 +21,13 @@ def show(summary: Summary, console: Console) -> None:
         table.add_row(labels[name], f"{lost:,}", f"{summary.loss_events[name]:,}")
     console.print(table)
     if (notice := llm_notice(summary)) is not None:
-        console.print(notice, style="yellow", markup=False, highlight=False, soft_wrap=True)
+        console.print(
+            notice, style="yellow" if summary.mode == "llm" else None, markup=False, highlight=False, soft_wrap=True
+        )
+    if (bound := bound_text(summary)) is not None:
+        console.print(bound, markup=False, highlight=False, soft_wrap=True)
     if summary.policy == "edge":
-        console.print(f"{summary.decisions} decisions: {sources_text(summary.by_source)}")
+        console.print(f"{summary.decisions} decisions: {deciders_text(summary)}", markup=False)
     tokens, trips = summary.tokens, summary.rtt_ms
     if trips.p50 is not None:
         console.print(f"Round trip: median {trips.p50:.0f} ms, 99th percentile {trips.p99:.0f} ms")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from simulator.records.summary import Summary, sources_text
+from simulator.records.summary import Summary
 
-# The share of LLM decisions from which a mission counts as a result of the LLM.
+# The share of LLM decisions from which a mission of mode `llm` counts as a result of the LLM.
 LLM_SHARE = 0.9
 NAMES = {
     "aic_vds": "AIC-VDS",
@@ -15,34 +15,62 @@ NAMES = {
     "max_gain": "maximum channel gain",
     "nearest": "nearest neighbour",
 }
+ADVISERS = {"llm": "LLM", "planner": "planner", "value": "learned values", "policy": "look-ahead"}
+
+
+def deciders_text(summary: Summary) -> str:
+    """The sources of the decisions, and the adviser that weighed most: ``87 guided (planner 97%), 3 policy``."""
+    leading = next(iter(summary.trust.items()), None)
+    weight = "" if leading is None else f" ({ADVISERS.get(leading[0], leading[0])} {percent(leading[1])})"
+    counts = summary.by_source.present().items()
+    return ", ".join(f"{count} {name}{weight if name == 'guided' else ''}" for name, count in counts) or "none"
 
 
 def policy_labels(summary: Summary) -> dict[str, str]:
     """The policies' display names; the edge's includes the sources of its decisions."""
-    flown = {"aic_vds": f"AIC-VDS ({sources_text(summary.by_source)})"} if summary.decisions else {}
+    flown = {"aic_vds": f"AIC-VDS: {deciders_text(summary)}"} if summary.decisions else {}
     return {**dict(zip(summary.lost_packets, summary.lost_packets, strict=True)), **NAMES, **flown}
 
 
 def llm_notice(summary: Summary) -> str | None:
-    """A warning if the mission's mode uses the LLM and too few decisions are the LLM's, else ``None``."""
-    by = summary.by_source
-    uses_llm = summary.mode in ("llm", "guided")
-    if not uses_llm or summary.policy != "edge" or by.llm + by.guided >= LLM_SHARE * summary.decisions:
+    """The LLM's part in a mission whose mode uses it; ``None`` where nothing is to be said of it."""
+    if summary.policy != "edge" or not summary.decisions:
         return None
+    if summary.mode == "guided":
+        return _guided_notice(summary)
+    by = summary.by_source
+    if summary.mode != "llm" or by.llm >= LLM_SHARE * summary.decisions:
+        return None
+    return (
+        f"The LLM took {by.llm} of {summary.decisions} decisions; {_others(summary)}, "
+        "so this is not a result of the LLM."
+    )
+
+
+def _guided_notice(summary: Summary) -> str:
+    by = summary.by_source
+    if not by.guided:
+        return f"The LLM took part in none of the {summary.decisions} decisions: {_others(summary)}."
+    weights = ", ".join(f"{ADVISERS.get(name, name)} {percent(weight)}" for name, weight in summary.trust.items())
+    weighed = f" Mean weight of each adviser: {weights}." if weights else ""
+    rest = "" if by.guided == summary.decisions else f" The others: {_others(summary)}."
+    return f"The LLM was one of several advisers in {by.guided} of {summary.decisions} decisions.{weighed}{rest}"
+
+
+def _others(summary: Summary) -> str:
+    """The decisions without the LLM, by decider, and their reasons."""
+    by = summary.by_source
     owners = [
-        f"{owner} {count}"
+        f"{count} by {owner}"
         for owner, count in (
-            ("the edge's LLM-free policy's", by.policy),
-            ("its learned values'", by.value),
-            ("the UAVs' own", by.onboard),
+            ("the edge's LLM-free policy", by.policy),
+            ("its learned values", by.value),
+            ("the UAVs themselves", by.onboard),
         )
         if count
     ]
     reasons = ", ".join(f"{reason} {count}" for reason, count in summary.by_reason.items())
-    return (
-        f"The LLM took {by.llm + by.guided} of {summary.decisions} decisions; the rest are {' and '.join(owners)} "
-        f"(reasons: {reasons or 'none given'}), so this is not a result of the LLM."
-    )
+    return f"{' and '.join(owners)} (reasons: {reasons or 'none given'})"
 
 
 def verdict(summary: Summary) -> str:
@@ -50,9 +78,9 @@ def verdict(summary: Summary) -> str:
     if not summary.steps_flown:
         return "Nothing was flown, so there is nothing to compare."
     name, *others = summary.lost_packets
-    labels = policy_labels(summary)
+    labels = {**dict(zip(summary.lost_packets, summary.lost_packets, strict=True)), **NAMES}
     lost, rivals = summary.lost_packets[name], [summary.lost_packets[other] for other in others]
-    outcome = f"In this one example {labels[name]} lost {lost:,} packets"
+    outcome = f"In this one example {labels[name]} lost {_packets(lost)}"
     if not rivals:
         return f"{outcome}."
     against = " and ".join(f"{labels[other]}'s {summary.lost_packets[other]:,}" for other in others)
@@ -65,6 +93,32 @@ def verdict(summary: Summary) -> str:
     else:
         rank = "as many as the best of them" if lost == min(rivals) else "neither the fewest nor the most"
     return f"{outcome} against {against}: {rank}."
+
+
+def bound_text(summary: Summary) -> str | None:
+    """What no flight in this world can undercut, and what this mission lost; ``None`` where no bound was wanted."""
+    if summary.bound is None:
+        return (
+            None if summary.bound_missing is None else f"The least possible loss is unknown: {summary.bound_missing}."
+        )
+    lost, least, best = next(iter(summary.lost_packets.values())), summary.bound.lower_bound, summary.bound.best_flight
+    said = f"Nobody can lose fewer than {_packets(least)} in this world; this mission lost {lost:,}."
+    if best > least:
+        said += f" A search that knows all arrivals found a flight that loses {best:,}."
+    return said
+
+
+def _packets(count: int) -> str:
+    return f"{count:,} packet{'' if count == 1 else 's'}"
+
+
+def percent(share: float) -> str:
+    """A share as a whole percentage; one that is neither 0 nor 1 is not rounded to them."""
+    if 0 < share < 0.005:
+        return "<1%"
+    if 0.995 <= share < 1:
+        return ">99%"
+    return f"{100 * share:.0f}%"
 
 
 def number(value: float | None, digits: int = 1) -> str:

@@ -14,7 +14,9 @@ pytestmark = pytest.mark.long
 def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
     # The deadline is generous because this tests what is decided, not how fast the machine is.
     with serving_edge(AICVDS_MODE="llm", AICVDS_DEADLINE_MS="30000") as (url, _):
-        flown = run("simulate", "--edge", url, "--steps", "4", "--seed", "2", "--out", str(tmp_path / "out"))
+        flown = run(
+            "simulate", "--edge", url, "--steps", "4", "--seed", "2", "--no-bound", "--out", str(tmp_path / "out")
+        )
         options = ("--top-k", "3", "--demonstrations", "2", "--selection", "similar", "--out", str(tmp_path / "again"))
         again = run("replay", str(tmp_path / "out"), "--edge", url, *options)
     assert flown.returncode == 0, flown.stderr

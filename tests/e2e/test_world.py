@@ -24,7 +24,7 @@ def summary_in(out: Path) -> dict[str, Any]:
 
 
 def test_the_example_flown_on_board(tmp_path: Path) -> None:
-    flown = run("simulate", "--world", str(EXAMPLE), "--policy", "eof", "--out", str(tmp_path))
+    flown = run("simulate", "--world", str(EXAMPLE), "--policy", "eof", "--no-bound", "--out", str(tmp_path))
     assert (flown.returncode, flown.stderr) == (0, "")
     summary = summary_in(tmp_path)
     assert [summary[key] for key in ("scenario", "steps", "sensors", "uavs")] == ["pipeline_world", 60, 14, 3]
@@ -36,7 +36,9 @@ def test_the_example_flown_on_board(tmp_path: Path) -> None:
 def flown_by(edge: httpx.Client, out: Path, *more: str) -> dict[str, Any]:
     """The summary of a mission flown against an edge; its report is not looked at."""
     with reports_undrawn():
-        flown = run_here("simulate", "--world", str(EXAMPLE), "--edge", str(edge.base_url), "--out", str(out), *more)
+        flown = run_here(
+            *("simulate", "--world", str(EXAMPLE), "--edge", str(edge.base_url)), "--no-bound", "--out", str(out), *more
+        )
     assert flown.returncode == 0, flown.stderr
     return summary_in(out)
 

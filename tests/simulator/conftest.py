@@ -24,6 +24,12 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shared.fleetplan.receding._WORK", 0.01)
 
 
+@pytest.fixture(autouse=True)
+def unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flights search no bound on their losses, which takes longer than most of them."""
+    monkeypatch.setattr("simulator.flying.mission_bound.mission_bound", lambda *_: "a test leaves it out")
+
+
 @pytest.fixture
 def without_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate an installation without torch and TorchRL."""

@@ -11,7 +11,7 @@ import pytest
 from simulator.commands import simulate
 from simulator.records.decision_log import read_decisions
 from simulator.records.run_folder import DRAWN
-from simulator.records.summary import Summary
+from simulator.records.summary import LossBound, Summary
 from tests.simulator.edge_stub import EdgeStub, stub_edge
 from tests.waiting import PATIENCE_S, until
 
@@ -43,7 +43,7 @@ def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pyte
     assert stub.missions[summary.mission_id].seed == 4
     assert {d.deadline_ms for d in stub.decides} == {30_000}
     printed = capsys.readouterr().out
-    assert "AIC-VDS (6 llm, 3 policy)" in printed
+    assert "AIC-VDS: 6 llm, 3 policy" in printed
     assert "The LLM took 6 of 9 decisions" in printed and "llm_timeout 3" in printed
     assert "80 % read from" in printed and "lost; 6 llm, 3 policy" in printed
     for words in ("AIC-VDS", "EOF", "WQCS", "summary.json", "report.html"):
@@ -80,6 +80,20 @@ def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
     summary = summary_in(tmp_path)
     assert set(summary.lost_packets) == {"round_robin", "eof", "wqcs"}
     assert summary.edge is None and summary.by_source.onboard == 6
+
+
+def test_the_bound_is_searched_unless_it_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = LossBound(lower_bound=2, best_flight=2, seconds=0.5)
+    monkeypatch.setattr("simulator.flying.mission_bound.mission_bound", lambda *_: found)
+    arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert summary_in(tmp_path).bound == found
+    assert "Nobody can lose fewer than 2 packets" in capsys.readouterr().out
+    assert "Nobody can lose fewer than 2 packets" in (tmp_path / "report.html").read_text("utf-8")
+    assert simulate.main([*arguments, "--overwrite", "--no-bound"]) == 0
+    assert (summary_in(tmp_path).bound, summary_in(tmp_path).bound_missing) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +148,7 @@ def test_an_edge_that_never_decides_is_code_1(
 def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
     # It is interrupted while the eighth decision is waited for: the second of the third step.
     stub.script, stub.otherwise = ["ok"] * 7, "slow"
-    arguments = ["simulate", "--edge", stub.url, "--out", str(tmp_path)]
+    arguments = ["simulate", "--edge", stub.url, "--no-bound", "--out", str(tmp_path)]
     process = subprocess.Popen([sys.executable, "-m", "shared.cli", *arguments], stdout=subprocess.PIPE, text=True)
     try:
         until(lambda: stub.gate.came)

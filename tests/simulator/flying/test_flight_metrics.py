@@ -39,7 +39,7 @@ def numbers(port: int) -> dict[str, float]:
 
 @contextmanager
 def flying(stub: EdgeStub, out: Path, port: int, steps: int) -> Iterator[subprocess.Popen[str]]:
-    arguments = ["simulate", "--edge", stub.url, "--steps", str(steps), "--out", str(out)]
+    arguments = ["simulate", "--edge", stub.url, "--steps", str(steps), "--no-bound", "--out", str(out)]
     process = subprocess.Popen(
         [sys.executable, "-m", "shared.cli", *arguments, "--metrics-port", str(port)],
         stdout=subprocess.PIPE,

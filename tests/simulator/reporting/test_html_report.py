@@ -12,13 +12,15 @@ from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import LocalPilot
 from simulator.flying.rollout import baselines
 from simulator.records.decision import Decision
-from simulator.records.summary import Summary, summarise
+from simulator.records.summary import LossBound, Summary, summarise
 from simulator.reporting import figures
+from simulator.reporting.figure_style import PaperFigure
 from simulator.reporting.html_report import costliest, drawings, render_report, write_report
 from simulator.reporting.wording import llm_notice, policy_labels
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
+Drawn = dict[str, PaperFigure]
 EVIL = '<script>alert("$x$")</script>&amp;'
 SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "glossary", "provenance")
 
@@ -62,6 +64,13 @@ def drawn(flight: Flight) -> str:
     return page(flight)
 
 
+@pytest.fixture(scope="module")
+def figures_of(flight: Flight) -> Drawn:
+    """The figures of that flight."""
+    tallies = {"aic_vds": flight.tally}
+    return drawings(summary_of(flight, "stub-1"), SHORT, flight.decisions, tallies, flight.sensor_xy)
+
+
 class Page(HTMLParser):
     """Collects IDs, and the addresses that a browser would follow or load."""
 
@@ -91,7 +100,7 @@ def test_every_section_is_there(drawn: str) -> None:
 
 def test_the_page_has_the_sources_of_the_decisions(flight: Flight, drawn: str) -> None:
     summary = summary_of(flight, None)
-    assert policy_labels(summary)["aic_vds"] == "AIC-VDS (8 onboard, 7 llm)"
+    assert policy_labels(summary)["aic_vds"] == "AIC-VDS: 8 onboard, 7 llm"
     notice = llm_notice(summary)
     assert notice is not None and "The LLM took 7 of 15 decisions" in notice and "policy_eof 15" in notice
     assert "AIC-VDS (8 onboard, 7 llm)" in drawn and "this is not a result of the LLM" in drawn
@@ -99,6 +108,32 @@ def test_the_page_has_the_sources_of_the_decisions(flight: Flight, drawn: str) -
     by_llm = summary.by_source.model_copy(update={"llm": 14, "onboard": 1})
     assert llm_notice(summary.model_copy(update={"by_source": by_llm})) is None
     assert llm_notice(summary.model_copy(update={"mode": "value"})) is None
+
+
+@pytest.mark.parametrize("mode", ["llm", "guided", "value", "policy"])
+def test_no_page_predicts_what_its_table_contradicts(flight: Flight, figures_of: Drawn, mode: str) -> None:
+    summary = summary_of(flight, "SmolLM2-135M-Instruct.Q4_1").model_copy(
+        update={"mode": mode, "lost_packets": {"aic_vds": 8, "eof": 204}, "loss_events": {"aic_vds": 6, "eof": 50}}
+    )
+    html = render_report(summary, SHORT, flight.decisions, figures_of)
+    assert "to lose more" not in html and "135 million" not in html
+    assert ("depends on the LLM" in html) == (mode == "llm")
+
+
+def test_the_page_has_the_bound(flight: Flight, figures_of: Drawn) -> None:
+    bounded = summary_of(flight, None).model_copy(
+        update={"lost_packets": {"aic_vds": 8}, "bound": LossBound(lower_bound=8, best_flight=8, seconds=1.0)}
+    )
+    html = render_report(bounded, SHORT, flight.decisions, figures_of)
+    assert "Nobody can lose fewer than 8 packets in this world; this mission lost 8." in html
+    assert "<td>nobody can lose fewer (clairvoyant bound)</td><td>8</td>" in html
+    unknown = bounded.model_copy(update={"bound": None, "bound_missing": "the mission ended before its last step"})
+    assert "loss is unknown: the mission ended" in render_report(unknown, SHORT, flight.decisions, figures_of)
+
+
+def test_the_figures_follow_the_pages_theme(flight: Flight) -> None:
+    inline = figures.losses({"eof": flight.tally}, {}).inline
+    assert "#ffffff" not in inline and "#000000" not in inline and "var(--ink)" in inline
 
 
 def test_decisions_of_learned_values_are_named_and_have_no_tokens(flight: Flight) -> None:
@@ -135,6 +170,13 @@ def test_the_costliest_decisions_come_first() -> None:
     flown = [decision(step=n, cost=float(n % 7)) for n in range(30)]
     shown = costliest(flown)
     assert len(shown) == 15 and [d.step for d in shown[:4]] == [6, 13, 20, 27]
+    assert [d.step for d in costliest(flown[:9])] == [6, 5, 4, 3, 2, 1, 8]
+
+
+def test_a_flight_without_costs_has_no_costly_decisions(flight: Flight) -> None:
+    free = [d.model_copy(update={"cost": 0.0}) for d in flight.decisions]
+    assert "No decision cost anything" in page(flight, decisions=free)
+    assert "No decision cost anything" not in page(flight)
 
 
 def test_the_page_needs_nothing_but_itself(drawn: str) -> None:

@@ -7,8 +7,8 @@ import pytest
 from shared.scenario import Scenario
 from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import LocalPilot
-from simulator.records.summary import Summary, summarise
-from simulator.reporting.wording import number, verdict
+from simulator.records.summary import BySource, LossBound, Summary, summarise
+from simulator.reporting.wording import bound_text, deciders_text, llm_notice, number, percent, verdict
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
@@ -40,6 +40,44 @@ def test_the_verdict_ranks(flight: Flight) -> None:
         assert rank in sentence and sentence.count(".") == 1
     assert "the same" in verdict(summary.model_copy(update={"lost_packets": {"eof": 2, "wqcs": 2}}))
     assert "Nothing was flown" in verdict(summary.model_copy(update={"steps_flown": 0}))
+
+
+def guided(**changes: object) -> Summary:
+    flown = fly(Site(SHORT), LocalPilot("eof", SHORT, 0), seed=0)
+    weights = {"llm": 0.004, "planner": 0.97, "value": 0.026}
+    flown.decisions = [d.model_copy(update={"source": "guided", "trust": weights}) for d in flown.decisions]
+    flown.decisions[0] = flown.decisions[0].model_copy(update={"source": "policy", "reason": "llm_timeout"})
+    return summary_of(flown, "stub-1").model_copy(update={"mode": "guided", **changes})
+
+
+def test_in_mode_guided_the_planner_has_its_own_share() -> None:
+    summary = guided()
+    assert summary.trust == pytest.approx({"planner": 0.97, "value": 0.026, "llm": 0.004})
+    assert deciders_text(summary) == "14 guided (planner 97%), 1 policy"
+    said = llm_notice(summary)
+    assert said is not None and "The LLM took" not in said
+    assert "The LLM was one of several advisers in 14 of 15 decisions." in said
+    assert "planner 97%, learned values 3%, LLM <1%" in said and "llm_timeout 1" in said
+
+
+def test_a_mission_without_the_llm_says_so(flight: Flight) -> None:
+    none = BySource(policy=15)
+    said = llm_notice(guided(by_source=none, trust={}))
+    assert said is not None and said.startswith("The LLM took part in none of the 15 decisions: 15 by the edge's")
+    assert llm_notice(guided(mode="policy")) is None
+
+
+def test_the_bound_is_beside_the_loss(flight: Flight) -> None:
+    summary = summary_of(flight, None).model_copy(update={"lost_packets": {"aic_vds": 9}})
+    assert bound_text(summary) is None
+    tight = summary.model_copy(update={"bound": LossBound(lower_bound=1, best_flight=1, seconds=1.0)})
+    assert bound_text(tight) == "Nobody can lose fewer than 1 packet in this world; this mission lost 9."
+    loose = summary.model_copy(update={"bound": LossBound(lower_bound=1, best_flight=3, seconds=1.0)})
+    assert bound_text(loose) == f"{bound_text(tight)} A search that knows all arrivals found a flight that loses 3."
+
+
+def test_a_share_is_rounded_to_0_or_1_only_if_it_is() -> None:
+    assert [percent(share) for share in (0, 0.001, 0.5, 0.999, 1)] == ["0%", "<1%", "50%", ">99%", "100%"]
 
 
 def test_numbers_have_separators_and_a_dash_for_none() -> None:
