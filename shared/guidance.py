@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from shared.channel import FloatArray
 from shared.scenario import Scenario
-from shared.wire import MissionId, Received, SensorId, Wire
+from shared.wire import MissionId, Note, Received, SensorId, Wire
 
 Level = Annotated[int, Field(ge=0, le=14)]
 MAX_WISHES = 1000
@@ -229,22 +229,25 @@ class GuidanceStatus(Wire):
     note: str | None = None
     guidance: Guidance | None = Field(None, description="compiled from the note, or given by the operator")
     in_words: str | None = Field(None, description="the guidance in plain English, from the structure alone")
+    obeyed_in_words: str | None = Field(None, description="the orders that are obeyed now, in plain English")
     origin: Literal["llm", "operator"] | None = Field(None, description="the author of the structure")
     model: str | None = Field(None, description="the LLM that compiled the note")
     failure: str | None = Field(None, description="why the note could not be compiled")
 
 
 class GuidanceAnswer(Received):
-    """``POST /missions/{id}/guidance``: confirm or reject the compiled guidance, or replace it by a structure.
+    """``POST /missions/{id}/guidance``: confirm or reject the compiled guidance, or replace it.
 
-    A given structure counts as confirmed. It needs neither an LLM nor a note.
+    A new note is compiled, and obeyed once it is confirmed; until then the orders before it stay. A given structure
+    counts as confirmed. It needs neither an LLM nor a note.
     """
 
     answer: Literal["confirm", "reject"] | None = None
     guidance: Guidance | None = None
+    note: Note | None = Field(None, description="a new note in plain words; the prompt keeps the mission's first one")
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> Self:
-        if (self.answer is None) == (self.guidance is None):
-            raise ValueError("give either answer or guidance")
+    def _one_of_them(self) -> Self:
+        if [self.answer, self.guidance, self.note].count(None) != 2:
+            raise ValueError("give one of answer, guidance and note")
         return self

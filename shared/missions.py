@@ -81,6 +81,7 @@ class MissionList(Wire):
     missions: list[MissionLine]
     more: int
     newest: MissionId | None = Field(description="the mission of the latest decision since the edge started")
+    may_command: bool = Field(True, description="whether this request's key may make, guide and delete missions")
 
 
 class DecisionPrompt(Wire):

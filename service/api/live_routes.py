@@ -17,7 +17,7 @@ from starlette.types import Message, Scope, Send
 from service import live
 from service.api.authentication import STILL_KNOWN
 from service.api.problem_details import documented
-from service.api.routes import TheEngine
+from service.api.routes import TheEngine, may_command
 from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
 from shared.missions import DecisionPrompt, MissionLine, MissionList
@@ -97,8 +97,8 @@ async def page() -> FileResponse:
 
 
 @router.get("/missions", tags=["missions"])
-async def list_missions(engine: TheEngine) -> MissionList:
-    """The missions that there are: the one that decided last first, those that are only in the store last."""
+async def list_missions(engine: TheEngine, request: Request) -> MissionList:
+    """All missions: the one that decided last first, those that are only in the store last."""
     missions = engine.missions
     loaded = {mission.mission_id: mission for mission in missions.loaded}
     lately = [name for name in engine.live.history.missions() if name in loaded]
@@ -110,7 +110,12 @@ async def list_missions(engine: TheEngine) -> MissionList:
             lines.append(MissionLine(mission_id=name))
         else:
             lines.append(MissionLine(mission_id=name, mode=mission.mode, decisions=mission.decisions))
-    return MissionList(missions=lines, more=max(0, len(names) - _MOST_LISTED), newest=lately[0] if lately else None)
+    return MissionList(
+        missions=lines,
+        more=max(0, len(names) - _MOST_LISTED),
+        newest=lately[0] if lately else None,
+        may_command=may_command(request),
+    )
 
 
 # Not in the schema: it does not end, and describes itself by its first event.

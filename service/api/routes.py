@@ -37,8 +37,8 @@ async def _engine(request: Request) -> Engine:
     return engine
 
 
-def _may_make_missions(request: Request) -> bool:
-    """Whether the request may make its mission where that does not exist: with keys, only scope ``admin`` may."""
+def may_command(request: Request) -> bool:
+    """Whether the request may make, guide and delete missions: with keys, only scope ``admin`` may."""
     scopes: frozenset[Scope] | None = request.scope.get(SCOPES)
     return scopes is None or "admin" in scopes
 
@@ -66,7 +66,7 @@ KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000,
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
     """Which sensor to collect from, and how fast to fly the next step."""
     engine: Engine = request.state.engine
-    answer = await engine.decide(body, may_make=_may_make_missions(request), key=key)
+    answer = await engine.decide(body, may_make=may_command(request), key=key)
     timing = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
     # The response is text already, because FastAPI would validate and convert the model a second time.
     return Response(answer.model_dump_json(), media_type="application/json", headers=timing)
@@ -77,7 +77,7 @@ async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
     """A fleet's UAVs at one step, decided in the order given; no sensor is given to two of them."""
-    return BatchResponse(decisions=await engine.decide_batch(body, may_make=_may_make_missions(request), key=key))
+    return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_command(request), key=key))
 
 
 @router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
@@ -136,10 +136,12 @@ async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStat
     "/missions/{mission_id}/guidance", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["missions"]
 )
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
-    """Confirm or reject what was understood, or give a structure in its place: it is obeyed from the next decision."""
+    """Confirm or reject what was understood, or give a structure or a new note. Only confirmed orders are obeyed."""
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")
     mission.answer_guidance(body)
+    engine.compiler.compile(mission)
+    engine.live.changed(mission_id)
     await engine.durable("answer")
     return mission.guidance.report(mission_id)
 

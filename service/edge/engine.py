@@ -60,7 +60,7 @@ class Engine:
         self._metrics = metrics
         self._traces = traces
         self.live = Broadcaster()
-        self.compiler = NoteCompiler(llm)
+        self.compiler = NoteCompiler(llm, self.live.changed)
         self.queries = LlmQueries(llm, metrics, settings.llm_concurrency)
         self.pipeline = Pipeline(settings, self.queries, counter)
         self._batches = BatchDecider(self.pipeline, self.queries)
@@ -229,7 +229,7 @@ class Engine:
             self._metrics.llm_trust.observe(choice.report.trust[LLM])
         self._traces.decided(answer)
         logs.decided(answer)
-        self.live.decided(task.uav, decided.prompt, answer)
+        self.live.decided(task.mission, task.uav, decided.prompt, answer)
 
     def _checkpoint_later(self, mission: Mission) -> None:
         """Where a checkpoint is due, write it once the event loop has sent the answer."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
@@ -53,10 +54,15 @@ class NoteOwner(Protocol):
 
 
 class NoteCompiler:
-    """Compiles the notes of a service's missions, one at a time."""
+    """Compiles the notes of a service's missions, one at a time.
 
-    def __init__(self, llm: ServerPool) -> None:
+    Args:
+        on_change: called with the mission's ID when its note was compiled, or could not be.
+    """
+
+    def __init__(self, llm: ServerPool, on_change: Callable[[str], None] = lambda mission_id: None) -> None:
         self._llm = llm
+        self._on_change = on_change
         self._lock = asyncio.Lock()
         self._tasks: dict[int, asyncio.Task[None]] = {}
 
@@ -77,14 +83,22 @@ class NoteCompiler:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _compile(self, mission: NoteOwner) -> None:
-        note = mission.guidance.note or ""
+        # Meanwhile the operator may give another note.
+        while mission.guidance.status == "compiling" and (note := mission.guidance.note) is not None:
+            await self._compile_once(mission, note)
+
+    async def _compile_once(self, mission: NoteOwner, note: str) -> None:
+        """Compile this note; what comes of it is dropped where the mission has another note by then."""
         try:
             async with asyncio.timeout(_TIMEOUT_S), self._lock:
                 await self._wait_for_llm()
-                if mission.guidance.status != "compiling":
+                if not _waits_for(mission, note):
                     return
-                mission.propose_guidance(await compile_note(note, mission.scenario, self._llm), self._llm.model)
-                return
+                compiled = await compile_note(note, mission.scenario, self._llm)
+            if _waits_for(mission, note):
+                mission.propose_guidance(compiled, self._llm.model)
+                self._on_change(mission.mission_id)
+            return
         except (BadOrders, Impossible, NoDecision) as error:
             reason = str(error)
         except TimeoutError:
@@ -92,7 +106,9 @@ class NoteCompiler:
         except Exception as error:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             reason = f"{type(error).__name__}: see the log"
-        mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.model)
+        if _waits_for(mission, note):
+            mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.model)
+            self._on_change(mission.mission_id)
 
     async def _wait_for_llm(self) -> None:
         """Wait while the LLM loads or recovers; raises ``NoDecision`` where it does neither and is not ready."""
@@ -100,6 +116,11 @@ class NoteCompiler:
             await asyncio.sleep(_POLL_S)
         if self._llm.status != "ready":
             raise NoDecision("llm_unavailable", f"the LLM is {self._llm.status}")
+
+
+def _waits_for(mission: NoteOwner, note: str) -> bool:
+    """Whether this note is still to be compiled."""
+    return mission.guidance.status == "compiling" and mission.guidance.note == note
 
 
 async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:

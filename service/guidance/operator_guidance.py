@@ -13,7 +13,8 @@ class OperatorGuidance:
     """The life of a note: compiling, then proposed or failed, then confirmed or rejected.
 
     The operator may give a structure at any time, which is confirmed at once. A proposal that an LLM makes afterwards
-    is ignored.
+    is ignored. A new note begins this life again; the orders that were confirmed before stay until the operator
+    confirms the new ones, and a rejected proposal leaves them as they are.
 
     Attributes:
         confirmed: the guidance that planner and scores follow; empty until the operator confirms one.
@@ -46,6 +47,10 @@ class OperatorGuidance:
             Conflict: there is nothing to confirm or reject.
             Refused: the fleet cannot follow the operator's structure; the guidance stays as it is.
         """
+        if answer.note is not None:
+            self.note, self.status = answer.note, "compiling"
+            self._proposed = self._origin = self._model = self._failure = None
+            return
         if answer.guidance is not None:
             try:
                 answer.guidance.check(self._scenario)
@@ -56,9 +61,12 @@ class OperatorGuidance:
             raise Conflict(
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
             )
-        rejected = answer.answer == "reject"
-        self.status = "rejected" if rejected else "confirmed"
-        self.confirmed = NO_GUIDANCE if rejected else self._proposed
+        if answer.answer != "reject":
+            self.status, self.confirmed = "confirmed", self._proposed
+            return
+        if self.status != "proposed":
+            self.confirmed = NO_GUIDANCE
+        self.status = "rejected"
 
     def report(self, mission_id: str) -> GuidanceStatus:
         """The body of ``GET /missions/{id}/guidance``."""
@@ -68,6 +76,7 @@ class OperatorGuidance:
             note=self.note,
             guidance=self._proposed,
             in_words=None if self._proposed is None else self._proposed.in_words(),
+            obeyed_in_words=self.confirmed.in_words() if self.confirmed else None,
             origin=self._origin,
             model=self._model,
             failure=self._failure,
@@ -76,6 +85,7 @@ class OperatorGuidance:
     def state_dict(self) -> dict[str, Any]:
         """Status, proposal and confirmed guidance, as plain values."""
         return {
+            "note": self.note,
             "status": self.status,
             "obeyed": self.confirmed.model_dump(),
             "understood": None if self._proposed is None else self._proposed.model_dump(),
@@ -86,6 +96,8 @@ class OperatorGuidance:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a ``state_dict``."""
+        # Journals of earlier versions have no note: theirs is the spec's.
+        self.note = state.get("note", self.note)
         self.status = state["status"]
         self.confirmed = Guidance.model_validate(state["obeyed"])
         proposed = state["understood"]

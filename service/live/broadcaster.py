@@ -15,6 +15,7 @@ from contextlib import asynccontextmanager, contextmanager
 
 from service.errors import Unavailable
 from service.live import snapshots
+from service.live.fleet_watch import FleetWatch, Watched
 from service.live.recent_decisions import RecentDecisions
 from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
@@ -39,11 +40,12 @@ _STALLED_S, _LAST_S = 20.0, 0.5
 class MissionStream:
     """The updates of one mission that has listeners."""
 
-    def __init__(self, mission: Mission, history: RecentDecisions) -> None:
+    def __init__(self, mission: Mission, history: RecentDecisions, watched: Watched) -> None:
         self.mission = mission
         self.listeners = 0
         self.deleted = False
         self._history = history
+        self._watched = watched
         self._frames: deque[bytes] = deque()
         self._bytes = 0
         # The number of updates so far. A listener that missed more than `_frames` has gets a snapshot.
@@ -110,7 +112,7 @@ class MissionStream:
             self._bytes = 0
         else:
             decisions = self._history.of(self.mission.mission_id)
-            self._add(_event("update", snapshots.update(self.mission, decisions, self._since)))
+            self._add(_event("update", snapshots.update(self.mission, decisions, self._watched, self._since)))
         self._since = self._history.order
         self._made += 1
         self.notify()
@@ -127,7 +129,7 @@ class MissionStream:
             decisions = self._history.of(self.mission.mission_id)[-_SHOWN:]
             self._last_snapshot = (
                 self._made,
-                _event("snapshot", snapshots.snapshot(self.mission, decisions, self._history.edge)),
+                _event("snapshot", snapshots.snapshot(self.mission, decisions, self._watched, self._history.edge)),
             )
         return self._last_snapshot[1]
 
@@ -137,26 +139,32 @@ class Broadcaster:
 
     def __init__(self) -> None:
         self.history = RecentDecisions()
+        self._watch = FleetWatch()
         self._streams: dict[str, MissionStream] = {}
         self._listeners = 0
         self._sending: set[asyncio.Timeout] = set()
         self._closing = False
 
-    def decided(self, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
+    def decided(self, mission: Mission, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
         """Show an answered decision with its prompt, whether an LLM received the prompt or not."""
+        self._watch.decided(mission, uav, answer.step)
         self.history.decided((uav.position[0], uav.position[1]), prompt, answer)
-        if (stream := self._streams.get(answer.mission_id)) is not None:
+        self.changed(answer.mission_id)
+
+    def changed(self, mission_id: str) -> None:
+        """Note that the content of the mission's page has changed."""
+        if (stream := self._streams.get(mission_id)) is not None:
             stream.change()
 
     def outcome_applied(self, mission: Mission, outcome: Outcome) -> None:
         """Show an outcome that is applied."""
         self.history.outcome_applied(outcome)
-        if (stream := self._streams.get(mission.mission_id)) is not None:
-            stream.change()
+        self.changed(mission.mission_id)
 
     def forget(self, mission_id: str) -> None:
         """Forget a deleted mission, and tell its listeners."""
         self.history.forget(mission_id)
+        self._watch.forget(mission_id)
         if (stream := self._streams.pop(mission_id, None)) is not None:
             stream.deleted = True
             stream.close()
@@ -196,7 +204,9 @@ class Broadcaster:
         """One mission's server-sent events, for one listener that has a slot."""
         stream = self._streams.get(mission.mission_id)
         if stream is None:
-            stream = self._streams[mission.mission_id] = MissionStream(mission, self.history)
+            stream = self._streams[mission.mission_id] = MissionStream(
+                mission, self.history, self._watch.of(mission.mission_id)
+            )
         stream.listeners += 1
         try:
             async for event in stream.events(lambda: self._closing):

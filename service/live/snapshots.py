@@ -7,20 +7,24 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
+from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 from shared.urgency import urgency
 
+# Steps until a queue is full, of a sensor that gets hardly any packets.
+_NEVER = 10_000
 # Points of a trajectory. The error for a circle of 300 m is less than half a metre.
 _POINTS = 97
 
 
-def snapshot(mission: Mission, decisions: list[RecentDecision], edge: str) -> bytes:
+def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched, edge: str) -> bytes:
     """The complete state of the page, with these decisions.
 
     Args:
+        watched: what the reports say of the fleet's troubles.
         edge: an ID of this process: after a restart the earlier decisions are unknown.
     """
     scenario = mission.scenario
@@ -33,7 +37,6 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], edge: str) -> by
                 "asks": mission.spec.uses_llm,
                 "planner": mission.planner is not None,
                 "top_k": mission.top_k,
-                "note": mission.guidance.note,
             },
             "scenario": scenario.model_dump(include=_SHOWN),
             "pipeline": scenario.pipeline if scenario.layout != "uniform" else (),
@@ -41,12 +44,13 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], edge: str) -> by
             "places": np.round(mission.belief.places, 1).tolist(),
             "decisions": [decision.summary() for decision in decisions],
             "outcomes": [],
-            **_moment(mission),
+            "full_by_step": list(watched.full.items()),
+            **_moment(mission, watched),
         }
     )
 
 
-def update(mission: Mission, decisions: list[RecentDecision], since: int) -> bytes:
+def update(mission: Mission, decisions: list[RecentDecision], watched: Watched, since: int) -> bytes:
     """The changes since an order of the history.
 
     Args:
@@ -56,7 +60,8 @@ def update(mission: Mission, decisions: list[RecentDecision], since: int) -> byt
         {
             "decisions": [decision.summary() for decision in decisions if decision.order > since],
             "outcomes": [d.outcome for d in decisions if d.order <= since < d.outcome_order],
-            **_moment(mission),
+            "full_by_step": list(watched.full.items())[-_NEWEST_STEPS:],
+            **_moment(mission, watched),
         }
     )
 
@@ -69,23 +74,51 @@ def located_sensors(mission: Mission) -> int:
 _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacity", "radio_radius_m", "max_velocity"}
 
 
-def _moment(mission: Mission) -> dict[str, Any]:
-    """The volatile part: counts, and the fleet's belief of each sensor."""
-    belief = mission.belief
+# Steps whose numbers an update repeats, so that none is missed.
+_NEWEST_STEPS = 20
+
+
+def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
+    """The volatile part: counts, the fleet's belief of each sensor, and the operator's orders."""
+    belief, scenario = mission.belief, mission.scenario
     step = belief.newest or 0
-    queue = belief.queue(step)
+    queue, rate = belief.queue(step), belief.rate
     return {
         "step": step,
         "made": mission.decisions,
         "settled": mission.feedback,
         "learner_updates": mission.learner.updates,
         "learner_loss": mission.learner.last_loss,
-        "guidance": mission.guidance.status,
+        "guidance": _guidance(mission),
+        **watched.totals(),
         "queue": np.round(queue, 1).tolist(),
-        "urgency": np.round(urgency(queue, belief.rate, mission.scenario), 3).tolist(),
+        "urgency": np.round(urgency(queue, rate, scenario), 3).tolist(),
+        "full_in": np.round((scenario.queue_capacity - queue) / np.maximum(rate, 1e-9), 1).clip(max=_NEVER).tolist(),
+        "battery": np.round(belief.battery / scenario.battery_j, 3).tolist(),
         "heard": belief.heard.tolist(),
         "visits": mission.records.visits.tolist(),
         "uavs": {uav: {"step": last.step, "position": last.position} for uav, last in belief.uavs.items()},
+    }
+
+
+def _guidance(mission: Mission) -> dict[str, Any]:
+    """The operator's note, what was understood of it, and each order for a sensor with its deadline."""
+    told, orders, visits = (
+        mission.guidance.report(mission.mission_id),
+        mission.guidance.confirmed,
+        mission.records.visits,
+    )
+    return {
+        **told.model_dump(exclude={"mission_id"}),
+        "orders": [
+            {
+                "sensor_id": wish.sensor_id,
+                "visit_every": wish.visit_every,
+                "weight": wish.weight,
+                "due": None if wish.visit_every is None else int(visits[wish.sensor_id]) + wish.visit_every,
+            }
+            for wish in orders.sensors
+        ],
     }
 
 

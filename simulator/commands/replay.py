@@ -157,8 +157,8 @@ def replay(options: Replay, command: str, console: Console) -> int:
     logged = logged_mission(options.run)
     spec = changed_spec(logged.spec, options)
     assert not isinstance(spec.scenario, str), "an edge resolves the scenario's name"
-    mission_id = new_mission_id(spec.scenario, spec.seed)
-    out = options.out or Path("runs") / f"{mission_id}-replay"
+    mission_id = f"{new_mission_id(spec.scenario, spec.seed)}-replay"
+    out = options.out or Path("runs") / mission_id
     refuse_old_result(out, options.overwrite, REPLAY)
     timeout_s = DEFAULT_TIMEOUT_S if options.deadline_ms is None else options.deadline_ms / 1000 + NETWORK_SLACK_S
     with EdgeClient(edge, timeout_s=timeout_s, api_key=os.environ.get(API_KEY) or None) as client:

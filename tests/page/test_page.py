@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 from collections.abc import Callable, Iterator
@@ -83,7 +84,7 @@ def test_a_mission_appears_while_it_flies(another_edge: str, visit: Open, tmp_pa
     expect(page.locator(".sensor[role=button]")).to_have_count(10)
     expect(page.locator(".mark.uav")).to_have_count(3)
     expect(page.locator("#feed li")).to_have_count(DECISIONS)
-    expect(page.locator("#connection")).to_have_text("Live")
+    expect(page.locator("#connection")).to_have_text("Connected")
     assert page.locator(".trails line").count() > DECISIONS // 2
     assert len(set(page.locator(".trails line").evaluate_all("all => all.map(l => l.getAttribute('stroke'))"))) > 3
     for chart in ("loss", "latency", "tokens"):
@@ -100,7 +101,7 @@ def test_where_no_round_trip_is_told_the_edges_time_is_shown(visit: Open, edge: 
         answer = httpx.post(f"{edge}/decide", json=body, timeout=PATIENCE_S).json()
         told = {"decision_id": answer["decision_id"], "cost": 0.5}
     page = visit(f"{edge}/?mission=silent")
-    expect(page.locator("#legend")).to_contain_text("the edge's own time: these UAVs do not tell")
+    expect(page.locator("#legend")).to_contain_text("the edge's own time: these UAVs do not report")
     expect(page.locator("#feed li").first).to_contain_text("ms at the edge")
     # Sensor 4 was never heard: it is drawn, and told apart.
     expect(page.locator("#sensor-4")).to_have_attribute("aria-label", re.compile("never heard, no visit"))
@@ -117,7 +118,7 @@ def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: st
     page.keyboard.press("Home")
     expect(first).to_be_focused()
     page.keyboard.press("Enter")
-    dialog = page.get_by_role("dialog", name=re.compile(f"^Step {STEPS - 1}: UAV"))
+    dialog = page.get_by_role("dialog", name=re.compile(f"^Step {STEPS - 1}: U\\d to S"))
     expect(dialog.get_by_role("region", name=re.compile("^Static block"))).to_contain_text("You direct a fleet of UAVs")
     expect(dialog.get_by_role("region", name="Current task")).to_have_text(re.compile(r"^(\d+(,-?\d+){6}\s*){5}$"))
     expect(dialog.locator("tr.chosen")).to_have_count(1)
@@ -163,7 +164,7 @@ def test_what_comes_from_outside_is_text(visit: Open, edge: str, report: Report)
     assert page.locator("img").count() == 0
     page.goto(f"{edge}/?mission={HOSTILE}")
     expect(page.locator("#trouble")).to_contain_text(f"There is no mission {HOSTILE}")
-    expect(page.locator("#connection")).to_have_text("Live")
+    expect(page.locator("#connection")).to_have_text("Connected")
     expect(page.locator("#trouble")).to_be_visible()
     assert page.locator("img").count() == 0
     assert page.evaluate("window.hacked") is None
@@ -200,7 +201,7 @@ def test_paused_the_page_stands_still_and_goes_on_from_there(visit: Open, edge: 
     httpx.post(f"{edge}/decide", json=report(mission_id="paused"), timeout=PATIENCE_S)
     page = visit(f"{edge}/?mission=paused")
     expect(page.locator("#feed li")).to_have_count(1)
-    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Freeze view").click()
     httpx.post(f"{edge}/decide", json=report(mission_id="paused", step=1), timeout=PATIENCE_S)
     # A page that is not paused has it.
     other = visit(f"{edge}/?mission=paused")
@@ -208,7 +209,7 @@ def test_paused_the_page_stands_still_and_goes_on_from_there(visit: Open, edge: 
     httpx.post(f"{edge}/decide", json=report(mission_id="paused", step=2), timeout=PATIENCE_S)
     expect(other.locator("#feed li")).to_have_count(3)
     expect(page.locator("#feed li")).to_have_count(1)
-    page.get_by_role("button", name="Pause").click()
+    page.get_by_role("button", name="Freeze view").click()
     expect(page.locator("#feed li")).to_have_count(3)
 
 
@@ -229,7 +230,7 @@ def test_a_lost_connection_is_told_and_taken_up_again(visit: Open, start: Start,
     url, process = start(AICVDS_MODE="value")
     httpx.post(f"{url}/decide", json=report(), timeout=PATIENCE_S)
     page = visit(url, expected=GONE)
-    expect(page.locator("#connection")).to_have_text("Live")
+    expect(page.locator("#connection")).to_have_text("Connected")
     process.send_signal(signal.SIGTERM)
     process.wait(PATIENCE_S)
     expect(page.locator("#connection")).to_have_text("Connection lost, trying again")
@@ -238,7 +239,7 @@ def test_a_lost_connection_is_told_and_taken_up_again(visit: Open, start: Start,
     with started("serve", "--port", port, AICVDS_MODE="value") as again:
         output_until(again, "startup complete")
         httpx.post(f"{url}/decide", json=report(step=7), timeout=PATIENCE_S)
-        expect(page.locator("#connection")).to_have_text("Live")
+        expect(page.locator("#connection")).to_have_text("Connected")
         expect(page.locator("#trouble")).to_be_hidden()
         expect(page.locator("#feed li")).to_have_count(1)
         expect(page.locator("#feed li")).to_contain_text("step 7")
@@ -309,3 +310,73 @@ def batch(step: int) -> dict[str, Any]:
     }
     uavs = [{"uav_id": u, "position": [10.0 + 15 * step, 50.0 + 100 * u], "sensors": sensors} for u in range(10)]
     return {"mission_id": "many", "step": step, "uavs": uavs}
+
+
+def test_the_operator_gives_orders_and_sees_their_deadlines(visit: Open, edge: str, report: Report) -> None:
+    httpx.post(f"{edge}/decide", json=report(mission_id="ordered"), timeout=PATIENCE_S)
+    page = visit(f"{edge}/?mission=ordered", expected=REFUSED)
+    summary = page.locator("#operator-summary")
+    expect(summary).to_have_text("no orders")
+    page.locator("#operator > summary").click()
+    page.locator("#structure > summary").click()
+    orders = page.locator("#orders-input")
+    orders.fill("{")
+    page.get_by_role("button", name="Give these orders").click()
+    expect(page.locator("#operator-error")).to_contain_text("These orders are no JSON")
+    orders.fill('{"sensors": [{"sensor_id": 99, "visit_every": 2}]}')
+    page.get_by_role("button", name="Give these orders").click()
+    expect(page.locator("#operator-error")).to_contain_text("sensor 99 is unknown")
+    orders.fill('{"sensors": [{"sensor_id": 3, "visit_every": 1}], "max_velocity": 9}')
+    page.get_by_role("button", name="Give these orders").click()
+    expect(summary).to_have_text("Visit sensor 3 in every step. Never fly faster than 9 m/s.")
+    expect(page.locator("#operator-error")).to_be_empty()
+    for step in (1, 2):
+        httpx.post(f"{edge}/decide", json=report(mission_id="ordered", step=step), timeout=PATIENCE_S)
+    expect(page.locator("#deadlines-list")).to_contain_text("S3, every 1 steps")
+    expect(page.locator("#deadlines-kept")).to_have_text(re.compile("summed over the steps: 2 kept, 0 missed"))
+    page.get_by_role("button", name="Withdraw the orders").click()
+    expect(summary).to_have_text("no orders")
+    # This edge has no LLM: a note is not understood, and the page says why.
+    page.locator("#note-input").fill("Visit sensor 4 every third step.")
+    page.get_by_role("button", name="Send the note").click()
+    expect(page.locator("#note-text")).to_have_text("Visit sensor 4 every third step.")
+    expect(page.locator("#note-words")).to_contain_text("the LLM is off")
+    assert violations(page) == []
+
+
+def test_alarms_name_the_sensors(visit: Open, edge: str, report: Report) -> None:
+    body = report(mission_id="alarming", step=20)
+    body["sensors"] |= {"queue": [60, 57, 3, 8, None], "battery": [49.0, 2.0, 47.5, 50.0, None]}
+    body["sensors"] |= {"last_seen": [20, 20, 5, 20, None]}
+    httpx.post(f"{edge}/decide", json=body, timeout=PATIENCE_S)
+    page = visit(f"{edge}/?mission=alarming")
+    alarms = page.locator("#alarm-list")
+    expect(alarms).to_contain_text(re.compile(r"Believed full: S0"))
+    expect(alarms).to_contain_text(re.compile(r"Full within 2 steps: S1 \(0\.6\)"))
+    expect(alarms).to_contain_text("In radio range but not heard: S2 (step 20)")
+    expect(alarms).to_contain_text(re.compile(r"Not heard for more than 10 steps: S\d \(never\).*S2 \(step 5\)"))
+    expect(alarms).to_contain_text("Battery below 15%: S1 (4%)")
+    expect(page.locator("#badge")).to_have_text("Flying")
+    assert violations(page) == []
+
+
+def test_the_page_says_what_the_records_say(visit: Open, edge: str, tmp_path: Path) -> None:
+    """Its numbers are those of the flight's own files."""
+    fly(edge, tmp_path, "--scenario", "pipeline")
+    summary = json.loads((tmp_path / "run" / "summary.json").read_bytes())
+    decisions = [json.loads(line) for line in (tmp_path / "run" / "decisions.jsonl").read_text().splitlines()]
+    page = visit(f"{edge}/?mission={summary['mission_id']}")
+    expect(page.locator("#mission")).to_have_attribute("data-made", str(summary["decisions"]))
+    expect(page.locator("#badge")).to_have_text("Ended")
+    names, values = (page.locator(f"#numbers {part}").all_inner_texts() for part in ("dt", ".value"))
+    tiles = dict(zip(names, values, strict=True))
+    assert tiles["Decisions"] == str(len(decisions))
+    assert tiles["Failed"] == str(summary["failures"])
+    # Mode value asks no LLM: nothing is said of tokens.
+    assert "Tokens saved" not in tiles
+    detail = page.locator("#numbers .detail").all_inner_texts()
+    assert any(f"cost {sum(d['cost'] for d in decisions):.1f}".removesuffix(".0") in text for text in detail)
+    for source, count in summary["by_source"].items():
+        if count:
+            words = {"value": "learned values", "policy": "LLM-free policy"}[source]
+            assert any(f"{count} {words}" in text for text in detail)

@@ -9,15 +9,14 @@ const REDRAWN_EVERY_MS = 500;
 
 const CHARTS = {
   loss: {
-    unit: "cost",
-    series: [["cost so far", "--c1", []], ["failed so far", "--c2", [6, 4]]],
+    unit: "sum",
+    series: [["overflows, believed", "--c3", [2, 3]], ["failed", "--c2", [6, 4]], ["cost", "--c1", []]],
     rows: (steps) => {
-      let cost = 0;
-      let failed = 0;
-      const sums = steps.map(([, s]) => [(cost += s.cost), (failed += s.failed)]);
-      return [sums.map((s) => s[0]), sums.map((s) => s[1])];
+      const sum = { full: 0, failed: 0, cost: 0 };
+      const sums = steps.map(([, s]) => ["full", "failed", "cost"].map((name) => (sum[name] += s[name])));
+      return [0, 1, 2].map((column) => sums.map((row) => row[column]));
     },
-    text: ([cost, failed], steps) => `Cost that the UAVs told since step ${steps[0][0]}: ${shown(cost.at(-1), 2)} (a failed transmission counts 1, a queue's worth of lost packets 1), ${failed.at(-1)} failed.`,
+    text: ([full, failed, cost], steps) => `Since step ${steps[0][0]}: about ${shown(full.at(-1), 0)} overflows, as the fleet believes (a sensor counts once a step), ${failed.at(-1)} failed transmissions. Cost that the UAVs reported: ${shown(cost.at(-1), 2)}, with the packets lost in their own reach only.`,
   },
   latency: {
     unit: "ms",
@@ -30,7 +29,7 @@ const CHARTS = {
     ],
     text: ([roundTrip, edge, slowest]) => {
       const told = roundTrip.findLast((v) => v !== null);
-      return `In the last step the edge took ${shown(edge.at(-1))} ms on average, ${shown(slowest.at(-1))} ms at most; ${told === undefined ? "the UAVs do not tell their round trip" : `the last round trips told were ${shown(told)} ms on average`}.`;
+      return `In the last step the edge took ${shown(edge.at(-1))} ms on average, ${shown(slowest.at(-1))} ms at most; ${told === undefined ? "the UAVs do not report their round trip" : `the last reported round trips were ${shown(told)} ms on average`}.`;
     },
   },
   tokens: {

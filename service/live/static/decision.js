@@ -3,7 +3,7 @@
 import { at, make, say, shown } from "./dom.js";
 import { ask, Refused } from "./edge.js";
 import { measured } from "./model.js";
-import { ADVISERS, SOURCES, why } from "./words.js";
+import { ADVISERS, decider, percent, why } from "./words.js";
 
 let opened = null;
 
@@ -13,11 +13,11 @@ at("decision-close").addEventListener("click", () => at("decision").close());
 export function open(decision) {
   const { answer } = decision;
   opened = answer.decision_id;
-  say(at("decision-title"), `Step ${answer.step}: UAV ${answer.uav_id} to sensor ${answer.sensor_id} at ${answer.velocity} m/s`);
+  say(at("decision-title"), `Step ${answer.step}: U${answer.uav_id} to S${answer.sensor_id} at ${answer.velocity} m/s`);
   const prompt = make("section", {}, make("h3", {}, "Prompt"), make("p", {}, "Asking the edge for it…"));
   const said = why(answer);
   at("decision-body").replaceChildren(
-    make("p", {}, make("span", { class: "who", "data-source": answer.source }, SOURCES[answer.source] ?? answer.source), said ? ` ${said}` : ""),
+    make("p", {}, make("span", { class: "who", "data-source": answer.source }, decider(answer)), said ? ` ${said}` : ""),
     candidates(answer), ...trust(answer), times(decision), tokens(answer), prompt);
   if (!at("decision").open) at("decision").showModal();
   at("decision-title").focus();
@@ -28,21 +28,21 @@ function candidates(answer) {
   const chosen = (row) => row.sensor_id === answer.sensor_id && (row.velocity ?? answer.velocity) === answer.velocity;
   const guided = answer.guided?.candidates;
   const columns = guided
-    ? [["Sensor", (c) => c.sensor_id], ["Velocity, m/s", (c) => c.velocity], ["LLM's probability", (c) => (c.llm === null ? "silent" : c.llm.toFixed(3))],
-       ["All advisers'", (c) => c.mixture.toFixed(3)], ["Expected loss, packets", (c) => c.regret.toFixed(2)], ["Score", (c) => c.score.toFixed(2)]]
+    ? [["Sensor", (c) => c.sensor_id], ["m/s", (c) => c.velocity], ["LLM", (c) => (c.llm === null ? "silent" : c.llm.toFixed(3))],
+       ["Advisers", (c) => c.mixture.toFixed(3)], ["Expected loss", (c) => c.regret.toFixed(2)], ["Score", (c) => c.score.toFixed(2)]]
     : [["Sensor", (c) => c.sensor_id], ["Attention score", (c) => c.score.toFixed(3)]];
   const rows = (guided ?? answer.top_k).map((row) =>
     make("tr", chosen(row) ? { class: "chosen" } : {}, ...columns.map(([, cell]) => make("td", {}, String(cell(row)))), make("td", {}, chosen(row) ? "flown" : "")));
   const head = make("tr", {}, ...columns.map(([name]) => make("th", { scope: "col" }, name)), make("td", {}));
-  const note = guided ? "Best first. The loss is above the best candidate's, as the critic expects it." : "The sensors that attention kept, best first.";
-  return make("section", {}, make("h3", {}, "Candidates"), make("p", { class: "hint" }, rows.length ? note : "None was offered."),
+  const note = guided ? "Best first. Expected loss: packets lost above the best candidate, by simulation. Score: advice less expected loss; the highest flies." : "The sensors that attention kept, best first.";
+  return make("section", {}, make("h3", {}, "Candidates"), make("p", { class: "hint" }, rows.length ? note : "No sensor was offered."),
     make("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Candidates" }, make("table", {}, make("thead", {}, head), make("tbody", {}, ...rows))));
 }
 
 function trust(answer) {
   if (!answer.guided) return [];
   const bars = Object.entries(answer.guided.trust).sort((a, b) => b[1] - a[1]).map(([name, weight]) =>
-    make("li", {}, make("span", {}, ADVISERS[name] ?? name), make("meter", { min: 0, max: 1, value: weight, "aria-label": `trust in ${ADVISERS[name] ?? name}` }), make("span", {}, `${shown(weight * 100)}%`)));
+    make("li", {}, make("span", {}, ADVISERS[name] ?? name), make("meter", { min: 0, max: 1, value: weight, "aria-label": `trust in ${ADVISERS[name] ?? name}` }), make("span", {}, percent(weight))));
   return [make("section", {}, make("h3", {}, "Trust before this decision"), make("ul", { class: "bars" }, ...bars))];
 }
 
@@ -51,7 +51,7 @@ function times(decision) {
   const roundTrip = measured(decision);
   const rows = Object.entries(stages).filter(([name]) => name !== "total").map(([name, ms]) => [name, `${shown(ms, 2)} ms`]);
   rows.push(["at the edge, total", `${shown(stages.total, 2)} ms of ${shown(deadline, 0)} ms`]);
-  rows.push(["round trip, by the UAV", roundTrip === null ? "not told" : `${shown(roundTrip, 2)} ms`]);
+  rows.push(["round trip, by the UAV", roundTrip === null ? "not reported" : `${shown(roundTrip, 2)} ms`]);
   return make("section", {}, make("h3", {}, "Time"), pairs(rows));
 }
 
@@ -72,11 +72,11 @@ async function showPrompt(answer, section) {
   try {
     const told = await ask(path);
     const block = (name, text) => [make("h4", {}, name), make("pre", { tabindex: 0, role: "region", "aria-label": name }, text || "(empty)")];
-    parts = [make("p", { class: "hint" }, told.asked ? "As the LLM got it." : "No LLM was asked: it was made to count its tokens."),
+    parts = [make("p", { class: "hint" }, told.asked ? "As the LLM received it." : "No LLM was asked. The prompt only serves to count its tokens."),
       ...block("Static block, the same for the whole mission", told.static), ...block("Experiences", told.experiences), ...block("Current task", told.state)];
   } catch (error) {
     const gone = error instanceof Refused && error.status === 404;
-    parts = [make("p", {}, gone ? "The edge keeps the prompts of its newest decisions only; this one is gone." : `The edge did not tell: ${error.message}`)];
+    parts = [make("p", {}, gone ? "The edge keeps the prompts of its newest decisions only; this one is gone." : `The edge did not say: ${error.message}`)];
   }
   if (opened === answer.decision_id) section.replaceChildren(make("h3", {}, "Prompt"), ...parts);
 }

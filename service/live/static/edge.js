@@ -24,6 +24,11 @@ export async function ask(path, signal) {
   return (await get(path, signal)).json();
 }
 
+/** Sends JSON; throws as `ask`. */
+export async function post(path, body) {
+  return (await get(path, undefined, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } })).json();
+}
+
 /** A stream's events as `{name, data}`, comments as `{name: null}`. Ends where the edge ends it. */
 export async function* events(path, signal) {
   const stop = new AbortController();
@@ -44,10 +49,10 @@ export async function* events(path, signal) {
   }
 }
 
-async function get(path, signal) {
+async function get(path, signal, sent = {}) {
   const key = sessionStorage.getItem(KEY);
-  const headers = key ? { Authorization: `Bearer ${key}` } : {};
-  const answer = await fetch(path, { headers, signal, cache: "no-store" });
+  const headers = { ...sent.headers, ...(key ? { Authorization: `Bearer ${key}` } : {}) };
+  const answer = await fetch(path, { ...sent, headers, signal, cache: "no-store" });
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({}));
   throw new Refused(answer.status, problem.detail ?? answer.statusText, Number(answer.headers.get("Retry-After")) || 0);

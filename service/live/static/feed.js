@@ -2,7 +2,7 @@
 
 import { at, make, say, shown } from "./dom.js";
 import { measured } from "./model.js";
-import { SOURCES, why } from "./words.js";
+import { decider, why } from "./words.js";
 
 const MOST_SHOWN = 100;
 
@@ -24,6 +24,7 @@ export class Feed {
   }
 
   update(mission) {
+    this.asks = mission.about.asks;
     const newest = mission.newest(MOST_SHOWN);
     const wanted = new Set(newest.map((decision) => decision.answer.decision_id));
     for (const [id, item] of this.items) {
@@ -44,9 +45,9 @@ export class Feed {
     const { answer } = decision;
     const meta = make("span", { class: "meta" });
     const button = make("button", { type: "button", "data-decision": id, "aria-haspopup": "dialog" },
-      make("span", { class: "what" }, make("b", {}, `UAV ${answer.uav_id}`), ` to sensor `, make("b", {}, String(answer.sensor_id)), ` at ${answer.velocity} m/s`),
+      make("span", { class: "what" }, make("b", {}, `U${answer.uav_id}`), ` to `, make("b", {}, `S${answer.sensor_id}`), ` at ${answer.velocity} m/s`),
       make("span", { class: "step" }, `step ${answer.step}`),
-      make("span", { class: "by" }, make("span", { class: "who", "data-source": answer.source }, SOURCES[answer.source] ?? answer.source), ` ${why(answer)}`),
+      make("span", { class: "by" }, make("span", { class: "who", "data-source": answer.source }, decider(answer)), ` ${why(answer)}`),
       meta);
     const item = { element: make("li", {}, button), meta, settled: false };
     this.items.set(id, item);
@@ -58,7 +59,8 @@ export class Feed {
     const { answer, outcome } = decision;
     const roundTrip = measured(decision);
     const time = roundTrip === null ? `${shown(answer.latency_ms.total)} ms at the edge` : `${shown(roundTrip)} ms round trip`;
-    const parts = [time, `${shown(answer.tokens.saved, 0)} of ${shown(answer.tokens.uncompressed, 0)} tokens saved`];
+    const parts = [time];
+    if (this.asks) parts.push(`${shown(answer.tokens.saved, 0)} of ${shown(answer.tokens.uncompressed, 0)} tokens saved`);
     if (outcome) parts.push(outcome.failed ? `failed, cost ${shown(outcome.cost, 2)}` : `cost ${shown(outcome.cost, 2)}`);
     say(item.meta, parts.join(" · "));
     item.meta.classList.toggle("failed", Boolean(outcome?.failed));

@@ -1,5 +1,6 @@
 // The page: which mission is shown, the connection to it, and when it is drawn.
 
+import { showAlarms } from "./alarms.js";
 import { Charts } from "./charts.js";
 import { open } from "./decision.js";
 import { at, make, say, set } from "./dom.js";
@@ -8,9 +9,11 @@ import { Feed } from "./feed.js";
 import { MissionMap } from "./map.js";
 import { Mission } from "./model.js";
 import { clearNumbers, showNumbers } from "./numbers.js";
-import { GUIDANCE } from "./words.js";
+import { Operator } from "./operator.js";
 
 const LISTED_EVERY_MS = 3000;
+// Without a decision for so long, the mission counts as silent.
+const SILENT_S = 30;
 const RETRY_MS = [1000, 2000, 4000, 8000];
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 
@@ -21,6 +24,7 @@ let stop = new AbortController();
 let drawing = false;
 let paused = false;
 let remark = null;
+let mayCommand = false;
 
 const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id)));
 const map = new MissionMap((kind, id) => {
@@ -28,6 +32,7 @@ const map = new MissionMap((kind, id) => {
   if (last) open(last);
 });
 const charts = new Charts();
+const operator = new Operator();
 
 function connection(state, text) {
   set(at("connection"), { "data-state": state });
@@ -48,6 +53,11 @@ async function list() {
     try {
       const told = await ask("missions");
       offer(told);
+      if (mayCommand !== told.may_command) {
+        mayCommand = told.may_command;
+        soon();
+      }
+      badge();
       const next = wanted ?? told.newest ?? told.missions.find((one) => one.mode)?.mission_id ?? null;
       if (next === null) nothing(told);
       else if (next !== following) follow(next);
@@ -93,7 +103,7 @@ async function follow(id) {
         if (signal.aborted) return;
         tries = 0;
         trouble(null);
-        connection(paused ? "paused" : "live", paused ? "Paused" : "Live");
+        connection("live", "Connected");
         if (event.name === "gone") return gone(id);
         hear(event);
       }
@@ -119,7 +129,7 @@ function gone(id) {
   if (following === id) following = null;
   if (wanted === id) {
     wanted = null;
-    remark = `There is no mission ${id}, or no longer: the newest is shown instead.`;
+    remark = `There is no mission ${id}, or no longer. The newest is shown instead.`;
     trouble(null);
     history.replaceState(null, "", location.pathname);
     offer.key = null;
@@ -163,6 +173,7 @@ function hear({ name, data }) {
       mission = new Mission(data);
       feed.begin();
       clearNumbers();
+      operator.begin();
       charts.mission = null;
       charts.begin();
     }
@@ -174,6 +185,17 @@ function hear({ name, data }) {
     mission.apply(data);
     soon();
   }
+}
+
+/** Whether the mission flies, has ended or is silent, and whether the view is frozen. */
+function badge() {
+  const state = !mission ? null : paused ? "frozen" : mission.ended ? "ended" : mission.idleS === null ? "new" : mission.idleS > SILENT_S ? "silent" : "flying";
+  at("badge").hidden = state === null;
+  if (state === null) return;
+  const minutes = Math.floor((mission.idleS ?? 0) / 60);
+  const words = { frozen: "View frozen", ended: "Ended", new: "No decision since the edge started", flying: "Flying", silent: `No decision for ${minutes ? `${minutes} min` : `${SILENT_S} s`}` }[state];
+  set(at("badge"), { "data-state": state });
+  say(at("badge"), mission.id.endsWith("-replay") ? `Replay: ${words.toLowerCase()}` : words);
 }
 
 function soon() {
@@ -191,10 +213,9 @@ function draw() {
   feed.update(mission);
   charts.update(mission);
   showNumbers(mission);
-  const { note } = mission.about;
-  at("note").hidden = note === null;
-  say(at("note-text"), note ?? "");
-  say(at("note-state"), GUIDANCE[mission.now.guidance] ?? mission.now.guidance);
+  showAlarms(mission);
+  operator.update(mission, mayCommand);
+  badge();
   document.title = `${mission.id} · AIC-VDS`;
   at("mission").dataset.made = mission.now.made;
 }
@@ -210,7 +231,7 @@ at("picker").addEventListener("change", ({ target }) => {
 at("pause").addEventListener("click", () => {
   paused = !paused;
   set(at("pause"), { "aria-pressed": paused });
-  if (at("connection").dataset.state === (paused ? "live" : "paused")) connection(paused ? "paused" : "live", paused ? "Paused" : "Live");
+  badge();
   if (!paused) draw();
 });
 

@@ -36,6 +36,7 @@ export class MissionMap {
     const uavs = draw("g", {});
     const { places } = mission;
     this.radius = places.length <= 30 ? 11 : places.length <= 150 ? 8 : places.length <= 1000 ? 4 : 2.5;
+    this.taken = places.flatMap((place) => (place[0] === null ? [] : [[this.x(place[0]), this.y(place[1])]]));
     places.forEach((place, id) => place[0] !== null && sensors.append(this.#sensor(id, place)));
     this.uavs = uavs;
     this.svg.replaceChildren(this.#ground(mission), this.trails, this.links, sensors, uavs);
@@ -61,7 +62,7 @@ export class MissionMap {
       mark.group.classList.toggle("unheard", heard[id] < 0);
       const known = heard[id] < 0 ? "never heard" : `last heard at step ${heard[id]}`;
       const visit = visits[id] < 0 ? "no visit" : `last visit at step ${visits[id]}`;
-      mark.text = `Sensor ${id}: queue ${shown(queue[id])} of ${capacity} packets, urgency ${(urgency[id] ?? 0).toFixed(2)}, ${known}, ${visit}`;
+      mark.text = `Sensor ${id}: queue ${shown(queue[id])} of ${capacity} packets, ${fullIn(mission.now.full_in[id])}, urgency ${(urgency[id] ?? 0).toFixed(2)}, ${known}, ${visit}`;
       set(mark.group, { "aria-label": mark.text });
     }
     const newest = this.#paths(mission);
@@ -71,13 +72,14 @@ export class MissionMap {
   }
 
   #fit(mission) {
-    const points = [[0, 0], [mission.scenario.area_m, mission.scenario.area_m], ...mission.trajectories.flat()];
+    const points = [...mission.trajectories.flat()];
     points.push(...mission.pipeline, ...mission.places.filter((place) => place[0] !== null));
     const low = [0, 1].map((axis) => points.reduce((least, p) => Math.min(least, p[axis]), Infinity));
     const high = [0, 1].map((axis) => points.reduce((most, p) => Math.max(most, p[axis]), -Infinity));
     const width = Math.max(200, this.svg.clientWidth);
     this.scale = (width - 2 * MARGIN_PX) / (high[0] - low[0]);
-    const height = Math.min(width * 1.25, (high[1] - low[1]) * this.scale + 2 * MARGIN_PX);
+    const tallest = Math.min(width * 1.25, Math.max(320, 0.62 * innerHeight));
+    const height = Math.min(tallest, (high[1] - low[1]) * this.scale + 2 * MARGIN_PX);
     this.scale = Math.min(this.scale, (height - 2 * MARGIN_PX) / (high[1] - low[1]));
     const left = (width - (high[0] - low[0]) * this.scale) / 2;
     this.x = (x) => px(left + (x - low[0]) * this.scale);
@@ -108,17 +110,28 @@ export class MissionMap {
     const disc = draw("circle", { class: "queue", r: 0 });
     const ring = draw("circle", { class: "urgency", r, pathLength: 1, transform: "rotate(-90)", "stroke-width": Math.max(1.5, r * 0.34) });
     const parts = [draw("circle", { class: "hit", r: Math.max(12, r * 1.6) }), draw("circle", { class: "body", r }), disc, ring];
-    if (r >= 8) parts.push(draw("text", { class: "label", y: -r - 4 }, String(id)));
+    if (r >= 8) parts.push(draw("text", { class: "label", ...this.#spot(id, r) }, `S${id}`));
     const attributes = { class: "mark sensor", id: `sensor-${id}`, role: "button", tabindex: -1, transform: `translate(${this.x(x)} ${this.y(y)})` };
     const group = draw("g", attributes, ...parts);
     this.marks.set(group.id, { kind: "sensor", id, group, disc, ring, text: "" });
     return group;
   }
 
+  /** Where a sensor's label is farthest from the other sensors and their labels, relative to the sensor. */
+  #spot(id, r) {
+    const here = this.mission.places[id];
+    const [x, y] = [this.x(here[0]), this.y(here[1])];
+    const free = ([dx, dy]) => Math.min(60, ...this.taken.map(([ox, oy]) => Math.hypot(x + dx - ox, (y + dy - oy) * 1.6)));
+    const spots = [[0, -r - 6], [0, r + 10], [r + 12, 2], [-r - 12, 2]];
+    const best = spots.reduce((found, spot) => (free(spot) > free(found) + 1 ? spot : found));
+    this.taken.push([x + best[0], y + best[1]]);
+    return { x: best[0], y: best[1] + 2 };
+  }
+
   #uav(id) {
     const body = draw("path", { class: "craft", d: "M0-11L8 8 0 4-8 8z" });
     const attributes = { class: "mark uav", id: `uav-${id}`, role: "button", tabindex: -1 };
-    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, String(id)));
+    const group = draw("g", attributes, draw("circle", { class: "hit", r: 16 }), body, draw("text", { class: "label", x: 11, y: -7 }, `U${id}`));
     const link = draw("line", { class: "link" });
     this.uavs.append(group);
     this.links.append(link);
@@ -204,7 +217,7 @@ export class MissionMap {
 
   #legend(scale) {
     const { measured, seen } = this.mission.totals;
-    const whose = measured === 0 ? "the edge's own time: these UAVs do not tell their round trip" : measured < seen ? "round trip as the UAV measured it; the edge's own time where it has not told" : "round trip as the UAV measured it";
+    const whose = measured === 0 ? "the edge's own time: these UAVs do not report their round trip" : measured < seen ? "round trip as the UAV measured it; the edge's own time where it has not reported one" : "round trip as the UAV measured it";
     const told = [scale.low, scale.high, whose].join();
     if (told === this.legendTold) return;
     this.legendTold = told;
@@ -217,7 +230,7 @@ export class MissionMap {
         draw("g", { class: "sensor" }, draw("circle", { class: "body", r: 10 }), draw("circle", { class: "queue", r: 6.5 }))), "disc: queue, its area is full at the capacity"),
       key(draw("svg", { width: 26, height: 26, viewBox: "-13 -13 26 26", "aria-hidden": "true" },
         draw("g", { class: "sensor" }, draw("circle", { class: "body", r: 10 }),
-          draw("circle", { class: "urgency", r: 10, pathLength: 1, "stroke-dasharray": "0.7 2", transform: "rotate(-90)", "stroke-width": 3.4 }))), "ring: urgency, 0 to a whole turn at 1"),
+          draw("circle", { class: "urgency", r: 10, pathLength: 1, "stroke-dasharray": "0.7 2", transform: "rotate(-90)", "stroke-width": 3.4 }))), "ring: urgency; a full circle is 1"),
       key(draw("svg", { width: 26, height: 26, viewBox: "-13 -13 26 26", "aria-hidden": "true" },
         draw("g", { class: "uav" }, draw("path", { class: "craft", d: "M0-11L8 8 0 4-8 8z" }))), "UAV, and the sensor that it collects from"),
       key(bar, `trail: ${shown(scale.low)} to ${shown(scale.high)} ms, ${whose}`));
@@ -256,6 +269,11 @@ export class MissionMap {
     const { kind, id } = this.marks.get(group.id);
     this.onChoose(kind, Number(id));
   }
+}
+
+function fullIn(steps) {
+  if (steps <= 0) return "believed full";
+  return steps > 1000 ? "not filling" : `full in about ${shown(steps)} steps`;
 }
 
 const px = (value) => Math.round(value * 100) / 100;

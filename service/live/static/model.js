@@ -34,6 +34,24 @@ export class Mission {
     this.now = update;
     for (const told of update.decisions) this.#decided(told);
     for (const outcome of update.outcomes) this.#settled(outcome);
+    for (const [step, count] of update.full_by_step) this.#step(step).full = count;
+    this.heardAt = performance.now();
+  }
+
+  /** Seconds since the edge's last decision; null before the first. */
+  get idleS() {
+    return this.now.idle_s === null ? null : this.now.idle_s + (performance.now() - this.heardAt) / 1000;
+  }
+
+  /** Whether every UAV has its decision of the mission's last step. */
+  get ended() {
+    const { uavs, steps } = this.scenario;
+    return this.now.step >= steps - 1 && this.decidedIn(steps - 1) >= uavs;
+  }
+
+  /** The number of UAVs that have a decision in this step. */
+  decidedIn(step) {
+    return new Set([...this.decisions.values()].filter(({ answer }) => answer.step === step).map(({ answer }) => answer.uav_id)).size;
   }
 
   /** Decisions, the newest first. */
@@ -81,7 +99,7 @@ export class Mission {
 
   #step(number) {
     if (!this.steps.has(number)) {
-      const none = { count: 0, edge: 0, slowest: 0, prompt: 0, uncompressed: 0, told: 0, cost: 0, failed: 0 };
+      const none = { count: 0, edge: 0, slowest: 0, prompt: 0, uncompressed: 0, told: 0, cost: 0, failed: 0, full: 0 };
       this.steps.set(number, { ...none, measured: 0, roundTrip: 0 });
       if (this.steps.size > MOST_STEPS) this.steps.delete(this.steps.keys().next().value);
     }

@@ -1,7 +1,9 @@
 // What the wire's words mean, for people.
 
+import { shown } from "./dom.js";
+
 export const SOURCES = {
-  guided: "LLM among the advisers",
+  guided: "guided",
   llm: "LLM",
   value: "learned values",
   policy: "LLM-free policy",
@@ -12,33 +14,46 @@ const REASONS = {
   mode_policy: "as its mode says",
   no_candidate: "no sensor was both heard and free",
   llm_loading: "the LLM was still loading",
-  llm_unavailable: "no LLM was to be had",
+  llm_unavailable: "no LLM was available",
   llm_timeout: "the LLM was too late",
   llm_status: "the LLM's server refused",
   llm_error: "the LLM's server failed",
-  llm_busy: "too many waited for the LLM",
+  llm_busy: "too many queries waited for the LLM",
   answer_format: "the LLM's answer had the wrong form",
   answer_sensor: "the LLM named a sensor that was not offered",
   answer_velocity: "the LLM named a velocity that is not allowed",
-  answer_reserved: "another UAV had got the sensor meanwhile",
+  answer_reserved: "another UAV had taken the sensor meanwhile",
   critic_timeout: "there was no time to weigh the candidates",
   rule_reach: "the LLM's sensor would have been out of reach",
   rule_battery: "the LLM's sensor has a flat battery",
 };
 
-/** Who decided, and why it was not the LLM if it was not. */
-export function why(answer) {
-  if (answer.reason) return REASONS[answer.reason] ?? answer.reason;
-  return answer.model ? `with ${answer.model}` : "";
-}
-
 export const ADVISERS = { llm: "LLM", planner: "planner", value: "learned values", policy: "look-ahead" };
 
+/** A share as a percentage; what is neither 0 nor 1 is not rounded to them. */
+export function percent(share) {
+  if (share > 0 && share < 0.005) return "<1%";
+  if (share < 1 && share >= 0.995) return ">99%";
+  return `${shown(100 * share, 0)}%`;
+}
+
+/** Who decided; in mode guided the adviser that weighed most. */
+export function decider(answer) {
+  const name = SOURCES[answer.source] ?? answer.source;
+  if (answer.source !== "guided" || !answer.guided) return name;
+  const [leading, weight] = Object.entries(answer.guided.trust).sort((a, b) => b[1] - a[1])[0];
+  return `${name} (${ADVISERS[leading] ?? leading} ${percent(weight)})`;
+}
+
+/** Why the decision is not the LLM's; empty where it has a part in it. */
+export const why = (answer) => (answer.reason ? (REASONS[answer.reason] ?? answer.reason) : "");
+
+/** The state of the operator's note. */
 export const GUIDANCE = {
-  none: "",
-  compiling: "is being read by the LLM",
-  proposed: "was read; it waits for the operator's word",
-  confirmed: "is confirmed and obeyed",
-  rejected: "was rejected: it is not obeyed",
-  failed: "was not understood: it is not obeyed",
+  none: "No note.",
+  compiling: "The LLM is reading the note.",
+  proposed: "The LLM has read the note. Its orders wait for your confirmation:",
+  confirmed: "Confirmed.",
+  rejected: "Rejected: the note is not obeyed.",
+  failed: "The note was not understood, and is not obeyed:",
 };

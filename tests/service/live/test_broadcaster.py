@@ -116,7 +116,12 @@ def test_updates_come_at_most_ten_times_a_second(edge: Edge, report: Report, mon
 
 def test_the_missions_are_listed_the_one_that_decided_last_first(edge: Edge, report: Report) -> None:
     client = edge()
-    assert client.get("/missions").json() == {"missions": [], "more": 0, "newest": None}
+    assert client.get("/missions").json() == {
+        "missions": [],
+        "more": 0,
+        "newest": None,
+        "may_command": True,
+    }
     client.put("/missions/waits", json={"mode": "policy"})
     for named in ("a", "b", "a"):
         decided(client, report(mission_id=named))

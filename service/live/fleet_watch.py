@@ -1,0 +1,99 @@
+"""What the reports of a fleet say about its troubles: overflows by step, silent sensors, and visit deadlines."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from service.mission.mission import Mission
+from shared.bounded import BoundedDict
+from shared.channel import FloatArray
+from shared.fleetplan import FleetBelief
+from shared.scenario import Scenario
+from shared.urgency import overflow_probability
+from shared.wire import UavState
+
+# Missions that are watched, and the steps that are remembered of each.
+_MOST_MISSIONS = 1000
+_MOST_STEPS = 1000
+
+
+@dataclass(slots=True)
+class Watched:
+    """What was seen of one mission since the edge started.
+
+    Attributes:
+        full: by step, the expected number of sensors that overflowed into it, as the fleet believed.
+        deadlines: by step, the numbers of visit deadlines that were kept and missed.
+        silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
+        decided_at: the monotonic time of the last decision, seconds; None before the first.
+    """
+
+    full: BoundedDict[int, float] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
+    deadlines: BoundedDict[int, tuple[int, int]] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
+    silent: dict[int, int] = field(default_factory=dict)
+    decided_at: float | None = None
+
+    def totals(self) -> dict[str, Any]:
+        """The page's numbers: sums over the steps, the silent sensors, and the seconds since the last decision."""
+        counts = list(self.deadlines.values())
+        return {
+            "overflows": round(sum(self.full.values()), 1),
+            "deadlines": {"kept": sum(kept for kept, _ in counts), "missed": sum(missed for _, missed in counts)},
+            "silent": self.silent,
+            "idle_s": None if self.decided_at is None else round(time.monotonic() - self.decided_at, 1),
+        }
+
+
+class FleetWatch:
+    """Watches every mission at its decisions; only the event loop uses it."""
+
+    def __init__(self) -> None:
+        self._missions = BoundedDict[str, Watched](_MOST_MISSIONS)
+
+    def decided(self, mission: Mission, uav: UavState, step: int) -> None:
+        """Take a report that was answered, and the belief after it."""
+        watched = self.of(mission.mission_id)
+        watched.decided_at = time.monotonic()
+        watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
+        self._hear(watched, mission, uav, step)
+        orders = mission.guidance.confirmed
+        if orders.wishes:
+            every = orders.every(mission.scenario.sensors)
+            late = orders.overdue(step, mission.records.visits) > 0
+            missed = int(late.sum())
+            watched.deadlines[step] = int(np.isfinite(every).sum()) - missed, missed
+
+    def of(self, mission_id: str) -> Watched:
+        """What was seen of the mission."""
+        found = self._missions.get(mission_id)
+        if found is None:
+            found = self._missions[mission_id] = Watched()
+        return found
+
+    def forget(self, mission_id: str) -> None:
+        """Forget a deleted mission."""
+        self._missions.take(mission_id)
+
+    def _hear(self, watched: Watched, mission: Mission, uav: UavState, step: int) -> None:
+        """Note the reported sensors within the UAV's radio radius that it did not hear in this step."""
+        ids = np.array(uav.sensors.id, dtype=np.int64)
+        offset = mission.belief.places[ids] - np.array(uav.position)
+        near = np.hypot(offset[:, 0], offset[:, 1]) <= mission.scenario.radio_radius_m
+        for row in np.flatnonzero(near).tolist():
+            if uav.sensors.last_seen[row] == step:
+                watched.silent.pop(int(ids[row]), None)
+            else:
+                watched.silent[int(ids[row])] = step
+
+
+def _overflowed(belief: FleetBelief, step: int, scenario: Scenario) -> FloatArray:
+    """The probability that each queue is full at a step's start, ``P(base + Poisson(rate x steps since) >= W)``."""
+    # The arrivals of the steps since, in terms of the function's own horizon.
+    arrived = belief.rate * np.maximum(step - belief.since, 0) / scenario.overflow_horizon_steps
+    # One packet more than there is: at least full, not more than full.
+    reached = overflow_probability(belief.base + 1, arrived, scenario)
+    return np.where(belief.base >= scenario.queue_capacity, 1.0, reached)

@@ -1,0 +1,107 @@
+// The operator's console: give a note, read what was understood, confirm or reject it, and see which deadlines are kept.
+
+import { at, make, say } from "./dom.js";
+import { post, Refused } from "./edge.js";
+import { GUIDANCE } from "./words.js";
+
+const EXAMPLE = '{"sensors": [{"sensor_id": 4, "visit_every": 3}], "max_velocity": 10}';
+
+export class Operator {
+  constructor() {
+    this.mission = null;
+    this.busy = false;
+    at("note-form").addEventListener("submit", (event) => this.#submit(event, () => ({ note: at("note-input").value.trim() }), at("note-input")));
+    at("orders-form").addEventListener("submit", (event) => this.#submit(event, () => ({ guidance: JSON.parse(at("orders-input").value) }), null));
+    at("confirm").addEventListener("click", () => this.#send({ answer: "confirm" }));
+    at("reject").addEventListener("click", () => this.#send({ answer: "reject" }));
+    at("edit").addEventListener("click", () => this.#edit());
+    at("orders-input").placeholder = EXAMPLE;
+  }
+
+  /** Begin with another mission. */
+  begin() {
+    say(at("operator-error"), "");
+    at("operator").open = false;
+    this.seen = null;
+  }
+
+  /** Show a mission's guidance. */
+  update(mission, mayCommand) {
+    this.mission = mission;
+    const { guidance, deadlines, step } = mission.now;
+    const waits = guidance.status === "proposed";
+    say(at("operator-summary"), summary(guidance, waits));
+    at("note").hidden = guidance.note === null && guidance.guidance === null;
+    at("note-quote").hidden = guidance.note === null;
+    say(at("note-text"), guidance.note ?? "");
+    say(at("note-state"), guidance.note === null ? "Orders without a note." : GUIDANCE[guidance.status] ?? guidance.status);
+    const orders = waits ? guidance.in_words : guidance.status === "failed" ? guidance.failure : "";
+    say(at("note-words"), orders ?? "");
+    at("note-words").hidden = !orders;
+    at("answer").hidden = !mayCommand || !(waits || (guidance.status === "confirmed" && guidance.obeyed_in_words));
+    at("confirm").hidden = !waits;
+    say(at("reject"), waits ? "Reject" : "Withdraw the orders");
+    at("command").hidden = !mayCommand;
+    at("read-only").hidden = mayCommand;
+    this.#orders(guidance, deadlines, step);
+    // Once for each proposal: who closes the console wants it closed.
+    if (waits && this.seen !== guidance.in_words) at("operator").open = true;
+    this.seen = waits ? guidance.in_words : null;
+  }
+
+  #orders(guidance, deadlines, step) {
+    say(at("orders-words"), guidance.obeyed_in_words ?? "None.");
+    const due = guidance.orders.filter((order) => order.due !== null);
+    at("deadlines").hidden = due.length === 0;
+    say(at("deadlines-kept"), `Deadlines of sensors, summed over the steps: ${deadlines.kept} kept, ${deadlines.missed} missed.`);
+    const rows = due.map((order) => {
+      const late = order.due < step;
+      const text = late ? `late: it was due by step ${order.due}` : `due by step ${order.due}`;
+      return make("li", late ? { class: "late" } : {}, `S${order.sensor_id}, every ${order.visit_every} steps: ${text}`);
+    });
+    at("deadlines-list").replaceChildren(...rows);
+  }
+
+  #edit() {
+    const { guidance } = this.mission.now.guidance;
+    at("orders-input").value = JSON.stringify(guidance ?? JSON.parse(EXAMPLE), null, 1);
+    at("structure").open = true;
+    at("orders-input").focus();
+  }
+
+  #submit(event, body, cleared) {
+    event.preventDefault();
+    let made;
+    try {
+      made = body();
+    } catch (error) {
+      say(at("operator-error"), `These orders are no JSON: ${error.message}`);
+      return;
+    }
+    this.#send(made).then((done) => {
+      if (done && cleared) cleared.value = "";
+    });
+  }
+
+  async #send(body) {
+    if (this.busy || !this.mission) return false;
+    this.busy = true;
+    say(at("operator-error"), "");
+    try {
+      await post(`missions/${encodeURIComponent(this.mission.id)}/guidance`, body);
+      return true;
+    } catch (error) {
+      say(at("operator-error"), error instanceof Refused ? `The edge refused: ${error.message}` : "The edge does not answer.");
+      return false;
+    } finally {
+      this.busy = false;
+    }
+  }
+}
+
+function summary(guidance, waits) {
+  if (waits) return "orders wait for your confirmation";
+  if (guidance.status === "compiling") return "the LLM is reading the note";
+  if (guidance.obeyed_in_words) return guidance.obeyed_in_words;
+  return guidance.status === "failed" ? "the note was not understood" : "no orders";
+}
