@@ -173,7 +173,7 @@ def serving() -> Iterator[str]:
     try:
         assert process.stderr is not None
         line = process.stderr.readline()
-        found = re.search(r"running on (http://[\d.:]+)", line)
+        found = re.search(r"listening on (http://[\d.:]+)", line)
         if found is None:
             raise RuntimeError(f"the edge did not start: {line}{process.stderr.read()}")
         with EdgeClient(found[1], timeout_s=60.0) as client:

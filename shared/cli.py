@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import sys
+from difflib import get_close_matches
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
 
 _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
+    "doctor": "look for what keeps an edge from running here, and say what to type",
+    "mission": "`mission create`: tell an edge your world, and print a request that works for it",
     "simulate": "fly one mission against an edge, local or remote, and write its report",
     "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
+    "compare": "set two or more missions side by side: a table and the figures",
     "experiment": "reproduce a figure or table of the paper, or one beyond it, over many seeds",
     "bound": "the fewest packets that a fleet could have lost in one world, all arrivals known",
     "train": "train the learned baselines, MADQN and MAPPO",
@@ -63,7 +67,9 @@ def main() -> int:
         return 0
     found = [e for e in entry_points(group="aicvds.commands") if e.name == name]
     if not found:
-        print(f"aicvds: there is no command {name!r}\n\n{usage()}", file=sys.stderr)
+        near = get_close_matches(name, _SUMMARIES, n=1)
+        meant = f"; did you mean `aicvds {near[0]}`?" if near else ""
+        print(f"aicvds: there is no command {name!r}{meant}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
         return int(found[0].load()(rest) or 0)

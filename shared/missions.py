@@ -36,6 +36,7 @@ class MissionStatus(Wire):
     prompt: PromptStyle = PromptStyle()
     init: Init
     seed: int
+    note: str | None = Field(None, description="the operator's newest note")
     decisions: int
     feedback: int
     experiences: int

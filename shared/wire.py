@@ -258,9 +258,12 @@ class DecideResponse(Wire):
     mission_id: MissionId
     uav_id: UavId
     step: Step
-    sensor_id: SensorId
-    velocity: int = Field(ge=0, le=14)
-    source: Source
+    sensor_id: SensorId = Field(description="collect from this sensor")
+    velocity: int = Field(ge=0, le=14, description="m/s, for the next step")
+    source: Source = Field(
+        description="`llm`: the LLM's answer; `guided`: several advisers, the LLM among them; `value`: the learned "
+        "modules; `policy`: the planner or one step of look-ahead"
+    )
     reason: Reason | None = Field(None, description="why the decision is not the LLM's")
     model: str | None = None
     top_k: list[Candidate]
@@ -284,7 +287,9 @@ class BatchResponse(Wire):
 class FeedbackRequest(Outcome):
     """``POST /feedback``: an outcome on its own."""
 
-    mission_id: MissionId = "default"
+    mission_id: MissionId | None = Field(
+        None, description="the decision's mission; omitted: the mission that knows the decision"
+    )
 
 
 class FeedbackResponse(Wire):

@@ -6,12 +6,16 @@ import gc
 import ipaddress
 import socket
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from pydantic import ValidationError
+
+from shared.faults import problem_of
+from shared.wire import Mode
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -23,9 +27,9 @@ if TYPE_CHECKING:
 class Serve:
     """Run the edge decision service.
 
-    Decides at once by its LLM-free policy, and by the LLM as soon as that is loaded (watch /readyz). With no
-    AICVDS_LLM_URL it embeds SmolLM2-135M; `aicvds model fetch` brings the file. Everything else is set by
-    environment variables AICVDS_*: see the table in docs/operations.md.
+    Decides at once by its LLM-free policy, and by the LLM as soon as that is loaded (watch /readyz). With no LLM server
+    it embeds SmolLM2-135M; `aicvds model fetch` brings the file. Everything else is set by environment variables
+    AICVDS_*: see the table in docs/operations.md. `aicvds doctor` looks for what may be in the way.
 
     Try it:  curl localhost:8000/readyz
     """
@@ -34,6 +38,19 @@ class Serve:
     """Address to listen on; 0.0.0.0 for every interface. Any but loopback needs AICVDS_KEYS, or AICVDS_ANONYMOUS=on."""
     port: Annotated[int, tyro.conf.arg(metavar="0-65535")] = 8000
     """Port to listen on; 0 picks a free one."""
+    mode: Annotated[Mode | None, tyro.conf.arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None
+    """Who decides where a mission does not say. Default: AICVDS_MODE, or guided."""
+    llm_url: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    """An LLM server with OpenAI's interface, up to and including /v1. Default: AICVDS_LLM_URL, or the embedded LLM."""
+    llm_model: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """The model at that server. Default: AICVDS_LLM_MODEL, or the first that it lists."""
+    store: Annotated[str | None, tyro.conf.arg(metavar="FILE|none", help_behavior_hint="")] = None
+    """SQLite file of the missions; none: they end with the process. Default: AICVDS_STORE, or a file in your home."""
+
+    def settings(self) -> dict[str, Any]:
+        """The settings that were given as options; the environment has the others."""
+        given = {"mode": self.mode, "llm_url": self.llm_url, "llm_model": self.llm_model, "store": self.store}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 def main(argv: list[str]) -> int:
@@ -41,54 +58,70 @@ def main(argv: list[str]) -> int:
     args = tyro.cli(Serve, prog="aicvds serve", args=argv)
     if not 0 <= args.port <= 65535:
         return _refused(f"--port {args.port} is not between 0 and 65535")
+    settings = checked_settings(args.settings(), args.host)
+    if settings is None:
+        return 2
     try:
         family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
         listener = socket.create_server((args.host, args.port), family=family)
     except OSError as error:
-        return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}")
+        other = "; choose another --port, or 0 for a free one" if args.port else ""
+        return _refused(f"cannot listen on {args.host}:{args.port}: {error.strerror or error}{other}")
     host = f"[{args.host}]" if ":" in args.host else args.host
+    url = f"http://{host}:{listener.getsockname()[1]}"
     try:
         # The system queues requests from here on. /healthz answers at once, the other routes once torch is loaded.
-        print(
-            f"aicvds serve: running on http://{host}:{listener.getsockname()[1]}, loading", file=sys.stderr, flush=True
-        )
+        print(f"aicvds serve: listening on {url}, loading", file=sys.stderr, flush=True)
         # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
         with listener:
-            return _serve(listener, args.host)
+            return _serve(listener, settings, url)
     except KeyboardInterrupt:
         return 130
     finally:
         gc.enable()
 
 
-def _serve(listener: socket.socket, host: str) -> int:
+def checked_settings(given: dict[str, Any], host: str) -> Settings | None:
+    """The settings, where an edge can listen on ``host`` with them; None once the faults are printed."""
+    from service.api.api_keys import BadKeys, KeyFile
     from service.config.settings import Settings, unknown_variables
-    from service.server.malloc import hand_back_memory
 
-    hand_back_memory()
-
+    for name, meant in unknown_variables().items():
+        print(f"aicvds serve: {name} is no setting and changes nothing{meant}", file=sys.stderr)
     try:
-        settings = Settings()
+        settings = Settings(**given)
     except ValidationError as error:
         for fault in error.errors():
-            name = "AICVDS_" + "_".join(str(part) for part in fault["loc"]).upper()
-            _refused(f"{name}: {fault['msg']}")
-        return 2
-    for name in unknown_variables():
-        print(f"aicvds serve: {name} is no setting and changes nothing", file=sys.stderr)
-
+            field = "_".join(str(part) for part in fault["loc"])
+            name = f"--{field.replace('_', '-')}" if field in given else f"AICVDS_{field.upper()}".removesuffix("_")
+            _refused(f"{name}: {problem_of(fault)}")
+        return None
     if settings.keys is None and settings.anonymous == "off" and not _is_loopback(host):
-        return _refused(
+        _refused(
             f"anyone who reaches {host} could control this fleet. Make a key with "
             "`aicvds keys add NAME --file keys.json`, set AICVDS_KEYS=keys.json, or say AICVDS_ANONYMOUS=on"
         )
+        return None
+    if settings.keys is not None:
+        try:
+            KeyFile.read(settings.keys)
+        except BadKeys as error:
+            _refused(f"AICVDS_KEYS: {error}")
+            return None
+    return settings
 
+
+def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     from service.observability import logs
+    from service.server.malloc import hand_back_memory
     from service.server.server import Server
 
+    hand_back_memory()
     logs.configure(settings.log_level, settings.log_format)
-    server = Server(partial(_application, settings), settings.log_level)
+    # A machine reads a log of JSON: it gets no banner.
+    loaded = _say if settings.log_format == "text" else lambda text: None
+    server = Server(partial(_application, settings, url, loaded), settings.log_level)
     server.run(sockets=[listener])
     if isinstance(server.error, _Unusable):
         return _refused(str(server.error))
@@ -97,19 +130,25 @@ def _serve(listener: socket.socket, host: str) -> int:
     return 0
 
 
-def _application(settings: Settings) -> FastAPI:
+def _application(settings: Settings, url: str, loaded: Callable[[str], None]) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
     from service.api.api_keys import BadKeys
     from service.api.app import create_app
+    from service.commands.banner import banner
     from service.storage.locks import StoreUnusable
     from service.storage.store import Store
 
     try:
-        return create_app(settings, None if settings.store == "none" else Store(settings.store))
+        store = None if settings.store == "none" else Store(settings.store)
+        app = create_app(settings, store)
     except BadKeys as error:
         raise _Unusable(f"AICVDS_KEYS: {error}") from None
     except StoreUnusable as error:
-        raise _Unusable(f"AICVDS_STORE: {error}. Give another, or `none` to store nothing") from None
+        raise _Unusable(
+            f"AICVDS_STORE: {error}. Give another (--store FILE), or `--store none` to store nothing"
+        ) from None
+    loaded(banner(settings, url, 0 if store is None else len(store.missions())))
+    return app
 
 
 class _Unusable(Exception):
@@ -121,6 +160,10 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _refused(fault: str) -> int:

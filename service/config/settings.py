@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.config.cores import usable_cores
 from service.config.prompt_budget import prompt_tokens
+from shared.faults import suggestion
 from shared.wire import Mode, Selection
 
 
@@ -186,7 +187,11 @@ def _for_each(servers: int, name: str, value: str | None) -> list[str | None]:
     return values * servers if len(values) == 1 else values
 
 
-def unknown_variables() -> list[str]:
-    """Environment variables with the prefix of settings that are none: mostly misspelled ones."""
+def unknown_variables() -> dict[str, str]:
+    """Environment variables with the prefix of settings that are none, mostly misspelled ones, each with a suggestion.
+
+    A suggestion begins with a semicolon; it is empty where no setting has a similar name.
+    """
     known = {f"AICVDS_{name.upper()}" for name in Settings.model_fields} | _SIMULATORS
-    return sorted(name for name in os.environ if name.startswith("AICVDS_") and name not in known)
+    unknown = sorted(name for name in os.environ if name.startswith("AICVDS_") and name not in known)
+    return {name: suggestion(name, known) for name in unknown}

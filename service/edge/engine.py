@@ -132,7 +132,10 @@ class Engine:
             Conflict: another outcome of the decision is applied already.
             Unavailable: the store fails, or is slow; the client is to send the outcome again.
         """
-        mission = await self.missions.get(request.mission_id)
+        if request.mission_id is None:
+            mission = await self.missions.of_decision(request.decision_id)
+        else:
+            mission = await self.missions.get(request.mission_id)
         self.missions.refuse_if_failing("decision_id")
         result = self._feedback.apply(mission, request)
         try:

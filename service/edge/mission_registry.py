@@ -78,6 +78,21 @@ class MissionRegistry:
             raise NotFound("mission_id", f"there is no mission {mission_id}")
         return mission
 
+    async def of_decision(self, decision_id: str) -> Mission:
+        """The mission that knows the decision: one in memory, or mission ``default`` from the store.
+
+        Raises:
+            NotFound: none does; the decision may be of another mission that is only in the store.
+            Unavailable, Conflict: as :meth:`get`.
+        """
+        for mission in self.loaded:
+            if mission.pending.knows(decision_id):
+                return mission
+        if "default" in self._stored and (mission := await self.get("default")).pending.knows(decision_id):
+            return mission
+        detail = f"no mission in memory knows decision {decision_id}, or it is forgotten; name its mission_id"
+        raise NotFound("decision_id", detail)
+
     async def resolve(
         self, request: AnyRequest, *, may_make: bool, key: str | None, within_s: float
     ) -> tuple[Mission, AnyRequest]:

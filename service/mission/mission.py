@@ -243,6 +243,7 @@ class Mission:
             prompt=self.spec.prompt,
             init=self.spec.init,
             seed=self.spec.seed,
+            note=self.guidance.note,
             decisions=self.decisions,
             feedback=self.feedback,
             experiences=len(self.experiences.block),

@@ -65,6 +65,10 @@ class PendingDecisions:
         self.applied = AppliedOutcomes(_APPLIED_PER_UAV * scenario.uavs)
         self.max_step_cost = float(scenario.uavs + scenario.sensors)
 
+    def knows(self, decision_id: str) -> bool:
+        """Whether the decision waits for its outcome, or has it."""
+        return decision_id in self._decisions or decision_id in self.applied
+
     def find(self, outcome: Outcome) -> Literal["pending", "applied"]:
         """Whether the decision still waits for an outcome, or this outcome is already applied.
 

@@ -9,8 +9,9 @@ import queue
 import sys
 import threading
 import time
+from collections.abc import MutableMapping
 from contextlib import suppress
-from typing import Literal
+from typing import Any, Literal
 
 import structlog
 from structlog.typing import Processor
@@ -79,6 +80,7 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
         structlog.stdlib.add_logger_name,
         structlog.stdlib.ExtraAdder(),
         structlog.processors.TimeStamper(fmt="iso", utc=True),
+        _without_colours,
     ]
     renderers: list[Processor] = (
         [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
@@ -95,6 +97,15 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
     handler.start()
     # At level info httpx logs every request with its address.
     logging.getLogger("httpx").setLevel(logging.WARNING)
+    if level != "debug":
+        # At level info it logs each of its plugins, also where no table changes.
+        logging.getLogger("alembic").setLevel(logging.WARNING)
+
+
+def _without_colours(_: object, __: str, event: MutableMapping[str, Any]) -> MutableMapping[str, Any]:
+    """Drop uvicorn's second copy of its message, which has a terminal's colour codes."""
+    event.pop("color_message", None)
+    return event
 
 
 def hurry() -> None:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from shared.scenario import Scenario, scenario_named
+from shared.wire import MissionId, Note
 from simulator.client.calls import edge_url
 from simulator.errors import UsageError
 from simulator.sites.site import Site
@@ -32,6 +36,27 @@ def check_deadline(deadline_ms: int | None) -> None:
     """Raises ``UsageError`` for a ``--deadline-ms`` out of the edge's bounds; ``None`` selects the edge's default."""
     if deadline_ms is not None:
         check_between("--deadline-ms", deadline_ms, 10, 60_000)
+
+
+def check_mission(mission_id: str | None) -> None:
+    """Raises ``UsageError`` for a ``--mission`` that is no mission's ID."""
+    if mission_id is not None:
+        _check_as(
+            MissionId, "--mission", mission_id, "use letters, digits, . _ and -, at most 64, a letter or digit first"
+        )
+
+
+def check_note(note: str | None) -> None:
+    """Raises ``UsageError`` for a ``--note`` that is too long or has line breaks."""
+    if note is not None:
+        _check_as(Note, "--note", note, "give one paragraph of at most 280 printable characters")
+
+
+def _check_as(kind: Any, option: str, value: str, remedy: str) -> None:
+    try:
+        TypeAdapter(kind).validate_python(value)
+    except ValidationError:
+        raise UsageError(f"{option} {value[:32]!r}: {remedy}") from None
 
 
 def checked_edge(edge: str | None) -> str:

@@ -39,7 +39,7 @@ class Replay:
 
       aicvds simulate --edge http://127.0.0.1:8000 --out runs/first
 
-      AICVDS_LLM_URL=http://localhost:11434/v1 aicvds serve --port 8001
+      aicvds serve --port 8001 --store none --llm-url http://localhost:11434/v1
 
       aicvds replay runs/first --edge http://127.0.0.1:8001 --out runs/other-model
 

@@ -12,7 +12,16 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
 from shared.wire import Mode, Uplink
-from simulator.cli.options import check_between, check_deadline, check_seed, check_wait, checked_edge, chosen_site
+from simulator.cli.options import (
+    check_between,
+    check_deadline,
+    check_mission,
+    check_note,
+    check_seed,
+    check_wait,
+    checked_edge,
+    chosen_site,
+)
 from simulator.cli.running import INTERRUPTED, command_main
 from simulator.errors import UsageError
 from simulator.flying.run import BOUND_S, Job, conduct, new_mission_id
@@ -73,6 +82,12 @@ class Simulate:
     mode: Annotated[Mode | None, arg(metavar="MODE")] = None
     """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or
     policy (the planner). Default: the edge's."""
+    mission: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    """The mission's ID at the edge: of a new mission, or of one that was made there for this world and has not flown.
+    Default: a new one, such as paper-0-1f6c09ab."""
+    note: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint="")] = None
+    """The operator's note in plain words, at most 280 characters. The edge obeys it once it is confirmed, on the
+    mission page or by POST /missions/ID/guidance."""
     uplink: Annotated[Uplink, arg(metavar="full|delta|pruned")] = "full"
     """The part of each report to send: full, the sensors that changed (delta, with the same decisions), or the k
     sensors that attention on board selects (pruned)."""
@@ -114,7 +129,7 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     check(options)
     from simulator.flying.flight_metrics import FlightMetrics, served
 
-    mission_id = new_mission_id(site.scenario, options.seed)
+    mission_id = options.mission or new_mission_id(site.scenario, options.seed)
     job = Job(
         site=site,
         seed=options.seed,
@@ -124,6 +139,8 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         policy=options.policy,
         edge=options.edge if options.policy == "edge" else None,
         mode=options.mode,
+        note=options.note,
+        named=options.mission is not None,
         uplink=options.uplink,
         deadline_ms=options.deadline_ms,
         wait_s=options.wait_s,
@@ -155,9 +172,13 @@ def check(options: Simulate) -> None:
     check_between("--metrics-port", options.metrics_port, 0, 65_535)
     if options.policy == "edge":
         checked_edge(options.edge)
-    elif options.edge is not None:
+        check_mission(options.mission)
+        check_note(options.note)
+        return
+    if options.edge is not None:
         raise UsageError(f"--policy {options.policy} asks no edge, so --edge contradicts it; give one of the two")
-    elif options.uplink != "full":
-        raise UsageError(
-            f"--policy {options.policy} asks no edge, so --uplink {options.uplink} means nothing; leave it out"
-        )
+    of_an_edge: dict[str, object] = {"mode": options.mode, "mission": options.mission, "note": options.note}
+    of_an_edge |= {"uplink": None if options.uplink == "full" else options.uplink, "deadline-ms": options.deadline_ms}
+    for name, value in of_an_edge.items():
+        if value is not None:
+            raise UsageError(f"--policy {options.policy} asks no edge, so --{name} {value} means nothing; leave it out")

@@ -85,6 +85,7 @@ class EdgePilot:
         seed: int,
         *,
         mode: Mode | None = None,
+        note: str | None = None,
         deadline_ms: int | None = None,
         probe: EdgeClient | None = None,
         reconnect_s: float = 0.0,
@@ -96,7 +97,7 @@ class EdgePilot:
         self._on_wait = on_wait
         self._step = 0
         self._mission_id = mission_id
-        self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode)
+        self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode, note=note)
         self._deadline_ms = deadline_ms
         self._max_velocity = scenario.max_velocity
         self._pending: dict[int, Outcome] = {}

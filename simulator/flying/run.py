@@ -16,11 +16,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from shared.guidance import GuidanceAnswer
+from shared.missions import MissionStatus
 from shared.scenario import Scenario
-from shared.wire import Mode, Uplink
+from shared.wire import MissionSpec, Mode, Uplink
 from simulator.cli.running import INTERRUPTED
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport
+from simulator.errors import EdgeRefused, UsageError
 from simulator.records.decision_log import DecisionLog
 from simulator.records.request_log import RequestLog, resolved
 from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, fresh_folder, naming_out
@@ -52,7 +55,8 @@ def new_mission_id(scenario: Scenario, seed: int) -> str:
 class Job:
     """One mission to conduct.
 
-    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. Before take-off the mission waits,
+    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. A ``named`` mission may exist at the
+    edge before the flight. ``note`` is the operator's. Before take-off the mission waits,
     at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses
     is searched for ``bound_s`` seconds at most; 0 searches none.
     """
@@ -65,6 +69,8 @@ class Job:
     policy: str = "edge"
     edge: str | None = None
     mode: Mode | None = None
+    note: str | None = None
+    named: bool = False
     uplink: Uplink = "full"
     deadline_ms: int | None = None
     wait_s: float = 120.0
@@ -96,10 +102,13 @@ def conduct(
         model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
         progress = _ProgressText(metrics)
         pilot = EdgePilot(
-            radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, deadline_ms=job.deadline_ms,
+            radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, note=job.note,
+            deadline_ms=job.deadline_ms,
             probe=probe, reconnect_s=job.reconnect_s, on_wait=progress.waiting,
         )  # fmt: skip
-        created = ground.put_mission(job.mission_id, pilot.spec)
+        created = begun_mission(ground, job, pilot.spec)
+        watched = f"{job.edge}/?mission={job.mission_id}"
+        console.print(f"Mission {job.mission_id}; watch it at {watched}", markup=False, highlight=False, soft_wrap=True)
         fresh_folder(job.out)
         with naming_out(job.out):
             requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, created))
@@ -113,6 +122,37 @@ def conduct(
             f"{unanswered} decisions were taken on board. The edge's last failure: {pilot.last_error}", file=sys.stderr
         )
     return code or (1 if flight.decisions and not pilot.answered else 0)
+
+
+def begun_mission(ground: EdgeClient, job: Job, spec: MissionSpec) -> MissionStatus:
+    """The mission at the edge: made now, or, where the job names one that is there, that one.
+
+    Raises:
+        UsageError: the mission that is there has another world or mode, or has flown already.
+        EdgeError: the edge refuses.
+    """
+    there = _existing(ground, job.mission_id) if job.named else None
+    if there is None:
+        return ground.put_mission(job.mission_id, spec)
+    name = f"--mission {job.mission_id}: the edge has this mission"
+    if there.decisions:
+        raise UsageError(f"{name}, with {there.decisions} decisions already; choose another ID, or DELETE it there")
+    if there.scenario != job.site.scenario:
+        raise UsageError(f"{name}, for another world ({there.scenario.name}); give that --scenario or --world")
+    if job.mode is not None and there.mode != job.mode:
+        raise UsageError(f"{name}, in mode {there.mode}; leave out --mode {job.mode}, or choose another ID")
+    if job.note is not None and there.note != job.note:
+        ground.answer_guidance(job.mission_id, GuidanceAnswer(note=job.note))
+    return there
+
+
+def _existing(ground: EdgeClient, mission_id: str) -> MissionStatus | None:
+    try:
+        return ground.mission(mission_id)
+    except EdgeRefused as refused:
+        if refused.status == 404:
+            return None
+        raise
 
 
 def _radio_link(scenario: Scenario, seed: int) -> LossyTransport | None:

@@ -75,4 +75,4 @@ def output_until(process: subprocess.Popen[str], pattern: str) -> re.Match[str]:
 def serving_edge(**env: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """``aicvds serve`` on a free port, with a far deadline unless told; yields its URL and process."""
     with started("serve", "--port", "0", **{"AICVDS_DEADLINE_MS": "60000", **env}) as process:
-        yield output_until(process, r"running on (http://[\d.:]+)")[1], process
+        yield output_until(process, r"listening on (http://[\d.:]+)")[1], process

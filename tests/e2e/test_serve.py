@@ -91,7 +91,7 @@ def test_other_addresses_are_served_with_keys_or_when_told_to(tmp_path: Path) ->
     key = run("keys", "add", "fleet", "--file", keys).stdout.strip()
     for env in ({"AICVDS_KEYS": keys}, {"AICVDS_ANONYMOUS": "on"}):
         with started("serve", "--port", "0", "--host", "0.0.0.0", AICVDS_MODE="policy", **env) as process:
-            port = output_until(process, r"running on http://0\.0\.0\.0:(\d+)")[1]
+            port = output_until(process, r"listening on http://0\.0\.0\.0:(\d+)")[1]
             url = f"http://127.0.0.1:{port}/metrics"
             assert httpx.get(url, timeout=PATIENCE_S).status_code == (401 if "AICVDS_KEYS" in env else 200)
             assert httpx.get(url, timeout=30, headers={"Authorization": f"Bearer {key}"}).status_code == 200
@@ -110,7 +110,37 @@ def test_a_misspelt_setting_is_told() -> None:
     told = run_here("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
     assert "AICVDS_TOP_K" in told.stderr
     with started("serve", "--port", "0", AICVDS_TOPK="3") as process:
-        output_until(process, "AICVDS_TOPK is no setting")
+        output_until(process, "AICVDS_TOPK is no setting and changes nothing; did you mean AICVDS_TOP_K?")
+
+
+def test_nothing_runs_before_the_settings_are_checked(tmp_path: Path) -> None:
+    for args, env in (
+        (["--mode", "llm", "--llm-url", "localhost:1"], {}),
+        ([], {"AICVDS_KEYS": str(tmp_path / "none.json")}),
+        (["--host", "0.0.0.0"], {}),
+    ):
+        refused = run("serve", "--port", "0", *args, **env)
+        assert refused.returncode == 2
+        assert "listening" not in refused.stderr and "Value error" not in refused.stderr
+
+
+def test_the_banner_says_what_runs_and_what_to_type_next(tmp_path: Path) -> None:
+    store = tmp_path / "missions.db"
+    with started("serve", "--port", "0", "--mode", "value", "--store", str(store), AICVDS_MODE="policy") as process:
+        url, lines = output_until(process, r"listening on (http://[\d.:]+)[^\0]*ready\n((?:  .*\n){5})").groups()
+        assert httpx.put(f"{url}/missions/m", json={}, timeout=PATIENCE_S).json()["mode"] == "value"
+    told = dict(line.split(maxsplit=1) for line in lines.strip().splitlines())
+    assert told["page"] == f"{url}/"
+    assert told["decides"] == "mode value, without an LLM"
+    assert told["store"] == f"{store}, 0 missions"
+    assert told["next"] == f"aicvds simulate --edge {url} --out runs/mission"
+    assert store.exists()
+
+
+def test_the_log_of_a_start_is_short_and_plain(tmp_path: Path) -> None:
+    with started("serve", "--port", "0", AICVDS_MODE="value", AICVDS_STORE=str(tmp_path / "m.db")) as process:
+        said = output_until(process, r"[^\0]*next .*\n")[0]
+    assert "alembic" not in said and "color_message" not in said
 
 
 def test_ctrl_c_while_loading_is_quiet() -> None:

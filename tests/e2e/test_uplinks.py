@@ -116,13 +116,13 @@ def test_an_edge_that_is_killed_on_the_way(tmp_path: Path) -> None:
         full = flown(url, "full", "full")
     with ExitStack() as stack:
         edge = stack.enter_context(started("serve", "--port", port, **common))
-        output_until(edge, "running on")
+        output_until(edge, "listening on")
 
         def restarted(flight: Flight) -> None:
             if flight.steps_flown == 6:
                 edge.kill()
                 edge.wait(PATIENCE_S)
-                output_until(stack.enter_context(started("serve", "--port", port, **common)), "running on")
+                output_until(stack.enter_context(started("serve", "--port", port, **common)), "listening on")
 
         cut = flown(f"http://127.0.0.1:{port}", "delta", "cut", on_step=restarted)
     assert decided(cut) == decided(full)

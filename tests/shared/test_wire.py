@@ -136,7 +136,7 @@ def test_a_batch_names_each_uav_once() -> None:
 def test_feedback_is_an_outcome_with_a_mission() -> None:
     feedback = FeedbackRequest.model_validate({"decision_id": DECISION, "cost": 1.0})
     assert isinstance(feedback, Outcome)
-    assert feedback.mission_id == "default"
+    assert feedback.mission_id is None
 
 
 def test_a_mission_takes_a_presets_name_or_a_whole_scenario() -> None:

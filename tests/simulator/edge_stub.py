@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
 from shared.scenario import Scenario, scenario_named
 from shared.wire import (
@@ -58,6 +59,8 @@ class EdgeStub:
     decides: list[DecideRequest] = field(default_factory=list)
     feedbacks: list[FeedbackRequest] = field(default_factory=list)
     missions: dict[str, MissionSpec] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+    flown: dict[str, int] = field(default_factory=dict)
 
     async def decide(self, request: Request) -> Response:
         """POST /decide."""
@@ -135,10 +138,18 @@ class EdgeStub:
             return Response(status_code=204)
         return Response(self._status(mission_id).model_dump_json())
 
+    async def guide(self, request: Request) -> Response:
+        """POST /missions/{mission_id}/guidance, of a new note."""
+        mission_id = request.path_params["mission_id"]
+        given = GuidanceAnswer.model_validate_json(await request.body())
+        self.notes[mission_id] = given.note or ""
+        return Response(GuidanceStatus(mission_id=mission_id, status="compiling", note=given.note).model_dump_json())
+
     def _status(self, mission_id: str) -> MissionStatus:
         spec = self.missions[mission_id]
         world = spec.scenario if isinstance(spec.scenario, Scenario) else scenario_named(spec.scenario)
         counts: dict[str, Any] = dict.fromkeys(("decisions", "feedback", "experiences", "learner_updates"), 0)
+        counts["decisions"] = self.flown.get(mission_id, 0)
         return MissionStatus(
             mission_id=mission_id,
             scenario=world,
@@ -146,6 +157,7 @@ class EdgeStub:
             top_k=5,
             init=spec.init,
             seed=spec.seed,
+            note=self.notes.get(mission_id, spec.note),
             learner_loss=None,
             visits={},
             **counts,
@@ -167,6 +179,7 @@ class EdgeStub:
                 Route("/feedback", self.feedback, methods=["POST"]),
                 Route("/missions/{mission_id}", self.put_mission, methods=["PUT"]),
                 Route("/missions/{mission_id}", self.mission, methods=["GET", "DELETE"]),
+                Route("/missions/{mission_id}/guidance", self.guide, methods=["POST"]),
                 Route("/readyz", self.readyz, methods=["GET"]),
             ]
         )

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from shared.scenario import SCENARIOS
+from shared.wire import MissionSpec
 from simulator.commands import simulate
 from simulator.records.decision_log import read_decisions
 from simulator.records.run_folder import DRAWN
@@ -96,6 +98,36 @@ def test_the_bound_is_searched_unless_it_is_left_out(
     assert (summary_in(tmp_path).bound, summary_in(tmp_path).bound_missing) == (None, None)
 
 
+def test_a_named_mission_has_its_note_and_its_address(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--edge", stub.url, "--steps", "1", "--mission", "patrol", "--out", str(tmp_path), "--overwrite"]
+    assert simulate.main([*arguments, "--note", "Visit sensor 4 every third step."]) == 0
+    assert stub.missions["patrol"].note == "Visit sensor 4 every third step."
+    assert f"Mission patrol; watch it at {stub.url}/?mission=patrol" in capsys.readouterr().out
+    # The mission is there: it is flown as it is, and a new note is given to it.
+    made = stub.missions["patrol"]
+    assert simulate.main([*arguments, "--note", "Visit sensor 2 every fourth step."]) == 0
+    assert stub.missions["patrol"] is made and stub.notes == {"patrol": "Visit sensor 2 every fourth step."}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "flown", "message"),
+    [
+        (["--steps", "2"], 0, "for another world (paper)"),
+        (["--steps", "1", "--mode", "value"], 0, "in mode llm; leave out --mode value"),
+        (["--steps", "1"], 3, "with 3 decisions already; choose another ID"),
+    ],
+)
+def test_a_mission_that_does_not_fit_is_refused(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], flown: int, message: str
+) -> None:
+    stub.missions["patrol"] = MissionSpec(scenario=SCENARIOS["paper"].model_copy(update={"steps": 1}))
+    stub.flown["patrol"] = flown
+    assert simulate.main(["--edge", stub.url, "--mission", "patrol", "--out", str(tmp_path), *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -110,6 +142,10 @@ def test_the_bound_is_searched_unless_it_is_left_out(
         (["--edge", "http://e", "--reconnect-s", "-1"], "--reconnect-s -1"),
         (["--edge", "http://e", "--policy", "eof"], "--policy eof asks no edge"),
         (["--policy", "eof", "--uplink", "delta"], "--uplink delta means nothing"),
+        (["--policy", "eof", "--mode", "llm"], "--mode llm means nothing"),
+        (["--policy", "eof", "--note", "x"], "--note x means nothing"),
+        (["--edge", "http://e", "--mission", "a b"], "--mission 'a b'"),
+        (["--edge", "http://e", "--note", "x" * 281], "at most 280"),
         (["--edge", "http://e", "--out", __file__], "is a file"),
         (["--policy", "eof", "--out", f"{__file__}/below"], f"--out {__file__}/below: Not a directory"),
     ],

@@ -1,0 +1,44 @@
+"""What `aicvds serve` says once it has loaded: where its page is, who decides, what is kept, and what to type next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from service.config.settings import Settings
+
+_LLM_MODES = ("guided", "llm")
+
+
+def banner(settings: Settings, url: str, missions: int) -> str:
+    """The lines, without the last line's end.
+
+    Args:
+        url: the edge's address.
+        missions: that the store has.
+    """
+    rows = {
+        "page": f"{url}/",
+        "decides": decides(settings),
+        "store": store(settings, missions),
+        "keys": "none needed" if settings.keys is None else f"as in {settings.keys}",
+        "next": f"aicvds simulate --edge {url} --out runs/mission",
+    }
+    return "\n".join(["aicvds serve: ready", *(f"  {name:<8} {text}" for name, text in rows.items())])
+
+
+def decides(settings: Settings) -> str:
+    """The mode, and the LLM or why there is none."""
+    if settings.mode not in _LLM_MODES:
+        return f"mode {settings.mode}, without an LLM"
+    if settings.llm_url is not None:
+        return f"mode {settings.mode}, LLM {settings.llm_model or 'as listed'} at {settings.llm_url}"
+    name = "SmolLM2-135M" if settings.llm_gguf is None else settings.llm_gguf.name
+    return f"mode {settings.mode}, embedded LLM {name}; the LLM-free policy until it is loaded (/readyz says when)"
+
+
+def store(settings: Settings, missions: int) -> str:
+    """Where missions are kept, without a password."""
+    if settings.store == "none":
+        return "none: missions end with this process"
+    where = "PostgreSQL" if "://" in settings.store else str(Path(settings.store).absolute())
+    return f"{where}, {missions} mission{'' if missions == 1 else 's'}"

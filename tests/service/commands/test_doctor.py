@@ -1,0 +1,72 @@
+"""`aicvds doctor`: each finding, and what to type about it."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from service.commands import doctor
+from service.config.settings import Settings
+from service.storage.locks import FileLock
+from tests.running import serving
+from tests.service.stub_llm import StubLlm
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def test_nothing_is_in_the_way(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("AICVDS_MODE", "value")
+    monkeypatch.setenv("AICVDS_STORE", str(tmp_path / "new" / "missions.db"))
+    assert doctor.main(["--port", str(free_port())]) == 0
+    printed = capsys.readouterr().out
+    assert "!!" not in printed and "Next:  aicvds serve" in printed
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_taken_port_and_bad_settings_have_remedies(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("AICVDS_TOP_K", "0")
+    monkeypatch.setenv("AICVDS_TOPK", "3")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        taken.setblocking(False)
+        assert doctor.main(["--port", str(taken.getsockname()[1])]) == 1
+    printed = capsys.readouterr().out
+    assert "aicvds serve --port 0" in printed
+    assert "did you mean AICVDS_TOP_K?" in printed and "unset AICVDS_TOPK" in printed
+    assert "AICVDS_TOP_K: Input should be greater" in printed and "3 in the way" in printed
+
+
+def test_a_locked_store_names_its_file(tmp_path: Path) -> None:
+    file = tmp_path / "missions.db"
+    file.touch()
+    settings = Settings(store=str(file))
+    assert doctor.store_of(settings).remedy is None
+    held = FileLock(str(file))
+    try:
+        found = doctor.store_of(settings)
+        assert "another edge uses" in found.found and found.remedy is not None and "--store" in found.remedy
+    finally:
+        held.close()
+
+
+def test_an_llm_server_must_have_the_model() -> None:
+    with serving(StubLlm("0 1").app) as url:
+        [there] = doctor.llm_servers(Settings(llm_url=f"{url}/v1"))
+        [other] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", llm_model="none-such"))
+    [gone] = doctor.llm_servers(Settings(llm_url="http://127.0.0.1:1/v1"))
+    assert there.remedy is None and "stub-1" in there.found
+    assert other.remedy is not None and "not none-such" in other.found
+    assert gone.remedy is not None
+
+
+def test_a_missing_model_file_is_fetched(tmp_path: Path) -> None:
+    [found] = doctor.embedded(Settings(cache_dir=tmp_path))
+    assert found.remedy == "aicvds model fetch"
