@@ -73,20 +73,29 @@ def test_every_name_in_the_architecture_is_in_its_file() -> None:
             assert re.search(definition, defined[path], re.MULTILINE), f"{path} defines no {name}"
 
 
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+
+
 def blocks(page: str) -> str:
     """A page's Python, as one program."""
-    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    text = (ROOT / page).read_text(encoding="utf-8")
     return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
 
 
 def test_the_policy_shown_flies(capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
-    exec(blocks("your-policy.md").replace("range(5)", "range(1)"), names)
+    exec(blocks("docs/your-policy.md").replace("range(5)", "range(1)"), names)
     assert re.match(r"mine \[\d+\]\neof \[\d+\]\n$", capsys.readouterr().out)
 
 
 def test_the_client_shown_asks(edge: Edge, capsys: pytest.CaptureFixture[str]) -> None:
-    shown = blocks("quick-start.md")
-    assert '"http://localhost:8000"' in shown
-    exec(shown.replace('"http://localhost:8000"', f'"{edge(mode="policy").base_url}", timeout_s=60'), {})
-    assert re.match(r"collect from [012] at \d+ m/s: policy\n$", capsys.readouterr().out)
+    url = edge(mode="policy").base_url
+    for page, printed in (
+        ("docs/quick-start.md", r"collect from [012] at \d+ m/s: policy\n$"),
+        ("README.md", r"0 \d+ policy\n$"),
+    ):
+        shown = blocks(page)
+        assert '"http://localhost:8000"' in shown
+        exec(shown.replace('"http://localhost:8000"', f'"{url}", timeout_s=60'), {})
+        assert re.match(printed, capsys.readouterr().out)

@@ -84,7 +84,7 @@ def create(options: Create, console: Console) -> int:
     print(curl(f"{edge}/feedback", '{"decision_id": "…", "cost": 0.2}', key is not None))
     if options.note is not None:
         guidance = f"{edge}/missions/{mission_id}/guidance"
-        print("# What was understood of the note, and your word on it:")
+        print("# What the LLM understood of the note, in a few seconds, and your word on it:")
         print(f"curl {shlex.quote(guidance)}")
         print(curl(guidance, '{"answer": "confirm"}', key is not None))
     return 0

@@ -36,6 +36,11 @@ FLOWN = {
     f"{BIN}python -m examples.uav_loop --edge {EDGE}": "--steps 3",
     f"{BIN}aicvds simulate --world examples/pipeline_world --edge {EDGE}": "--steps 2",
     f"{BIN}aicvds simulate --world examples/pipeline_world --policy eof --out runs/pipeline_world": "--steps 2",
+    f"{BIN}aicvds simulate --policy eof --no-bound --out runs/eof": "--steps 2",
+    f"{BIN}aicvds simulate --edge {EDGE} --mission patrol --out runs/patrol": "--steps 2 --no-bound",
+    f"{BIN}aicvds compare runs/mission runs/eof": "",
+    f"{BIN}aicvds compare runs/mission runs/pipeline_world": "",
+    f"{BIN}aicvds mission create --edge {EDGE} --world examples/pipeline_world": "",
 }
 # The edge that the others are flown against is this one; the commands of "Authentication" have an edge of their own.
 SERVED = [
@@ -49,6 +54,7 @@ KEYED = [
 ]
 # Their command lines are parsed and no more; by how they begin.
 PARSED = {
+    "aicvds doctor": "its result is this machine's; tests/service/commands/test_doctor.py runs it",
     "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
     "aicvds explore": "minutes; tests/e2e/test_pretrain.py runs it small",
     "aicvds pretrain": "minutes; tests/e2e/test_pretrain.py runs it small",
@@ -153,7 +159,13 @@ def test_missions_are_flown_as_shown(workspace: Path) -> None:
             shell(f"{command} {more}".replace(EDGE, url), workspace)
         decided = httpx.get(f"{url}/metrics", timeout=PATIENCE_S).text
     assert "aicvds_decisions_total{" in decided
-    for written in ("mission/summary.json", "mission/report.html", "again/replay.json", "pipeline_world/report.html"):
+    for written in (
+        "mission/summary.json",
+        "mission/report.html",
+        "again/replay.json",
+        "pipeline_world/report.html",
+        "compare.html",
+    ):
         assert (workspace / "runs" / written).stat().st_size > 0
 
 
@@ -186,7 +198,7 @@ def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
 @pytest.mark.parametrize("command", [command for _, command in TOLD if begins(command, PARSED)])
 def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *args = shlex.split(command.removeprefix(BIN))
-    if args[0] == "experiment":
+    if args[:1] == ["experiment"]:
         assert args[1] in (*EXPERIMENTS, "all")
     with monkeypatch.context() as patched:
         patched.setattr(tyro, "cli", only_parsed(tyro.cli))

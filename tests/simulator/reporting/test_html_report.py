@@ -103,7 +103,7 @@ def test_the_page_has_the_sources_of_the_decisions(flight: Flight, drawn: str) -
     assert policy_labels(summary)["aic_vds"] == "AIC-VDS: 8 onboard, 7 llm"
     notice = llm_notice(summary)
     assert notice is not None and "The LLM took 7 of 15 decisions" in notice and "policy_eof 15" in notice
-    assert "AIC-VDS (8 onboard, 7 llm)" in drawn and "this is not a result of the LLM" in drawn
+    assert "AIC-VDS: 8 onboard, 7 llm" in drawn and "this is not a result of the LLM" in drawn
     assert "guided" not in drawn and "<td>value</td>" not in drawn
     by_llm = summary.by_source.model_copy(update={"llm": 14, "onboard": 1})
     assert llm_notice(summary.model_copy(update={"by_source": by_llm})) is None
