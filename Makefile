@@ -2,7 +2,7 @@
 #
 # TORCH_INDEX: on a machine with the whole internet, the address of PyTorch's CPU index: its "Get Started" selector
 # prints it after --index-url. Unset, torch comes from the ordinary index (on Linux the CUDA build).
-PYTHON ?= $(shell command -v python3.11 || echo python3)
+PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || echo python3)
 TORCH_INDEX ?=
 MINUTES ?= 10
 IMAGES ?= auto

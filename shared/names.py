@@ -17,3 +17,26 @@ def few_names(given: Any) -> Any:
     if isinstance(given, dict) and len(given) > MOST_NAMES:
         raise ValueError(f"an object of {len(given)} names, and {MOST_NAMES} are more than there are")
     return given
+
+
+def plain(given: Any) -> Any:
+    """Turn numpy's arrays and numbers in an object into Python's, so that a strict model takes them.
+
+    For pydantic's ``model_validator(mode="before")``. Anything else, JSON above all, passes as it is.
+    """
+    if not isinstance(given, dict):
+        return given
+    return {name: _plain(value) for name, value in given.items()} if any(map(_numeric, given.values())) else given
+
+
+def _numeric(value: Any) -> bool:
+    """Whether it is numpy's, or a list that begins with a number of numpy's."""
+    if isinstance(value, list | tuple):
+        return bool(value) and hasattr(value[0], "tolist")
+    return hasattr(value, "tolist")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list | tuple) and _numeric(value):
+        return [one.tolist() if hasattr(one, "tolist") else one for one in value]
+    return value.tolist() if hasattr(value, "tolist") else value

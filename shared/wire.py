@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from shared.names import few_names
+from shared.names import few_names, plain
 from shared.reasons import Reason
 from shared.scenario import Scenario
 
@@ -59,8 +59,13 @@ class Wire(BaseModel):
 
 
 class Received(Wire):
-    """A model of a request: an object with far too many names gives one error, not one for each name."""
+    """A model of a request: an object with far too many names gives one error, not one for each name.
 
+    From Python, numpy's arrays and numbers are taken too.
+    """
+
+    # The one that is named last runs first.
+    _plain = model_validator(mode="before")(plain)
     _few_names = model_validator(mode="before")(few_names)
 
 

@@ -13,6 +13,10 @@ class EdgeError(Exception):
     """A call to the edge yielded no usable answer."""
 
 
+class EdgeAddressWrong(EdgeError, ValueError):
+    """The text is no edge's URL; it says how to write one."""
+
+
 class EdgeUnreachable(EdgeError):
     """Every attempt failed in transport, or the edge was overloaded each time; the text names the URL and the cause."""
 

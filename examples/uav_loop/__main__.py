@@ -8,6 +8,7 @@ import os
 import secrets
 import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import tyro
@@ -18,9 +19,10 @@ from examples.uav_loop.vehicle import LocalFrame
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 from simulator.client import AsyncEdgeClient
+from simulator.errors import EdgeError
 
-# Seconds that a UAV waits for its edge before take-off.
-GROUND_S = 60.0
+# Seconds that a UAV waits for its edge before take-off; then it flies on board.
+GROUND_S = 20.0
 # The south-west corner of the area, WGS 84.
 ORIGIN = (39.9312, 41.2345)
 SITES = (
@@ -57,7 +59,10 @@ async def flown(job: Job) -> Flown:
     stub = StubWorld(scenario, frame, (x, y), job.seed)
     mission_id = f"uav_loop-{job.seed}-{secrets.token_hex(4)}"
     async with AsyncEdgeClient(job.edge, attempts=2, api_key=os.environ.get("AICVDS_API_KEY") or None) as edge:
-        await edge.wait_ready(GROUND_S)
+        try:
+            await edge.wait_ready(GROUND_S, on_wait=_say_once(f"waiting {GROUND_S:g} s for the edge at {job.edge}"))
+        except EdgeError as error:
+            print(f"{error}; flying on board. `aicvds serve` starts an edge.", file=sys.stderr)
         return await Loop(stub.vehicle(), edge, scenario, frame, mission_id, on_leg=_tell).fly()
 
 
@@ -69,9 +74,28 @@ def _tell(leg: Leg) -> None:
     )
 
 
+def _say_once(what: str) -> Callable[[str], None]:
+    """Prints what is waited for, with the first cause."""
+    said: list[str] = []
+
+    def waiting(cause: str) -> None:
+        if not said:
+            said.append(cause)
+            print(f"{what}: {cause}", file=sys.stderr, flush=True)
+
+    return waiting
+
+
 def main() -> None:
-    """Fly, and print the sums as JSON."""
-    result = asyncio.run(flown(tyro.cli(Job, description=Job.__doc__)))
+    """Fly, and print the sums as JSON; Ctrl-C ends it."""
+    job = tyro.cli(Job, description=Job.__doc__)
+    try:
+        result = asyncio.run(flown(job))
+    except EdgeError as error:
+        sys.exit(f"uav_loop: {error}")
+    except KeyboardInterrupt:
+        print("uav_loop: interrupted", file=sys.stderr)
+        sys.exit(130)
     sums = {
         "steps": len(result.legs),
         "decided_by": Counter(leg.decided_by for leg in result.legs),

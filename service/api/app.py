@@ -74,6 +74,8 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         version=version("aic-vds"),
         summary="Which sensor to collect from, and how fast to fly",
         lifespan=lifespan,
+        # Clients made from the schema then have functions of these names.
+        generate_unique_id_function=lambda route: route.name,
     )
     app.include_router(router)
     app.include_router(live_routes.router)

@@ -73,6 +73,7 @@ GUIDANCE = {
     "note": NOTE,
     "guidance": ORDERS,
     "in_words": "Visit sensor 4 at least once in every 3 steps. Never fly faster than 10 m/s.",
+    "obeyed_in_words": "Visit sensor 4 at least once in every 3 steps. Never fly faster than 10 m/s.",
     "origin": "operator",
     "model": None,
     "failure": None,
@@ -90,6 +91,7 @@ MISSION = {
     "prompt": {"format": "csv", "order": "score", "experiences": 8, "selection": "recent", "demonstrations": 0},
     "init": "pretrained",
     "seed": 0,
+    "note": NOTE,
     "decisions": 3,
     "feedback": 2,
     "experiences": 2,
@@ -150,6 +152,7 @@ REQUESTS: dict[tuple[str, str], dict[str, Example]] = {
         "own": {"summary": "The operator's own structure: obeyed at once", "value": {"guidance": ORDERS}},
         "confirm": {"summary": "What was understood is right", "value": {"answer": "confirm"}},
         "reject": {"summary": "It is not", "value": {"answer": "reject"}},
+        "note": {"summary": "A new note: read by the LLM, and obeyed once it is confirmed", "value": {"note": NOTE}},
     },
 }
 

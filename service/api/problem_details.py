@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -13,7 +13,10 @@ from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
 from service.errors import Refused, Unavailable
-from shared.wire import Problem
+from shared.faults import problem_of
+from shared.guidance import Guidance, GuidanceAnswer, SensorWish
+from shared.scenario import Scenario
+from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Problem, PromptStyle, SensorColumns
 
 log = logging.getLogger(__name__)
 
@@ -23,6 +26,12 @@ _UNION_TAGS = ("constrained-", "function-")
 CONTENT_TYPE = "application/problem+json"
 # The name of a real field is shorter; a longer one is the client's text, which is not sent back.
 _MOST_NAME = 80
+_REQUESTS = (
+    *(BatchRequest, DecideRequest, FeedbackRequest, SensorColumns),
+    *(MissionSpec, PromptStyle, Scenario, GuidanceAnswer, Guidance, SensorWish),
+)
+# The names of all fields that a request may have: one of them may be meant by a name that is none.
+_NAMES = sorted({name for model in _REQUESTS for name in model.model_fields})
 # The `Retry-After` of a request that cannot be served now.
 _RETRY_S = 1
 
@@ -59,10 +68,12 @@ def install(app: FastAPI) -> None:
         return response
 
     @app.exception_handler(RequestValidationError)
-    async def invalid(_: Request, error: RequestValidationError) -> Response:
+    async def invalid(request: Request, error: RequestValidationError) -> Response:
         # The deepest fault comes first: it is of the branch of a union that nearly fits.
         faults = sorted(error.errors()[:20], key=lambda e: -len(e["loc"]))
-        errors = [{"field": _path(e["loc"]), "problem": e["msg"]} for e in faults]
+        if not _sends_json(request) and _path(faults[0]["loc"]) == "body":
+            return problem_response(415, "send the body as JSON, with the header Content-Type: application/json")
+        errors = [{"field": _path(e["loc"]), "problem": _problem(e, error.body)} for e in faults]
         return problem_response(422, f"{errors[0]['field']}: {errors[0]['problem']}", errors)
 
     @app.exception_handler(HTTPException)
@@ -76,6 +87,24 @@ def install(app: FastAPI) -> None:
     async def unexpected(request: Request, error: Exception) -> Response:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         return problem_response(500, "the edge failed; its log has the details")
+
+
+def _sends_json(request: Request) -> bool:
+    """Whether the request says that its body is JSON."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    return kind == "application/json" or (kind.startswith("application/") and kind.endswith("+json"))
+
+
+def _problem(fault: Mapping[str, Any], body: Any) -> str:
+    """A fault in words; of a body that is no JSON, the line and column."""
+    if fault["type"] != "json_invalid":
+        return problem_of(fault, _NAMES)
+    reason = str(fault.get("ctx", {}).get("error", "it cannot be read"))
+    at = fault["loc"][-1]
+    if not isinstance(body, str) or not isinstance(at, int):
+        return f"is no JSON: {reason}"
+    before = body[:at]
+    return f"is no JSON: {reason}, line {before.count(chr(10)) + 1}, column {at - before.rfind(chr(10))}"
 
 
 def _path(location: Sequence[int | str]) -> str:

@@ -12,7 +12,7 @@ from typing import TypeVar
 import tyro
 from rich.console import Console
 
-from simulator.errors import EdgeError, UsageError
+from simulator.errors import EdgeError, EdgeRefused, EdgeUnreachable, UsageError
 
 INTERRUPTED = 130
 Options = TypeVar("Options")
@@ -43,7 +43,7 @@ def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
         print(f"{prog}: {error}", file=sys.stderr)
         return 2
     except EdgeError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
+        print(f"{prog}: {error}{_remedy(error)}", file=sys.stderr)
         return 1
     except OSError as error:
         print(f"{prog}: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", file=sys.stderr)
@@ -51,6 +51,17 @@ def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _remedy(error: EdgeError) -> str:
+    """What to type next, after a semicolon; empty where that is unknown."""
+    if isinstance(error, EdgeUnreachable):
+        return "; start an edge with `aicvds serve`, or correct --edge"
+    if isinstance(error, EdgeRefused) and error.status == 401:
+        return "; put a key into AICVDS_API_KEY (`aicvds keys add` makes one for the edge)"
+    if isinstance(error, EdgeRefused) and error.status == 403:
+        return "; AICVDS_API_KEY needs a key with that scope (`aicvds keys add --scopes decide admin`)"
+    return ""
 
 
 @contextmanager

@@ -39,7 +39,7 @@ from shared.wire import (
     Uplink,
 )
 from simulator.client.uplinks import encoder_of
-from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from simulator.errors import EdgeAddressWrong, EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 
 RETRIED_STATUS = frozenset({408, 429, 502, 503, 504})
 FIRST_BACKOFF_S = 0.1
@@ -99,17 +99,17 @@ def edge_url(text: str) -> str:
     """The edge's base URL, without a trailing slash.
 
     Raises:
-        ValueError: it is no http or https URL with a host, or it has a password.
+        EdgeAddressWrong: it is no http or https URL with a host, or it has a password.
     """
     try:
         url = httpx.URL(text)
     except httpx.InvalidURL as error:
-        raise ValueError(f"{text!r} is not a URL: {error}") from None
+        raise EdgeAddressWrong(f"{text!r} is not a URL: {error}") from None
     if url.scheme not in ("http", "https") or not url.host:
-        raise ValueError(f"{text!r} is not an edge's URL; write it like http://127.0.0.1:8000")
+        raise EdgeAddressWrong(f"{text!r} is not an edge's URL; write it like http://127.0.0.1:8000")
     if url.userinfo or url.query or url.fragment:
         # The URL goes into summary.json and the report; a secret must not.
-        raise ValueError("an edge's URL has no user, password, query or fragment; set AICVDS_API_KEY for a key")
+        raise EdgeAddressWrong("an edge's URL has no user, password, query or fragment; set AICVDS_API_KEY for a key")
     return str(url).rstrip("/")
 
 
@@ -289,6 +289,9 @@ class Calls:
         assert answer is not None, "the runner of a call answers a Send with the response"
         if answer.status_code in RETRIED_STATUS:
             raise _TryAgain(f"{answer.status_code} {_problem(answer).detail}", _retry_after(answer))
+        if answer.status_code >= 400 and _is_page(answer):
+            what = f"it answers {answer.status_code} with a web page to {send.path}"
+            raise EdgeProtocolError(f"there is no AIC-VDS edge at {self.base_url}: {what}")
         if answer.status_code >= 400:
             raise EdgeRefused(url, _problem(answer), answer.status_code)
         return answer
@@ -328,6 +331,11 @@ def _problem(answer: httpx.Response) -> Problem:
         lines = answer.text.strip().splitlines()
         detail = lines[0][:200] if lines else answer.reason_phrase
         return Problem(title=answer.reason_phrase, status=answer.status_code, detail=detail)
+
+
+def _is_page(answer: httpx.Response) -> bool:
+    """Whether the answer is a web page, as another server's or a proxy's."""
+    return answer.text.lstrip()[:1] == "<"
 
 
 def _retry_after(answer: httpx.Response) -> float | None:

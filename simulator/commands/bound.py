@@ -43,17 +43,17 @@ class BoundOptions:
     ends the search, and the best so far is printed. Exit code: 0 done, also by Ctrl-C; 2 bad use.
     """
 
-    seed: Annotated[int, arg(metavar="N")]
+    seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the world, 0 to 4294967295."""
-    scenario: Annotated[str | None, arg(metavar="NAME")] = None
+    scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """A ready-made world: paper (the default), stress, shadowed and others; `aicvds simulate --help` lists them."""
-    world: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A world of your own, instead of --scenario; `aicvds simulate --help` describes the folder."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Waypoints to fly, 1 to 10000. Default: the scenario's (30)."""
     time_limit_s: Annotated[float, arg(metavar="S")] = 60.0
     """Seconds of search at most, 0.1 to 86400."""
-    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """JSON file to write the bound and the plan to."""
 
 

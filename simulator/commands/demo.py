@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.console import Console
-from tyro.conf import FlagCreatePairsOff
+from tyro.conf import FlagCreatePairsOff, arg
 
 from simulator.cli.options import check_between, check_seed, check_wait, chosen_site
 from simulator.cli.running import command_main
 from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
 from simulator.flying.run import BOUND_S, Job, conduct, new_mission_id
-from simulator.records.run_folder import fresh_folder, refuse_old_result
+from simulator.records.run_folder import REPORT, fresh_folder, refuse_old_result
 
 EDGE_LOG = "edge.log"
 
@@ -37,16 +37,16 @@ class Demo:
     """Folder to write to, made if missing."""
     seed: int = 0
     """Seed of the world, 0 to 4294967295; the same seed gives the same world."""
-    scenario: str | None = None
+    scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """A ready-made world: paper (the default), stress, shadowed and others; `aicvds simulate --help`
     describes them."""
-    world: Path | None = None
+    world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A folder with a world of your own, instead of --scenario; `aicvds simulate --help` describes its files."""
     port: int = 0
     """Port of the edge on 127.0.0.1, 0 to 65535; 0 picks a free one."""
     wait_s: float = 300.0
     """Seconds that the edge may take to start and to load its LLM."""
-    bound: Annotated[bool, FlagCreatePairsOff] = True
+    bound: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = True
     """Leave out the search, of at most 10 s after the flight, for the fewest packets that any fleet could have lost."""
 
 
@@ -88,4 +88,21 @@ def demo(options: Demo, command: str, console: Console) -> int:
         console.print(
             f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
         )
-        return conduct(job, console, alive=lambda: check_alive(process, log))
+        code = conduct(job, console, alive=lambda: check_alive(process, log))
+    if code == 0:
+        console.print(_next_steps(options.out), markup=False, highlight=False, soft_wrap=True)
+    return code
+
+
+def _next_steps(out: Path) -> str:
+    """What to open and what to try after the demo."""
+    return "\n".join(
+        (
+            "",
+            f"Open {out / REPORT} in a browser. Then try:",
+            "  aicvds serve                                                  an edge that stays, with its page at http://127.0.0.1:8000/",
+            "  aicvds simulate --edge http://127.0.0.1:8000 --out runs/next   a mission to watch on that page",
+            f"  aicvds compare {out} runs/next                          both side by side",
+            "(In a clone without an activated environment: .venv/bin/aicvds.)",
+        )
+    )

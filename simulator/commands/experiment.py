@@ -52,22 +52,22 @@ class Options:
     """Folder to write to, made if missing; its stored flights are used again."""
     quick: Annotated[bool, FlagCreatePairsOff] = False
     """Few seeds, and short missions with an LLM: a check that the figures can be made, without a valid result."""
-    seeds: Annotated[int | None, arg(metavar="N")] = None
+    seeds: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Worlds for schemes without an LLM: seeds 0 to N - 1. Default: 30, quick 5."""
-    llm_seeds: Annotated[int | None, arg(metavar="N")] = None
+    llm_seeds: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Worlds for schemes with an LLM, a minute each. Default: 10, quick 2, at most --seeds."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Waypoints of a mission. Default: the world's own (30)."""
     llm: Annotated[str, arg(metavar="embedded|none|URL")] = "embedded"
     """The LLM: the embedded one, none (its schemes are left out), or an OpenAI-compatible server's address such as
     http://127.0.0.1:8080/v1 (AICVDS_LLM_MODEL and AICVDS_LLM_API_KEY apply to it)."""
-    edge: Annotated[str | None, arg(metavar="URL")] = None
+    edge: Annotated[str | None, arg(metavar="URL", help_behavior_hint="")] = None
     """Use this running edge for the schemes with an LLM, with its settings, instead of starting one."""
     model: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="FILE.gguf")] = ()
     """For llm-models: another model to embed; repeatable."""
-    scenario: Annotated[str | None, arg(metavar="NAME")] = None
+    scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """The world: paper (default), stress, shadowed and others; `aicvds simulate --help` lists them."""
-    world: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes for the flights without an edge."""

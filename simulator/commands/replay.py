@@ -28,6 +28,7 @@ from simulator.records.request_log import read_requests
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out, refuse_old_result
 from simulator.reporting.replay_agreement import Compared, Prices, ReplaySummary, agreement, by_source, show, side
 
+Format = Literal["csv", "json", "markdown"]
 REPLAY, REPLAYED = "replay.json", "replayed.jsonl"
 
 
@@ -65,39 +66,41 @@ class Replay:
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
     """Folder of `aicvds simulate --edge`."""
-    edge: Annotated[str | None, arg(metavar="URL")] = None
+    edge: Annotated[str | None, arg(metavar="URL", help_behavior_hint="")] = None
     """The edge's address, such as http://127.0.0.1:8000. Required."""
-    mode: Annotated[Mode | None, arg(metavar="MODE")] = None
+    mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None
     """The edge's mode. Default, of this option and the next ones: as logged."""
-    top_k: Annotated[int | None, arg(metavar="K")] = None
+    top_k: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
     """Sensors that attention keeps for the prompt, 1 to 100."""
-    attention: Literal["on", "off"] | None = None
+    attention: Annotated[Literal["on", "off"] | None, arg(metavar="on|off", help_behavior_hint="")] = None
     """off: every admissible sensor is in the prompt."""
-    features: Features | None = None
+    features: Annotated[Features | None, arg(metavar="paper|reach", help_behavior_hint="")] = None
     """The modules' features."""
-    init: Init | None = None
+    init: Annotated[Init | None, arg(metavar="pretrained|random", help_behavior_hint="")] = None
     """The modules' initial weights."""
-    format: Literal["csv", "json", "markdown"] | None = None
+    format: Annotated[
+        Literal["csv", "json", "markdown"] | None, arg(metavar="csv|json|markdown", help_behavior_hint="")
+    ] = None
     """The format of the prompt's rows."""
-    order: Literal["score", "shuffled"] | None = None
+    order: Annotated[Literal["score", "shuffled"] | None, arg(metavar="score|shuffled", help_behavior_hint="")] = None
     """The rows' order."""
-    experiences: Annotated[int | None, arg(metavar="N")] = None
+    experiences: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Experiences in the prompt, 0 to 100."""
-    selection: Selection | None = None
+    selection: Annotated[Selection | None, arg(metavar="recent|similar|best", help_behavior_hint="")] = None
     """The selection of experiences beyond that number."""
-    demonstrations: Annotated[int | None, arg(metavar="N")] = None
+    demonstrations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Worked examples in the prompt, 0 to 20."""
-    deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
+    deadline_ms: Annotated[int | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: as in each request."""
-    price_input: Annotated[float | None, arg(metavar="USD")] = None
+    price_input: Annotated[float | None, arg(metavar="USD", help_behavior_hint="")] = None
     """US dollars a million prompt tokens. Default: the cost is each edge's estimate by its own prices."""
-    price_cached: Annotated[float | None, arg(metavar="USD")] = None
+    price_cached: Annotated[float | None, arg(metavar="USD", help_behavior_hint="")] = None
     """US dollars a million prompt tokens read from a prefix cache. Default: --price-input."""
-    price_output: Annotated[float | None, arg(metavar="USD")] = None
+    price_output: Annotated[float | None, arg(metavar="USD", help_behavior_hint="")] = None
     """US dollars a million tokens of the answer. Default: --price-input."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
     """Seconds to wait for the edge and its LLM."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder to write to, made if missing. Default: runs/ and the new mission's ID."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
     """Overwrite an earlier replay's result."""

@@ -59,27 +59,27 @@ class Simulate:
     the key for an edge that needs one. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
     """
 
-    edge: Annotated[str | None, arg(metavar="URL")] = None
+    edge: Annotated[str | None, arg(metavar="URL", help_behavior_hint="")] = None
     """The edge's address, such as http://127.0.0.1:8000. Required, unless --policy is a local one."""
-    scenario: Annotated[str | None, arg(metavar="NAME")] = None
+    scenario: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """A ready-made world: paper (10 sensors, 3 UAVs, 30 steps; the default), pipeline (sensors in a line), stress
     (weak link), dense (100 sensors, 10 UAVs) or lossy_uplink (a tenth of the requests lost). In the other six the world
     differs from the edge's model: shadowed (links 8 dB off), fading, bursty (arrivals), windy, faulty (dead radios, a
     UAV gone, half of the rate lost) and field (all of it, mild)."""
-    world: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A world of your own, instead of --scenario: a folder with world.geojson (sensors, trajectories) and, optionally,
     scenario.toml (other numbers), arrivals.csv (recorded traffic) and gains.csv (recorded links).
     examples/pipeline_world is one."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the world, 0 to 4294967295: it draws the sensors, queues, arrivals and starts that are not given. The
     same seed gives the same world."""
-    steps: Annotated[int | None, arg(metavar="N")] = None
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Waypoints to fly, 1 to 10000. Default: the world's (30 in every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
     (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner, extra `planner`),
     madqn or mappo (trained networks, extra `marl`)."""
-    mode: Annotated[Mode | None, arg(metavar="MODE")] = None
+    mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None
     """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or
     policy (the planner). Default: the edge's."""
     mission: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
@@ -91,7 +91,7 @@ class Simulate:
     uplink: Annotated[Uplink, arg(metavar="full|delta|pruned")] = "full"
     """The part of each report to send: full, the sensors that changed (delta, with the same decisions), or the k
     sensors that attention on board selects (pruned)."""
-    deadline_ms: Annotated[int | None, arg(metavar="MS")] = None
+    deadline_ms: Annotated[int | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: the edge's own setting."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
     """Seconds to wait for the edge and its LLM. An edge that still loads its LLM then decides without it."""
@@ -99,11 +99,11 @@ class Simulate:
     """on: wait for an unreachable LLM as for a loading one."""
     reconnect_s: Annotated[float, arg(metavar="S")] = 10.0
     """Seconds to wait during the flight for a lost edge and its LLM, in all per outage, 0 to 3600; 0 never waits."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder to write to, made if missing. Default: runs/ and the mission's ID, such as runs/paper-0-1f6c09ab."""
-    bound: Annotated[bool, FlagCreatePairsOff] = True
+    bound: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = True
     """Leave out the search, of at most 10 s after the flight, for the fewest packets that any fleet could have lost."""
-    overwrite: Annotated[bool, FlagCreatePairsOff] = False
+    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Overwrite an earlier mission's result."""
     metrics_port: Annotated[int, arg(metavar="0-65535")] = 0
     """Port of the flight's metrics for Prometheus, served during the flight and until one more scrape (at most 20 s);

@@ -54,11 +54,11 @@ class Train:
     """The scheme to train."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
     """The training's world. Weights fit only scenarios with the same numbers of sensors, UAVs and velocities."""
-    episodes: Annotated[int | None, arg(metavar="N")] = None
+    episodes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Missions to fly. Default: 1000 for madqn, as in the paper, 21600 for mappo."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the initial weights, the exploration and the training worlds, 0 to 4294967295."""
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder to write to, made if missing. Default: runs/ and the scheme, such as runs/madqn."""
     resume: Annotated[bool, FlagCreatePairsOff] = False
     """Continue the training in --out."""

@@ -190,7 +190,7 @@ def await_edge(
 
         def waiting(cause: str) -> None:
             alive()
-            status.update(f"Waiting for the edge at {ground.base_url}: {escape(cause)}")
+            status.update(f"Waiting for the edge at {ground.base_url} (`aicvds serve` starts one): {escape(cause)}")
 
         readiness = ground.wait_ready(wait_s, wait_out, on_wait=waiting)
         alive()

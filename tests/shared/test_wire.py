@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from shared.scenario import SCENARIOS
-from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Outcome, PromptStyle
+from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Outcome, PromptStyle, SensorColumns
 
 DECISION = "0123456789abcdef0123456789abcdef"
 
@@ -174,3 +175,20 @@ def test_a_mission_that_is_none_is_refused_by_field(change: dict[str, Any], fiel
     with pytest.raises(ValidationError) as caught:
         MissionSpec.model_validate_json(json.dumps(change))
     assert field in str(caught.value)
+
+
+def test_numpys_arrays_and_numbers_are_taken() -> None:
+    sensors = SensorColumns(
+        id=np.arange(2),  # type: ignore[arg-type]
+        x=np.array([1.0, 2.0]),  # type: ignore[arg-type]
+        y=[np.float64(3.0), np.float32(4.0)],  # type: ignore[list-item]
+        queue=np.array([5.0, 6.0]),  # type: ignore[arg-type]
+        battery=[7.0, 8.0],
+        channel_gain=[-80.0, -90.0],
+        last_seen=[np.int64(0), np.int64(0)],  # type: ignore[list-item]
+    )
+    assert (sensors.id, sensors.x, sensors.y) == ([0, 1], [1.0, 2.0], [3.0, 4.0])
+    request = DecideRequest(step=np.int64(3), uav_id=0, position=np.array([1.0, 2.0]), sensors=sensors)  # type: ignore[arg-type]
+    assert type(request.step) is int and request.position == [1.0, 2.0]
+    with pytest.raises(ValidationError):
+        DecideRequest(step=np.float64(3.0), uav_id=0, position=[1.0, 2.0], sensors=sensors)  # type: ignore[arg-type]

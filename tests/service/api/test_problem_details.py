@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -50,3 +51,35 @@ def test_a_name_that_is_no_field_is_not_sent_back_whole(edge: Edge, report: Repo
     answer = edge().post("/decide", json=report(**{"k" * 1_000_000: 0}))
     assert fields(answer) == ["k" * 80]
     assert len(answer.content) < 1000
+
+
+def test_broken_json_is_told_with_its_line_and_column(edge: Edge) -> None:
+    broken = edge().post(
+        "/decide", content='{\n  "step": 0,\n  "uav_id" 1}', headers={"Content-Type": "application/json"}
+    )
+    assert broken.status_code == 422
+    assert "is no JSON: Expecting ':' delimiter, line 3, column 12" in broken.json()["detail"]
+
+
+def test_a_body_without_a_content_type_is_a_415_that_says_which(edge: Edge, report: Report) -> None:
+    for headers in ({}, {"Content-Type": "application/x-www-form-urlencoded"}):
+        refused = edge().post("/decide", content=json.dumps(report()).encode(), headers=headers)
+        assert refused.status_code == 415
+        assert "Content-Type: application/json" in refused.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "said"),
+    [
+        ("/missions/m", {"topk": 3}, "there is no such field; did you mean top_k?"),
+        ("/missions/m", {"prompt": {"formatt": "csv"}}, "did you mean format?"),
+        ("/missions/m", {"zzzz": 3}, "there is no such field"),
+        ("/missions/m", {"note": "a\nb"}, "note: must be one paragraph"),
+        ("/missions/m", [], "must be a JSON object"),
+    ],
+)
+def test_a_fault_is_told_in_plain_words(edge: Edge, path: str, body: object, said: str) -> None:
+    refused = edge().put(path, json=body)
+    assert refused.status_code == 422
+    assert said in refused.json()["detail"]
+    assert not {"Value error", "Extra inputs", "valid dictionary"} & set(refused.json()["detail"].split(","))

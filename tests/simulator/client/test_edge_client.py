@@ -15,7 +15,7 @@ from simulator.client import AsyncEdgeClient, EdgeClient
 from simulator.client.calls import edge_url
 from simulator.client.lossy_transport import LossyTransport
 from simulator.client.observation_report import decide_request
-from simulator.errors import EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from simulator.world import PipelineWorld
 from tests.running import listening
 from tests.simulator.edge_stub import EdgeStub, stub_edge
@@ -153,9 +153,16 @@ def test_a_server_error_is_a_refusal(stub: EdgeStub, request_: DecideRequest, cl
 
 def test_an_error_page_that_is_no_problem_document(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
     stub.script = ["html"]
-    with client(stub.url) as edge, pytest.raises(EdgeRefused) as refused:
+    with client(stub.url) as edge, pytest.raises(EdgeProtocolError, match=f"there is no AIC-VDS edge at {stub.url}"):
         edge.decide(request_)
-    assert refused.value.detail == "<h1>Bad gateway</h1>"
+
+
+@pytest.mark.parametrize("address", ["localhost:8000", "ftp://edge", "http://", "http://user:secret@edge"])
+def test_an_address_that_is_none_is_an_edge_error_too(address: str) -> None:
+    with pytest.raises(EdgeError):
+        EdgeClient(address)
+    with pytest.raises(ValueError):
+        AsyncEdgeClient(address)
 
 
 def test_garbage_is_no_traceback(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
