@@ -191,6 +191,7 @@ ANSWERS: dict[tuple[str, str], Any] = {
         ],
         "more": 0,
         "newest": "patrol",
+        "may_command": True,
     },
     ("get", "/missions/{mission_id}/decisions/{decision_id}/prompt"): {
         "decision_id": DECISION_ID,

@@ -2,6 +2,8 @@
 
 const MOST_DECISIONS = 1000;
 const MOST_STEPS = 1000;
+// In the last step a UAV that has not asked for so long will not ask.
+const ASKING_S = 5;
 
 export class Mission {
   constructor(snapshot) {
@@ -43,10 +45,11 @@ export class Mission {
     return this.now.idle_s === null ? null : this.now.idle_s + (performance.now() - this.heardAt) / 1000;
   }
 
-  /** Whether every UAV has its decision of the mission's last step. */
+  /** Whether every UAV has its decision of the mission's last step, or those that have none no longer ask. */
   get ended() {
     const { uavs, steps } = this.scenario;
-    return this.now.step >= steps - 1 && this.decidedIn(steps - 1) >= uavs;
+    if (this.now.step < steps - 1) return false;
+    return this.decidedIn(steps - 1) >= uavs || this.idleS > ASKING_S;
   }
 
   /** The number of UAVs that have a decision in this step. */
