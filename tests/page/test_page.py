@@ -65,7 +65,10 @@ def flown(edge: str, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def fly(url: str, out: Path, *options: str) -> None:
     with reports_undrawn():
-        assert simulate.main(["--edge", url, "--steps", str(STEPS), "--no-bound", "--out", str(out / "run"), *options]) == 0
+        assert (
+            simulate.main(["--edge", url, "--steps", str(STEPS), "--no-bound", "--out", str(out / "run"), *options])
+            == 0
+        )
 
 
 def violations(page: Page) -> list[str]:

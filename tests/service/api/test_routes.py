@@ -125,16 +125,6 @@ def test_feedback_is_applied_once(edge: Edge, report: Report) -> None:
     assert client.get("/missions/test").json()["feedback"] == 1
 
 
-def test_the_mission_of_an_outcome_is_found_by_its_decision(edge: Edge, report: Report) -> None:
-    client = edge()
-    client.post("/decide", json=report(mission_id="other"))
-    answer = client.post("/decide", json=report()).json()
-    outcome = {"decision_id": answer["decision_id"], "cost": 0.2}
-    assert client.post("/feedback", json=outcome).json()["result"] == "applied"
-    assert client.post("/feedback", json=outcome).json()["result"] == "duplicate"
-    assert [client.get(f"/missions/{name}").json()["feedback"] for name in ("test", "other")] == [1, 0]
-
-
 def test_feedback_for_an_unknown_decision_is_a_404(edge: Edge, report: Report) -> None:
     client = edge()
     client.post("/decide", json=report())
