@@ -96,13 +96,10 @@ def demo(options: Demo, command: str, console: Console) -> int:
 
 def _next_steps(out: Path) -> str:
     """What to open and what to try after the demo."""
-    return "\n".join(
-        (
-            "",
-            f"Open {out / REPORT} in a browser. Then try:",
-            "  aicvds serve                                                  an edge that stays, with its page at http://127.0.0.1:8000/",
-            "  aicvds simulate --edge http://127.0.0.1:8000 --out runs/next   a mission to watch on that page",
-            f"  aicvds compare {out} runs/next                          both side by side",
-            "(In a clone without an activated environment: .venv/bin/aicvds.)",
-        )
-    )
+    steps = {
+        "aicvds serve": "an edge that stays, with its page at http://127.0.0.1:8000/",
+        "aicvds simulate --edge http://127.0.0.1:8000 --out runs/next": "a mission to watch on that page",
+        f"aicvds compare {out} runs/next": "both side by side",
+    }
+    listed = "\n".join(f"  {command}\n      {what}" for command, what in steps.items())
+    return f"\nOpen {out / REPORT} in a browser. Then try (in a clone: .venv/bin/aicvds):\n{listed}"

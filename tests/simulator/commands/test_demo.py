@@ -30,7 +30,9 @@ def summary_in(out: Path) -> Summary:
 
 
 @pytest.mark.long
-def test_the_demo_serves_flies_and_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_serves_flies_and_stops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("AICVDS_MODE", "value")
     (tmp_path / "summary.json").write_text("{}", encoding="utf-8")
     assert demo.main(["--out", str(tmp_path), "--seed", "1"]) == 0
@@ -38,6 +40,9 @@ def test_the_demo_serves_flies_and_stops(tmp_path: Path, monkeypatch: pytest.Mon
     assert summary.decisions == 90 and summary.mode == "value"
     assert summary.by_source.value > 80 and summary.by_source.value + summary.by_source.policy == 90
     assert "Finished server process" in (tmp_path / "edge.log").read_text("utf-8")
+    printed = capsys.readouterr().out
+    assert f"Open {tmp_path / 'report.html'} in a browser" in printed
+    assert f"aicvds compare {tmp_path} runs/next" in printed
     assert summary.edge is not None
     port = int(summary.edge.rsplit(":", 1)[1])
     with socket.socket() as probe:
