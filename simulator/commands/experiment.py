@@ -22,7 +22,6 @@ from simulator.experiments.result import Result
 
 SEEDS, LLM_SEEDS = 30, 10
 PAGE = "page"
-_ELSEWHERE = ("paper", "pipeline", "stress", "dense", "lossy_uplink")
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,8 @@ def setup_of(options: Options) -> Setup:
     site = chosen_site(options.scenario, options.world, options.steps)
     sites = {site.scenario.name: site}
     if options.scenario is None:
-        sites |= {name: chosen_site(name, None, options.steps) for name in _ELSEWHERE if name not in sites}
+        named = dict.fromkeys(name for each in EXPERIMENTS.values() for name in each.worlds)
+        sites |= {name: chosen_site(name, None, options.steps) for name in named if name not in sites}
     pace: Literal["full", "quick"] = "quick" if options.quick else "full"
     edge = None if options.edge is None else checked_edge(options.edge)
     return Setup(sites, Llm(options.llm, edge), options.model, seeds, min(llm_seeds, seeds), options.steps, pace)
@@ -133,11 +133,9 @@ def show(result: Result, console: Console) -> None:
         seeds = len(result.seeds_of.get(name, result.seeds))
         cells = [f"{f.mean:.4g} [{f.low:.4g}, {f.high:.4g}]" if (f := found.get(m)) else "" for m in measures]
         table.add_row(f"{result.labels[name]} ({seeds})", *cells)
-    if result.bound and "lost_packets" in measures:
-        bound = result.bound["lost_packets"]
+    if result.bound.keys() & set(measures):
         cells = [
-            f"at least {bound.mean:.4g} [{bound.low:.4g}, {bound.high:.4g}]" if m == "lost_packets" else ""
-            for m in measures
+            f"at least {f.mean:.4g} [{f.low:.4g}, {f.high:.4g}]" if (f := result.bound.get(m)) else "" for m in measures
         ]
         table.add_row("clairvoyant bound", *cells, style="italic")
     console.print(table)

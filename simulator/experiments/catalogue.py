@@ -20,6 +20,7 @@ from simulator.experiments import (
     scheduler,
     tokens,
     top_k,
+    unknown_worlds,
 )
 from simulator.experiments.plan import Experiment
 
@@ -40,6 +41,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         jailbreak,
         aoi,
         scenarios,
+        unknown_worlds,
     )
 }
 ALL = "all"

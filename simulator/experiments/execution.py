@@ -12,8 +12,9 @@ from simulator.errors import EdgeError, UsageError
 from simulator.experiments.edges import EdgeAt, radio
 from simulator.experiments.flight import BoundFound, DecisionRecord, FlightRecord, TokenCounts
 from simulator.experiments.plan import Planned
-from simulator.experiments.schemes import Clairvoyant, Local, OverEdge
+from simulator.experiments.schemes import Clairvoyant, Informed, Local, OverEdge
 from simulator.flying.flight import Flight, fly
+from simulator.flying.informed import InformedPilot
 from simulator.flying.pilots import Choice, EdgePilot, LocalPilot, Pilot
 from simulator.flying.run import new_mission_id
 from simulator.records.decision import Decision
@@ -45,15 +46,21 @@ def fly_locally(planned: Planned) -> FlightRecord:
     """
     if isinstance(planned.scheme.decides, Clairvoyant):
         return _bound(planned, planned.scheme.decides.seconds)
-    assert isinstance(planned.scheme.decides, Local)
-    scenario = planned.site.scenario
     try:
-        pilot: Pilot = LocalPilot(planned.scheme.decides.policy, scenario, planned.seed)
-        if planned.scheme.decides.velocity == "full":
-            pilot = FullSpeed(planned.scheme.decides.policy, scenario.max_velocity, planned)
+        pilot = _pilot(planned)
     except (UsageError, ValueError, ImportError, OSError) as error:
         raise CannotFly(str(error)) from error
     return _record(planned, fly(planned.site, pilot, planned.seed), model=None)
+
+
+def _pilot(planned: Planned) -> Pilot:
+    decides, scenario = planned.scheme.decides, planned.site.scenario
+    if isinstance(decides, Informed):
+        return InformedPilot(planned.site, planned.seed)
+    assert isinstance(decides, Local)
+    if decides.velocity == "full":
+        return FullSpeed(decides.policy, scenario.max_velocity, planned)
+    return LocalPilot(decides.policy, scenario, planned.seed)
 
 
 def fly_with_edge(edge: EdgeAt, planned: Planned) -> FlightRecord:

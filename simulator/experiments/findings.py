@@ -4,36 +4,22 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from io import StringIO
 
 from simulator.errors import UsageError
+from simulator.experiments.comparisons import bounds, comparisons
 from simulator.experiments.flight import FlightRecord
-from simulator.experiments.intervals import METHOD, curve, interval, paired
+from simulator.experiments.group import Group, groups_of
+from simulator.experiments.intervals import METHOD, curve, interval
 from simulator.experiments.measures import MEASURES, STEP_MEASURES, substituted_decisions
 from simulator.experiments.plan import Experiment, FigureSpec, Plan, Setup
-from simulator.experiments.result import Curve, Figure, Interval, Paired, Result
-from simulator.experiments.schemes import BOUND, OverEdge, Scheme
+from simulator.experiments.result import Curve, Figure, Interval, Result
+from simulator.experiments.schemes import BOUND, OverEdge
 
 # The largest share of substituted decisions without a note: a few late answers belong to the LLM, more of them make the
 # result another method's.
 _FEW_PCT = 3.0
-
-
-@dataclass(frozen=True)
-class Group:
-    """The flights of one scheme on one site in order of their seeds; ``suffix`` marks the site in names."""
-
-    scheme: Scheme
-    site: str
-    suffix: str
-    flights: list[FlightRecord]
-
-    @property
-    def seeds(self) -> list[int]:
-        """The seeds flown."""
-        return [flight.seed for flight in self.flights]
 
 
 def findings(
@@ -53,12 +39,13 @@ def findings(
     Raises:
         UsageError: no scheme flew at all.
     """
-    groups = _groups(plan, load)
+    groups = groups_of(plan, load)
     flying = [group for group in groups if group.scheme.name != BOUND.name]
     if not flying:
         raise UsageError(f"experiment {plan.experiment.name}: no scheme could fly. {' '.join(notes)}")
     experiment, seeds = plan.experiment, max((group.seeds for group in flying), key=len)
     schemes, curves, lacking = _scores(experiment, flying)
+    compared = comparisons(experiment, flying, groups)
     return Result(
         experiment=experiment.name,
         title=experiment.title,
@@ -71,14 +58,14 @@ def findings(
         seeds=seeds,
         model=_model(flying),
         schemes=schemes,
-        bound=_bound(groups),
+        bound=bounds(groups),
         curves=curves,
-        paired=_paired(plan, flying, groups),
+        paired=compared.pairs,
         sweep=experiment.sweep,
         figures=[_figure(spec, flying, seeds, command) for spec in experiment.figures],
-        labels=_labels(flying, experiment.measures, experiment.figures),
+        labels=_labels(flying, experiment.measures, experiment.figures) | compared.labels,
         seeds_of={group.scheme.name: group.seeds for group in flying if group.seeds != seeds},
-        notes=[*experiment.notes, *_notes(plan, setup, groups), *notes, *lacking],
+        notes=[*experiment.notes, *compared.notes, *_notes(plan, setup, groups), *notes, *lacking],
     )
 
 
@@ -97,26 +84,7 @@ def tidy(result: Result) -> str:
 
 def _once(bound: dict[str, Interval]) -> dict[str, Interval]:
     """The bound of a mission's losses; the same number also bounds the last step of a curve."""
-    return {name: found for name, found in bound.items() if name in MEASURES}
-
-
-def _groups(plan: Plan, load: Callable[[str], FlightRecord | None]) -> list[Group]:
-    sites = list(dict.fromkeys(planned.site_name for planned in plan.flights))
-    flights: dict[tuple[str, str], list[FlightRecord]] = {}
-    schemes = {planned.scheme.name: planned.scheme for planned in plan.flights}
-    broken = set()
-    for planned in plan.flights:
-        at = (planned.scheme.name, planned.site_name)
-        flight = load(planned.key)
-        if flight is None:
-            broken.add(at)
-        else:
-            flights.setdefault(at, []).append(flight)
-    return [
-        Group(schemes[name], site, f"@{site}" if len(sites) > 1 else "", found)
-        for (name, site), found in flights.items()
-        if (name, site) not in broken
-    ]
+    return {name: found for name, found in bound.items() if name.partition("@")[0] in MEASURES}
 
 
 def _scores(
@@ -159,47 +127,6 @@ def _curves(group: Group, figures: Sequence[FigureSpec]) -> dict[str, Curve]:
         if len(present) == len(rows):
             found[name + group.suffix] = curve(present)
     return found
-
-
-def _bound(groups: Sequence[Group]) -> dict[str, Interval]:
-    bounds = [f.bound.lower_bound for g in groups if g.scheme.name == BOUND.name for f in g.flights if f.bound]
-    return {"lost_packets": interval(bounds), "lost_packets_cumulative": interval(bounds)} if bounds else {}
-
-
-def _paired(plan: Plan, flying: Sequence[Group], groups: Sequence[Group]) -> list[Paired]:
-    by_site = {(group.scheme.name, group.site): group for group in flying}
-    reference = plan.experiment.reference
-    pairs = [(g.scheme.name, reference) for g in flying if reference and g.scheme.name != reference]
-    found: list[Paired] = []
-    for name, other in dict.fromkeys([*pairs, *plan.experiment.pairs]):
-        for site in dict.fromkeys(group.site for group in flying):
-            if (name, site) in by_site and (other, site) in by_site:
-                found += _pair(by_site[name, site], by_site[other, site], plan.experiment.paired_measures)
-    for bound in (group for group in groups if group.scheme.name == BOUND.name):
-        for group in flying:
-            found += _over_bound(group, bound)
-    return found
-
-
-def _pair(group: Group, other: Group, measures: Sequence[str]) -> list[Paired]:
-    theirs = {flight.seed: flight for flight in other.flights}
-    both = [(flight, theirs[flight.seed]) for flight in group.flights if flight.seed in theirs]
-    found: list[Paired] = []
-    for name in measures:
-        values = [(MEASURES[name].of(a), MEASURES[name].of(b)) for a, b in both]
-        present = [(a, b) for a, b in values if a is not None and b is not None]
-        if present and len(present) == len(values):
-            ours, others = zip(*present, strict=True)
-            found += paired(group.scheme.name, other.scheme.name, name + group.suffix, ours, others)
-    return found
-
-
-def _over_bound(group: Group, bound: Group) -> list[Paired]:
-    least = {flight.seed: flight.bound.lower_bound for flight in bound.flights if flight.bound}
-    ours = [(float(sum(f.lost_packets)), least[f.seed]) for f in group.flights if f.seed in least]
-    if not ours:
-        return []
-    return paired(group.scheme.name, BOUND.name, "lost_packets" + group.suffix, *zip(*ours, strict=True))
 
 
 def _figure(spec: FigureSpec, flying: Sequence[Group], seeds: Sequence[int], command: str) -> Figure:

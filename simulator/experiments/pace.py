@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 
 from simulator.experiments.plan import Planned
-from simulator.experiments.schemes import Clairvoyant, Local
+from simulator.experiments.schemes import Clairvoyant, Informed, Local
 
 # Seconds a decision on two cores, for kinds of flights not measured yet.
 _LOCAL_S, _PLANNER_S, _BOUND_S, _EDGE_S, _LLM_S = 0.001, 0.2, 0.05, 0.015, 0.75
@@ -58,6 +58,6 @@ def _guess(planned: Planned) -> float:
     decides = planned.scheme.decides
     if isinstance(decides, Clairvoyant):
         return _BOUND_S
-    if isinstance(decides, Local):
+    if isinstance(decides, Local | Informed):
         return _PLANNER_S if planned.plans else _LOCAL_S
     return _LLM_S if planned.scheme.asks_llm else _EDGE_S

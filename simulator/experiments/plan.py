@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from simulator.experiments.edges import Llm
 from simulator.experiments.flight import flight_key
 from simulator.experiments.result import Sweep
-from simulator.experiments.schemes import NAMED_BY_OPTION, PLANNER, Clairvoyant, Local, OverEdge, Scheme
+from simulator.experiments.schemes import NAMED_BY_OPTION, PLANNERS, Clairvoyant, Informed, Local, OverEdge, Scheme
 
 if TYPE_CHECKING:
     from simulator.sites.site import Site
@@ -27,8 +27,8 @@ QUICK_SEEDS, QUICK_LLM_SEEDS = 5, 2
 class Setup:
     """The options of the command line that apply to every experiment of a run.
 
-    ``sites`` are the worlds by name; all experiments but ``scenarios`` fly the first one. ``seeds`` and ``llm_seeds``
-    are numbers of seeds, from 0. ``steps`` are those of a mission, or ``None`` for the scenario's.
+    ``sites`` are the worlds by name; an experiment flies the first one, and those that it names. ``seeds`` and
+    ``llm_seeds`` are numbers of seeds, from 0. ``steps`` are those of a mission, or ``None`` for the scenario's.
     """
 
     sites: dict[str, Site]
@@ -62,7 +62,8 @@ class Experiment:
     ``summary`` is its line in ``--help``. ``measures``, and the measures of curves in ``figures``, are names in
     ``measures.py``. Every other scheme is paired with ``reference``; ``pairs`` are further pairs. With ``when_quick``
     of ``short``, ``--quick`` shortens the missions of all schemes, so that they stay comparable; with ``no_llm`` it
-    omits the schemes that query an LLM. Experiments with ``where`` of ``everywhere`` fly all of the setup's sites.
+    omits the schemes that query an LLM. ``worlds`` are the setup's sites that it flies beside the first one. On each
+    site, the one of ``heuristics`` with the fewest lost packets is another reference for every other scheme.
     """
 
     name: str
@@ -76,7 +77,8 @@ class Experiment:
     paired_measures: tuple[str, ...] = ("lost_packets", "events")
     sweep: Sweep | None = None
     when_quick: Literal["short", "no_llm"] = "short"
-    where: Literal["first", "everywhere"] = "first"
+    worlds: tuple[str, ...] = ()
+    heuristics: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
 
@@ -99,7 +101,9 @@ class Planned:
     def plans(self) -> bool:
         """Whether the flight runs OR-Tools, which takes half a second a step."""
         decides = self.scheme.decides
-        return isinstance(decides, Clairvoyant) or (isinstance(decides, Local) and decides.policy == PLANNER)
+        return isinstance(decides, Clairvoyant | Informed) or (
+            isinstance(decides, Local) and decides.policy in PLANNERS
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +118,8 @@ class Plan:
 def plan(experiment: Experiment, setup: Setup) -> Plan:
     """The flights that an experiment needs."""
     flights, left_out = [], []
-    sites = dict(setup.sites) if experiment.where == "everywhere" else dict([next(iter(setup.sites.items()))])
+    first = next(iter(setup.sites))
+    sites = {name: site for name, site in setup.sites.items() if name == first or name in experiment.worlds}
     for scheme in experiment.schemes(setup):
         without_llm = setup.quick and experiment.when_quick == "no_llm"
         missing = (

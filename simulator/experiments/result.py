@@ -62,7 +62,8 @@ class Result(Record):
 
     ``schemes`` is by the name of the scheme, then of the measure, in display order. ``labels`` are the labels of
     schemes and measures. ``seeds_of`` has the schemes that flew fewer seeds than the rest. ``bound`` is the proven
-    lower bound of each measure, a separate line and no scheme.
+    lower bound of each measure, a separate line and no scheme. In a result of several sites a measure's name ends with
+    ``@`` and the site's.
     """
 
     experiment: str

@@ -39,7 +39,7 @@ EXPERIMENT = Experiment(
     ),
     reference="eof",
     pairs=(("guided", "wqcs"), ("guided_chance", "wqcs")),
-    where="everywhere",
+    worlds=("paper", "pipeline", "stress", "dense", "lossy_uplink"),
     notes=(
         "`LLM draws` answers a uniform draw of the letters offered: what mode guided brings whatever the LLM.",
         "The modules' start, MADQN and MAPPO were trained on the scenario `paper` alone; elsewhere they are out of it. "

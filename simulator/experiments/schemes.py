@@ -48,12 +48,18 @@ class Clairvoyant(Record):
     seconds: float = 60.0
 
 
+class Informed(Record):
+    """The planner that is told every true link, a reference for all schemes: see ``simulator.flying.informed``."""
+
+    kind: Literal["informed"] = "informed"
+
+
 class Scheme(Record):
     """A decider, with a name for files and a label for display."""
 
     name: str
     label: str
-    decides: Annotated[Local | OverEdge | Clairvoyant, Field(discriminator="kind")]
+    decides: Annotated[Local | OverEdge | Clairvoyant | Informed, Field(discriminator="kind")]
 
     @property
     def is_answered(self) -> bool:
@@ -66,12 +72,14 @@ class Scheme(Record):
         return self.is_answered and not (isinstance(self.decides, OverEdge) and self.decides.backing in (CHANCE, WORST))
 
 
-PLANNER = "mpc"
+PLANNER, FORMULA_PLANNER = "mpc", "mpc_formula"
+PLANNERS = (PLANNER, FORMULA_PLANNER)
 # In display order. A figure shows those that are policies of this version.
 _POLICY_LABELS = {
     "madqn": "MADQN",
     "mappo": "MAPPO",
     PLANNER: "MPC (CP-SAT, horizon 8)",
+    FORMULA_PLANNER: "MPC without learning",
     "eof": "EOF",
     "wqcs": "WQCS",
     "max_gain": "maximum channel gain",
@@ -79,7 +87,10 @@ _POLICY_LABELS = {
     "round_robin": "round robin",
     "random": "random",
 }
+# Only the experiments that name them fly these.
+_NAMED_ONLY = (FORMULA_PLANNER,)
 BOUND = Scheme(name="bound", label="clairvoyant bound", decides=Clairvoyant())
+INFORMED = Scheme(name="informed", label="MPC, told the true links", decides=Informed())
 
 
 def local(name: str) -> Scheme:
@@ -94,10 +105,11 @@ def at_full_speed(name: str) -> Scheme:
 
 
 def available_locals(*names: str) -> list[Scheme]:
-    """The local policies of ``names`` that this version has, in display order; without names, all of them."""
+    """The local policies of ``names`` that this version has, in display order; without names, all but variants."""
     from simulator.policies.registry import POLICY_NAMES
 
-    wanted = names or (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
+    every = (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
+    wanted = names or tuple(name for name in every if name not in _NAMED_ONLY)
     return [local(name) for name in wanted if name in POLICY_NAMES]
 
 

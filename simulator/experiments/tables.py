@@ -56,6 +56,8 @@ def _by_site(result: Result, measures: Sequence[str]) -> list[Table]:
             row_label(result, scheme): [measured(result, scheme, f"{name}@{site}") for site in sites]
             for scheme in result.schemes
         }
+        if any(f"{name}@{site}" in result.bound for site in sites):
+            rows[BOUND_LABEL] = [result.bound.get(f"{name}@{site}") for site in sites]
         digits = _digits([found for cells in rows.values() for found in cells])
         texts = {label: [cell(found, digits) for found in cells] for label, cells in rows.items()}
         caption = _sited_label(result, name, sites[0])
@@ -88,9 +90,12 @@ def pair_tables(result: Result) -> list[Table]:
 
 def _pairs_by_site(result: Result, both: Mapping[tuple[str, str, str], Mapping[str, Paired]]) -> list[Table]:
     tables = []
+    order = list(dict.fromkeys(_site_of(measure) for found in result.schemes.values() for measure in found))
     for reference in dict.fromkeys(reference for _, reference, _ in both):
         compared = [(scheme, measure) for scheme, other, measure in both if other == reference]
-        for name, sites in _sites_of([measure for _, measure in compared]).items():
+        for name, found_at in _sites_of([measure for _, measure in compared]).items():
+            # The first scheme may be paired on some sites alone.
+            sites = sorted(found_at, key=order.index)
             for kind in ("difference", "ratio"):
                 rows = [
                     [
@@ -99,6 +104,8 @@ def _pairs_by_site(result: Result, both: Mapping[tuple[str, str, str], Mapping[s
                     ]
                     for scheme in dict.fromkeys(scheme for scheme, _ in compared)
                 ]
+                if all(text == NONE for row in rows for text in row[1:]):
+                    continue
                 caption = f"{_sited_label(result, name, sites[0])}: {kind} to {_reference_label(result, reference)}"
                 tables.append(Table(caption, ["scheme", *sites], rows))
     return tables

@@ -30,7 +30,9 @@ def true_problem(world: PipelineWorld, steps: int | None = None) -> FleetProblem
     end = world.scenario.steps if steps is None else min(len(world.tally) + steps, world.scenario.steps)
     links = None
     if world.truth.differs:
-        links = _links(world, end, course(world, (end - len(world.tally)) * world.scenario.max_velocity + 1)[:, None])
+        links = true_links(
+            world, end, course(world, (end - len(world.tally)) * world.scenario.max_velocity + 1)[:, None]
+        )
     return _problem(world, end, world.scenario, links)
 
 
@@ -46,7 +48,7 @@ def relaxed_problem(world: PipelineWorld) -> FleetProblem:
     fastest = _fastest(world)
     sums = np.arange((world.scenario.steps - len(world.tally)) * fastest + 1)[:, None, None]
     around = np.linspace(-0.5, 0.5, math.ceil(world.scenario.step_s / _SPACING_M) + 1)[:, None]
-    links = _links(world, world.scenario.steps, world.fleet.progress_m + (sums + around) * world.scenario.step_s)
+    links = true_links(world, world.scenario.steps, world.fleet.progress_m + (sums + around) * world.scenario.step_s)
     return _problem(world, world.scenario.steps, world.scenario.model_copy(update={"max_velocity": fastest}), links)
 
 
@@ -102,7 +104,7 @@ def _fastest(world: PipelineWorld) -> int:
     return math.ceil(scenario.max_velocity * min(max(stretch, 0.0), 2.0) - 1e-9)
 
 
-def _links(world: PipelineWorld, end: int, progress: FloatArray) -> list[IntArray]:
+def true_links(world: PipelineWorld, end: int, progress: FloatArray) -> list[IntArray]:
     """By UAV the packets of its links until a step, ``(1 or steps, C, J)``, at a progress ``(C, n, I)``, metres.
 
     Each is the best of the n links.

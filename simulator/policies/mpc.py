@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.fleetplan import FleetBelief
+from shared.fleetplan import Draft, FleetBelief
 from shared.fleetplan import RecedingHorizon as Planner
 from shared.scenario import Scenario
 from simulator.policies.reach import longest_silent
@@ -20,8 +20,16 @@ class RecedingHorizon:
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission; the seed is not used."""
         self._scenario = scenario
-        self.belief = FleetBelief(scenario)
+        self.belief = self.new_belief(scenario)
         self._planner = Planner(scenario, self.belief)
+
+    def new_belief(self, scenario: Scenario) -> FleetBelief:
+        """The belief that a mission starts with."""
+        return FleetBelief(scenario)
+
+    def draft(self, uav: int, taken: frozenset[int]) -> Draft | None:
+        """The problem of the plan that decides for a UAV; off the trajectory there is none."""
+        return self._planner.draft([uav], taken)
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
@@ -50,7 +58,7 @@ class RecedingHorizon:
 
     def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
         """The plan's action; off the trajectory, where no plan exists, no sensor (-1) at full speed."""
-        draft = self._planner.draft([uav], taken)
+        draft = self.draft(uav, taken)
         if draft is None:
             return -1, self._scenario.max_velocity
         self._planner.adopt(draft, draft.search())

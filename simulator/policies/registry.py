@@ -9,6 +9,7 @@ from simulator.policies.eof import EarliestOverflowFirst
 from simulator.policies.learned import Learned
 from simulator.policies.max_gain import MaximumGain
 from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc_formula import FormulaPlanner
 from simulator.policies.nearest import NearestNeighbour
 from simulator.policies.policy import Policy
 from simulator.policies.random_choice import RandomChoice
@@ -23,6 +24,7 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "max_gain": MaximumGain,
     "nearest": NearestNeighbour,
     "mpc": RecedingHorizon,
+    "mpc_formula": FormulaPlanner,
 }
 # They need the extra `marl`, and fly only scenarios of the size of their training.
 LEARNED_NAMES = ("madqn", "mappo")

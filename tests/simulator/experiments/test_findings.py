@@ -13,8 +13,10 @@ from simulator.experiments.findings import findings, tidy
 from simulator.experiments.flight import BoundFound, FlightRecord
 from simulator.experiments.measures import MEASURES, STEP_MEASURES
 from simulator.experiments.plan import QUICK_STEPS, Experiment, FigureSpec, plan
+from simulator.experiments.plots import BOUND_LABEL
 from simulator.experiments.result import Result
 from simulator.experiments.schemes import BOUND, llm, local
+from simulator.experiments.tables import measure_tables
 from simulator.sites.site import Site
 from tests.simulator.experiments.tiny_flights import TINY, decided, declared, flown, setup
 
@@ -90,11 +92,31 @@ def test_a_measure_that_some_seed_lacks_is_omitted_with_a_note() -> None:
 
 def test_the_measures_names_have_the_site() -> None:
     sites = {"paper": Site(TINY), "stress": Site(TINY.model_copy(update={"name": "stress", "link_share": 0.35}))}
-    result = result_of(declared(where="everywhere"), sites=sites)
+    result = result_of(declared(worlds=("stress",)), sites=sites)
     assert {"lost_packets@paper", "lost_packets@stress"} <= set(result.schemes["eof"])
     assert result.figures[0].measures == [f"{m}@{s}" for m in ("lost_packets", "events") for s in sites]
     assert result.labels["events@stress"] == "loss events, stress"
     assert {p.measure for p in result.paired} >= {"events@paper", "events@stress"}
+
+
+def test_each_site_has_a_bound_and_a_best_heuristic_of_its_own() -> None:
+    sites = {"paper": Site(TINY), "stress": Site(TINY.model_copy(update={"name": "stress", "link_share": 0.35}))}
+    experiment = declared(
+        local("eof"), local("random"), BOUND, worlds=("stress",), heuristics=("eof", "random"), reference=None
+    )
+    result = result_of(experiment, sites=sites)
+    assert result.bound["lost_packets@paper"].values == result.bound["lost_packets@stress"].values == [2, 3, 4]
+    found = {(p.scheme, p.reference, p.measure, p.kind): p.mean for p in result.paired}
+    assert found["random", "best_heuristic", "lost_packets@stress", "ratio"] == pytest.approx(3.0)
+    # EOF loses 10, 20, 30 and random thrice as many, at least 2, 3 and 4 of them whatever is flown.
+    assert found["random", "best_heuristic", "excess@stress", "ratio"] == pytest.approx(171 / 51)
+    assert found["random", "bound", "lost_packets@paper", "difference"] == pytest.approx(57.0)
+    assert ("eof", "best_heuristic", "lost_packets@paper", "ratio") not in found
+    assert {"experiment": "tiny", "scheme": "bound", "seed": "2", "measure": "lost_packets@stress", "value": "4"} in [
+        *csv.DictReader(StringIO(tidy(result)))
+    ]
+    [lost, *_] = measure_tables(result)
+    assert lost.rows[-1][0] == BOUND_LABEL and lost.rows[-1][1].startswith("3.0")
 
 
 def test_the_table_has_a_line_a_scheme_seed_and_measure() -> None:
@@ -121,6 +143,7 @@ def test_the_names_that_experiments_declare_exist(experiment: Experiment, pace: 
     whole = {scheme.name for scheme in experiment.schemes(setup())}
     assert names <= whole
     assert experiment.reference is None or experiment.reference in names
+    assert set(experiment.heuristics) <= names
     assert {name for pair in experiment.pairs for name in pair} <= whole
     assert set(experiment.measures) <= MEASURES.keys() and set(experiment.paired_measures) <= set(experiment.measures)
     for drawing in experiment.figures:

@@ -43,7 +43,18 @@ def ready(name: str, scenario: Scenario = FOUR, seed: int = 0) -> Policy:
 
 
 def test_an_unknown_policy_lists_the_known_ones() -> None:
-    assert POLICY_NAMES == ("random", "round_robin", "eof", "wqcs", "max_gain", "nearest", "mpc", "madqn", "mappo")
+    assert POLICY_NAMES == (
+        "random",
+        "round_robin",
+        "eof",
+        "wqcs",
+        "max_gain",
+        "nearest",
+        "mpc",
+        "mpc_formula",
+        "madqn",
+        "mappo",
+    )
     with pytest.raises(
         ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs, max_gain"
     ):

@@ -1,0 +1,44 @@
+"""Receding-horizon planning without learning: what the planner's model alone is worth."""
+
+from __future__ import annotations
+
+from shared.channel import FloatArray, IntArray
+from shared.drift import Drift
+from shared.fleetplan import FleetBelief
+from shared.fleetplan.arrivals import Arrivals
+from shared.scenario import Scenario
+from shared.trajectory import Trajectory
+from simulator.policies.mpc import RecedingHorizon
+
+
+class _MeanArrivals(Arrivals):
+    def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
+        """Every sensor's rate stays the scenario's mean."""
+
+
+class _StillAir(Drift):
+    def learn(self, path: Trajectory, start_m: float, still_m: float, end_m: float) -> None:
+        """A UAV is expected to fly its velocity times the step."""
+
+
+class _Formula(FleetBelief):
+    """The beacons' queues and the UAVs' positions; links, rates and ways are the formulas'."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        super().__init__(scenario)
+        self.arrivals = _MeanArrivals(scenario)
+        self.drift = _StillAir()
+
+    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
+        """A link has the mean path loss, whatever gain was measured."""
+
+    def settle(self, uav: int, step: int, failed: bool) -> None:
+        """A transfer is what was planned, until a beacon says otherwise."""
+
+
+class FormulaPlanner(RecedingHorizon):
+    """The planner of ``mpc`` with the model that it starts with: its channel, drift and arrivals never learn."""
+
+    def new_belief(self, scenario: Scenario) -> FleetBelief:
+        """A belief that takes no measurement and no outcome."""
+        return _Formula(scenario)
