@@ -124,6 +124,14 @@ class RadioMap:
         weight = _PRIOR_WEIGHT + int(self.count.sum())
         return float(np.sqrt((_PRIOR_WEIGHT * _PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
+    def measured_db(self) -> dict[int, float]:
+        """The mean excess loss of each measured sensor, dB, over the measurements kept; empty if all are exact."""
+        if self._exact:
+            return {}
+        used = np.arange(self.excess.shape[1]) < self.count[:, None]
+        means = (self.excess * used).sum(axis=1) / np.maximum(self.count, 1)
+        return {int(sensor): float(means[sensor]) for sensor in np.flatnonzero(self.count)}
+
     def measure(self, ids: IntArray, place: ArrayLike, excess_db: FloatArray) -> None:
         """Take one UAV's measurements of n sensors at its place.
 

@@ -74,6 +74,8 @@ def located_sensors(mission: Mission) -> int:
 _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacity", "radio_radius_m", "max_velocity"}
 
 
+# The page has an alarm for a sensor whose links lose this much more than modelled, dB: a tenth of the power arrives.
+_WORSE_DB = 10.0
 # Steps whose numbers an update repeats, so that none is missed.
 _NEWEST_STEPS = 20
 
@@ -97,6 +99,12 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "battery": np.round(belief.battery / scenario.battery_j, 3).tolist(),
         "heard": belief.heard.tolist(),
         "visits": mission.records.visits.tolist(),
+        "dead_radios": belief.channel.failures.dead,
+        "excess_db": {
+            sensor: round(excess, 1)
+            for sensor, excess in belief.channel.radio_map.measured_db().items()
+            if excess >= _WORSE_DB
+        },
         "uavs": {uav: {"step": last.step, "position": last.position} for uav, last in belief.uavs.items()},
     }
 

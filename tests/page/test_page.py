@@ -363,6 +363,20 @@ def test_alarms_name_the_sensors(visit: Open, edge: str, report: Report) -> None
     assert violations(page) == []
 
 
+def test_alarms_name_bad_links_and_dead_radios(visit: Open, edge: str, report: Report) -> None:
+    outcome = None
+    for step in range(20, 32):
+        body = report(mission_id="shadowed", step=step)
+        body["sensors"] |= {"last_seen": [step] * 4 + [None], "channel_gain": [-90.0, -90.0, -90.0, -108.0, None]}
+        body["sensors"] |= {"queue": [60, 60, 60, 60, None], "battery": [49.0, 49.0, 47.5, 50.0, None]}
+        answer = httpx.post(f"{edge}/decide", json=body | ({"outcome": outcome} if outcome else {}), timeout=PATIENCE_S)
+        outcome = {"decision_id": answer.json()["decision_id"], "cost": 1.0, "failed": True}
+    page = visit(f"{edge}/?mission=shadowed")
+    alarms = page.locator("#alarm-list")
+    expect(alarms).to_contain_text(re.compile(r"Radio probably dead: S\d"))
+    expect(alarms).to_contain_text(re.compile(r"Links worse than modelled: .*S\d \(\d+ dB\)"))
+
+
 def test_the_page_says_what_the_records_say(visit: Open, edge: str, tmp_path: Path) -> None:
     """Its numbers are those of the flight's own files."""
     fly(edge, tmp_path, "--scenario", "pipeline")

@@ -1,4 +1,4 @@
-// What may need the operator: full and nearly full queues, sensors that are not heard, and low batteries.
+// What may need the operator: full and nearly full queues, sensors that are not heard, radios, links and batteries.
 
 import { at, make, shown } from "./dom.js";
 
@@ -24,12 +24,15 @@ export function alarms(now, capacity) {
   const soon = ids.filter((id) => !full.includes(id) && now.full_in[id] <= SOON_STEPS).sort((a, b) => now.full_in[a] - now.full_in[b]);
   const unheard = ids.filter((id) => now.step - now.heard[id] > UNHEARD_STEPS).sort((a, b) => now.heard[a] - now.heard[b]);
   const low = ids.filter((id) => now.heard[id] >= 0 && now.battery[id] < BATTERY).sort((a, b) => now.battery[a] - now.battery[b]);
+  const worse = Object.keys(now.excess_db).sort((a, b) => now.excess_db[b] - now.excess_db[a]);
   const silent = Object.keys(now.silent);
   return [
     ["Believed full", full.map((id) => `S${id}`)],
     [`Full within ${SOON_STEPS} steps`, soon.map((id) => `S${id} (${shown(now.full_in[id])})`)],
     ["In radio range but not heard", silent.map((id) => `S${id} (step ${now.silent[id]})`)],
     [`Not heard for more than ${UNHEARD_STEPS} steps`, unheard.map((id) => `S${id} (${now.heard[id] < 0 ? "never" : `step ${now.heard[id]}`})`)],
+    ["Radio probably dead", now.dead_radios.map((id) => `S${id}`)],
+    ["Links worse than modelled", worse.map((id) => `S${id} (${shown(now.excess_db[id], 0)} dB)`)],
     [`Battery below ${100 * BATTERY}%`, low.map((id) => `S${id} (${shown(100 * now.battery[id], 0)}%)`)],
   ].filter(([, sensors]) => sensors.length > 0);
 }
