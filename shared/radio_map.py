@@ -27,6 +27,8 @@ _EXACT_DB = 0.05
 # The map compares its kinds of shadowing again when this factor more measurements came.
 _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
+# Matrices of measurements grow by so many rows at once, so that many sensors' are inverted together.
+_SIZE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,16 +192,22 @@ class RadioMap:
         return mean.T, deviation * np.sqrt(share).T
 
     def _factor(self, ids: IntArray) -> None:
-        """Invert the covariances of these sensors' measurements."""
+        """Invert the covariances of these sensors' measurements.
+
+        A matrix's size follows from its own sensor's measurements alone: the last bits of an inverse depend on it, and
+        a restored map is the same to the bit.
+        """
         if self._inverse is None:
             self._inverse = np.zeros((*self.excess.shape, self.excess.shape[1]))
-        kept = int(self.count[ids].max(initial=0))
-        used = (np.arange(kept) < self.count[ids, None]).astype(np.float64)
-        inverse = np.linalg.inv(self._covariances(ids, kept))
-        self._inverse[ids, :kept, :kept] = inverse
-        both = np.stack((self.excess[ids, :kept] * used, used), axis=2)
-        solved = inverse @ both
-        self._measured[ids, :kept], self._ones[ids, :kept] = solved[..., 0], solved[..., 1]
+        sizes = np.minimum(-(-self.count[ids] // _SIZE) * _SIZE, self.excess.shape[1])
+        for size in np.unique(sizes[sizes > 0]).tolist():
+            some = ids[sizes == size]
+            used = (np.arange(size) < self.count[some, None]).astype(np.float64)
+            inverse = np.linalg.inv(self._covariances(some, size))
+            self._inverse[some, :size, :size] = inverse
+            both = np.stack((self.excess[some, :size] * used, used), axis=2)
+            solved = inverse @ both
+            self._measured[some, :size], self._ones[some, :size] = solved[..., 0], solved[..., 1]
 
     def _covariances(self, ids: IntArray, kept: int) -> FloatArray:
         """``K``, ``(n, kept, kept)``; the rows without a measurement are the identity's."""

@@ -124,3 +124,17 @@ def test_a_report_without_a_fresh_beacon_changes_nothing() -> None:
     found = RadioMap(3)
     found.measure(np.array([], dtype=np.int64), np.zeros(2), np.array([]))
     assert found.heard == 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_restored_map_is_the_same_to_the_bit_however_often_each_sensor_was_heard(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = RadioMap(10)
+    for _ in range(50):
+        ids = np.sort(random.choice(10, random.integers(1, 7), replace=False))
+        found.measure(ids, random.uniform(0, 1000, 2), random.normal(0, 8, len(ids)))
+    again = RadioMap(10)
+    again.load_state_dict(found.state_dict())
+    assert again.offset_db == found.offset_db and again.deviation_db == found.deviation_db
+    for ours, theirs in zip(found.predict(PLACES, ALL), again.predict(PLACES, ALL), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
