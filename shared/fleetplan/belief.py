@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 from shared.channel import FloatArray, IntArray, Links
 from shared.drift import Drift
 from shared.fleetplan.arrivals import Arrivals, Which
+from shared.fleetplan.whereabouts import Visit, Whereabouts
 from shared.learned_channel import ExpectedLinks, LearnedChannel
 from shared.radio_failures import GOOD_LINK_DB
 from shared.scenario import Point, Scenario
@@ -24,41 +24,6 @@ FAR_M = 1e9
 _POSITION_ERROR_M = 0.01
 # The arrays of a belief.
 _ARRAYS = ("base", "since", "heard", "battery", "places", "visited")
-
-
-@dataclass(slots=True)
-class Visit:
-    """A flown decision: the sensor, the velocity, where the UAV started, and what was believed of the sensor before.
-
-    ``collected`` says whether the belief has taken packets from the sensor, and ``failed`` is the UAV's report,
-    ``None`` before it.
-    """
-
-    step: int
-    sensor: int
-    base: float
-    since: int
-    visited: int
-    collected: bool
-    failed: bool | None
-    velocity: int
-    start_m: float | None
-
-
-@dataclass(slots=True)
-class Whereabouts:
-    """A UAV's position at the start of ``step``, its decision in that step, if known, and its last flown one.
-
-    ``progress_m`` along its trajectory is ``None`` for a UAV off its trajectory, which is assumed to stay in place.
-    ``failed`` is the reported outcome of ``action``, ``None`` before the report.
-    """
-
-    step: int
-    position: Point
-    progress_m: float | None
-    action: tuple[int, int] | None = None
-    failed: bool | None = None
-    visit: Visit | None = None
 
 
 class FleetBelief:
@@ -137,16 +102,17 @@ class FleetBelief:
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
         here = (float(position[0]), float(position[1]))
-        visit = self.uavs[uav].visit if uav in self.uavs else None
+        last = self.uavs.get(uav)
+        visit, taught = (None, -1) if last is None else (last.visit, last.taught)
         path = self._paths[uav]
         progress = progress_of(path, here, reported_m)
         if reported_m is not None and progress == reported_m:
             x, y = path.at(reported_m).tolist()
             if math.hypot(x - here[0], y - here[1]) > _POSITION_ERROR_M:
                 here = x, y
-            if visit is not None and visit.step == step - 1 and visit.start_m is not None:
+            if taught != step and visit is not None and visit.step == step - 1 and visit.start_m is not None:
                 self.drift.learn(path, visit.start_m, visit.velocity * self._scenario.step_s, reported_m)
-        self.uavs[uav] = Whereabouts(step, here, progress, visit=visit)
+        self.uavs[uav] = Whereabouts(step, here, progress, visit=visit, taught=taught)
 
     def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
         """Take the gains ``(n,)`` of the beacons that a UAV hears where it was located.
@@ -155,6 +121,9 @@ class FleetBelief:
         is good, the sensor's radio failed.
         """
         last = self.uavs[uav]
+        if last.taught == last.step:
+            return
+        last.taught = last.step
         place = np.asarray(last.position)
         offset = self.places[ids] - place
         distance = np.hypot(offset[:, 0], offset[:, 1])
@@ -166,19 +135,22 @@ class FleetBelief:
         row = np.flatnonzero(near & (ids == visit.sensor))
         others = (other.visit for index, other in self.uavs.items() if index != uav)
         contested = any(o is not None and (o.sensor, o.step) == (visit.sensor, visit.step) for o in others)
-        # A sensor serves one UAV in a step, and a flat battery sends nothing, whatever the radio does.
-        if not len(row) or contested or self.battery[visit.sensor] <= 0:
+        # A sensor serves one UAV in a step, whatever its radio does.
+        if not len(row) or contested:
             return
         gain = float(gain_db[row[0]])
+        link = Links(distance[row[0]], np.asarray(-gain), self._scenario)
+        if self.battery[visit.sensor] < link.packet_j:
+            return
         if gain > GOOD_LINK_DB - self._scenario.path_loss_limit_db:
             self.channel.failures.settle(visit.sensor, visit.failed)
         if not visit.failed and visit.since == visit.step and self.since[visit.sensor] == last.step:
             # The queue was known before and after: it tells what the link moved.
             soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(np.array(1))
             rate = float((self.rate + soon)[visit.sensor])
-            link = int(Links(distance[row[0]], np.asarray(-gain), self._scenario).packets)
             moved = visit.base + rate - float(self.base[visit.sensor])
-            self.channel.moved(moved, visit.base, link, slack=3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0)
+            slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
+            self.channel.moved(moved, visit.base, int(link.packets), slack)
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
@@ -247,21 +219,17 @@ class FleetBelief:
         return int((links.packets if held else links.likely)[0, 0])
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
-        """Subtract the packets that a UAV collects in a step."""
+        """Subtract the packets that a UAV collects in a step, unless something newer is known of the queue."""
+        self.visited[sensor] = max(int(self.visited[sensor]), step)
+        if self.since[sensor] > step:
+            return
         self.base[sensor] = max(0.0, self.queue(step, [sensor])[0] - packets)
         self.since[sensor] = step
-        self.visited[sensor] = max(int(self.visited[sensor]), step)
 
     def state_dict(self) -> dict[str, Any]:
         """The whole belief, as copies."""
         arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
-        uavs = {
-            uav: [
-                *(u.step, list(u.position), u.progress_m, u.action),
-                *(u.failed, None if u.visit is None else astuple(u.visit)),
-            ]
-            for uav, u in self.uavs.items()
-        }
+        uavs = {uav: last.state() for uav, last in self.uavs.items()}
         learned = {"channel": self.channel.state_dict(), "drift": self.drift.state_dict()}
         return {**arrays, **self.arrivals.state_dict(), "uavs": uavs, **learned}
 
@@ -270,17 +238,7 @@ class FleetBelief:
         for name in _ARRAYS:
             setattr(self, name, state[name])
         self.arrivals.load_state_dict(state)
-        self.uavs = {
-            uav: Whereabouts(
-                step=step,
-                position=(x, y),
-                progress_m=progress_m,
-                action=None if action is None else (action[0], action[1]),
-                failed=newer[0] if newer else None,
-                visit=Visit(*newer[1]) if newer and newer[1] is not None else None,
-            )
-            for uav, (step, (x, y), progress_m, action, *newer) in state["uavs"].items()
-        }
+        self.uavs = {uav: Whereabouts.of(told) for uav, told in state["uavs"].items()}
         if "channel" in state:
             self.channel.load_state_dict(state["channel"])
             self.drift.load_state_dict(state["drift"])
