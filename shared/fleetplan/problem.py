@@ -107,8 +107,12 @@ class FleetProblem:
                 )
         if self.links is not None and len(self.links) != self.uavs:
             raise ValueError(f"links has tables of {len(self.links)} UAVs, there are {self.uavs}")
+        if any(table.dtype.kind not in "iu" or table.min(initial=0) < 0 for table in self.links or ()):
+            raise ValueError("links must be whole packets, at least 0")
         if self.chances is not None and [c.shape for c in self.chances] != [table.shape for table in self.links or ()]:
             raise ValueError(f"chances has shapes {[c.shape for c in self.chances]}, must have those of links")
+        if not all(((chance >= 0) & (chance <= 1)).all() for chance in self.chances or ()):
+            raise ValueError("chances must be probabilities, 0..1")
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
                 shape = actions.shape
@@ -163,17 +167,26 @@ class FleetProblem:
         table = self.chances[uav]
         return np.asarray(table[step if len(table) > 1 else 0, np.asarray(velocity)])
 
-    def links_until(self, step: int) -> list[IntArray] | None:
-        """The links of the steps before this one."""
-        return None if self.links is None else [table[:step] for table in self.links]
+    def tables_until(self, step: int) -> dict[str, Any]:
+        """The links and chances of the steps before this one."""
+        return {
+            name: None if tables is None else [table[:step] for table in tables]
+            for name, tables in (("links", self.links), ("chances", self.chances))
+        }
 
-    def links_after(self, actions: IntArray) -> list[IntArray] | None:
-        """The links after these actions ``(n, I, 2)``."""
-        if self.links is None:
-            return None
+    def tables_after(self, actions: IntArray) -> dict[str, Any]:
+        """The links and chances after these actions ``(n, I, 2)``."""
         flown = actions[:, :, 1].sum(axis=0).tolist()
-        gone = [min(len(actions), len(table) - 1) for table in self.links]
-        return [table[step:, summed:] for table, step, summed in zip(self.links, gone, flown, strict=True)]
+
+        def after(table: NDArray[Any], summed: int) -> NDArray[Any]:
+            return table[min(len(actions), len(table) - 1) :, summed:]
+
+        return {
+            name: None
+            if tables is None
+            else [after(table, summed) for table, summed in zip(tables, flown, strict=True)]
+            for name, tables in (("links", self.links), ("chances", self.chances))
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -206,9 +206,7 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
     begun, flown = time.perf_counter(), []
     now = problem
     while True:
-        near = replace(
-            now, arrivals=now.arrivals[:_NEAR], fixed={}, usable=None, risk=None, links=now.links_until(_NEAR)
-        )
+        near = replace(now, arrivals=now.arrivals[:_NEAR], fixed={}, usable=None, risk=None, **now.tables_until(_NEAR))
         left = seconds - (time.perf_counter() - begun)
         actions = look_ahead(near)
         if left > 0:
@@ -222,7 +220,7 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
             progress_m=now.progress_m + kept[:, :, 1].sum(axis=0) * problem.scenario.step_s,
             queue=fly(near, actions).queue[len(kept)],
             arrivals=now.arrivals[len(kept) :],
-            links=now.links_after(kept),
+            **now.tables_after(kept),
         )
 
 
