@@ -27,6 +27,8 @@ _EXACT_DB = 0.05
 # The map compares its kinds of shadowing again when this factor more measurements came.
 _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
+# Measurements of a sensor within this distance are of the same place, metres.
+_SAME_PLACE_M = 10.0
 # Matrices of measurements grow by so many rows at once, so that many sensors' are inverted together.
 _SIZE = 8
 
@@ -97,6 +99,8 @@ class RadioMap:
         self.excess: FloatArray = np.zeros((sensors, kept))
         self.noise: FloatArray = np.ones((sensors, kept))
         self.count: IntArray = np.zeros(sensors, dtype=np.int64)
+        # When each measurement was taken: ``heard`` then.
+        self._taken: IntArray = np.zeros((sensors, kept), dtype=np.int64)
         self.heard = 0
         self.kind = KINDS[0]
         self._compared = _COMPARE_FIRST
@@ -134,18 +138,21 @@ class RadioMap:
         means = (self.excess * used).sum(axis=1) / np.maximum(self.count, 1)
         return {int(sensor): float(means[sensor]) for sensor in np.flatnonzero(self.count)}
 
-    def measure(self, ids: IntArray, place: ArrayLike, excess_db: FloatArray) -> None:
+    def measure(self, ids: IntArray, place: ArrayLike, excess_db: FloatArray) -> FloatArray:
         """Take one UAV's measurements of n sensors at its place.
 
         Args:
             ids: shape ``(n,)``, each sensor once.
             place: shape ``(2,)``, metres.
             excess_db: shape ``(n,)``, measured path loss less the formula's, dB.
+
+        Returns:
+            the measurements as they count: within the largest excess loss.
         """
-        if not len(ids):
-            return
         # For a few numbers np.clip takes several times as long.
         excess = np.minimum(np.maximum(excess_db, -LARGEST_EXCESS_DB), LARGEST_EXCESS_DB)
+        if not len(ids):
+            return excess
         self.heard += len(ids)
         here = np.asarray(place, dtype=np.float64)
         noise: FloatArray | float = 1.0
@@ -156,20 +163,32 @@ class RadioMap:
             mean, deviation = self.predict(here[None], ids)
             off = np.abs(excess - mean[0]) / np.maximum(deviation[0], _HUBER_LEAST_DB)
             noise = np.square(np.maximum(off / _HUBER, 1.0))
-        # A full record drops the measurement nearest to the new one, which tells the most of what that one told.
         slot = self.count[ids]
         full = slot == self.excess.shape[1]
         if full.any():
-            slot = np.where(full, np.square(self.places[ids] - here).sum(axis=2).argmin(axis=1), slot)
+            slot = np.where(full, self._dropped(ids, here), slot)
+        self._taken[ids, slot] = self.heard
         self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
         self.count[ids] += ~full
         if self._exact:
-            return
+            return excess
         if self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
             self._compare()
         else:
             self._factor(ids)
+        return excess
+
+    def _dropped(self, ids: IntArray, here: FloatArray) -> IntArray:
+        """The measurement that a full record of each sensor drops for one here.
+
+        It is the oldest one of the same place, so that no wrong one stays, or else the nearest one, which tells the most
+        of what the new one tells.
+        """
+        apart = np.square(self.places[ids] - here).sum(axis=2)
+        same = apart <= _SAME_PLACE_M**2
+        oldest = np.where(same, self._taken[ids], self.heard).argmin(axis=1)
+        return np.asarray(np.where(same.any(axis=1), oldest, apart.argmin(axis=1)))
 
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
@@ -237,6 +256,7 @@ class RadioMap:
         arrays = {name: getattr(self, name).copy() for name in ("places", "excess", "noise", "count")}
         return {
             **arrays,
+            "taken": self._taken.copy(),
             "heard": self.heard,
             "kind": KINDS.index(self.kind),
             "compared": self._compared,
@@ -247,6 +267,7 @@ class RadioMap:
         """Restore a map, to the bit."""
         for name in ("places", "excess", "noise", "count"):
             setattr(self, name, state[name])
+        self._taken = state["taken"]
         self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
         self._exact = state["exact"]
         if not self._exact:

@@ -130,3 +130,13 @@ def test_expected_links_by_the_formula_are_certain() -> None:
     links = ExpectedLinks.by_formula(DISTANCES, PAPER)
     assert set(links.hold.ravel().tolist()) == {0.0, 1.0}
     assert links.likely is links.packets
+
+
+def test_a_radio_counts_as_dead_for_at_most_81_steps_after_the_last_forged_failure() -> None:
+    failures = RadioFailures(3)
+    for _ in range(10_000):
+        failures.settle(0, failed=True)
+    failures.advance(79)
+    assert failures.dead == [0]
+    failures.advance(81)
+    assert failures.dead == []

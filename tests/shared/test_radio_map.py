@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -138,3 +140,40 @@ def test_a_restored_map_is_the_same_to_the_bit_however_often_each_sensor_was_hea
     assert again.offset_db == found.offset_db and again.deviation_db == found.deviation_db
     for ours, theirs in zip(found.predict(PLACES, ALL), again.predict(PLACES, ALL), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+AROUND = np.array([[math.cos(angle), math.sin(angle)] for angle in np.linspace(0, 2 * math.pi, 12, False)]) * 300.0
+EVERYWHERE = np.stack(np.meshgrid(np.linspace(-400, 400, 9), np.linspace(-400, 400, 9)), axis=-1).reshape(-1, 2)
+
+
+def flown(deviation_db: float, seed: int) -> RadioMap:
+    """A map after an honest lap, half of the excess losses' variance the sensors' own."""
+    random, found = np.random.default_rng(seed), RadioMap(10)
+    own, along = random.normal(0, deviation_db * 0.7, 10), random.normal(0, deviation_db * 0.7, (12, 10))
+    for place, row in zip(AROUND, along, strict=True):
+        found.measure(ALL, place, own + row)
+    return found
+
+
+@pytest.mark.parametrize("deviation_db", [0.0, 4.0, 8.0])
+@pytest.mark.parametrize("lie_db", [1e6, -1e6, 20.0, 5.0])
+def test_a_forged_report_moves_no_link_further_than_the_links_differ(deviation_db: float, lie_db: float) -> None:
+    for seed in range(5):
+        found = flown(deviation_db, seed)
+        before = found.predict(EVERYWHERE, ALL)[0]
+        found.measure(ALL, AROUND[3] + 7.0, np.full(10, lie_db))
+        assert np.abs(found.predict(EVERYWHERE, ALL)[0] - before).max() <= max(deviation_db, 0.5)
+
+
+def test_any_number_of_lies_is_bounded_and_honest_laps_undo_them() -> None:
+    found = flown(4.0, 0)
+    before = found.predict(AROUND, ALL)[0]
+    for lie in range(100):
+        found.measure(ALL, AROUND[lie % 12] + 3.0, np.full(10, 1e6))
+    assert np.abs(found.predict(EVERYWHERE, ALL)[0]).max() <= LARGEST_EXCESS_DB
+    lied = np.abs(found.predict(AROUND, ALL)[0] - before).max()
+    for _ in range(3):
+        for place, row in zip(AROUND, before, strict=True):
+            found.measure(ALL, place, row)
+    undone = np.abs(found.predict(AROUND, ALL)[0] - before).max()
+    assert lied > 15.0 > 5.0 > undone
