@@ -105,9 +105,13 @@ class LearnedChannel:
         """Go to a later step."""
         self.failures.advance(step)
 
-    def measure(self, ids: IntArray, place: FloatArray, distance: FloatArray, gain_db: FloatArray) -> None:
-        """Take the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``."""
-        self.radio_map.measure(ids, place, -gain_db - path_loss_db(distance, self._scenario))
+    def measure(self, ids: IntArray, place: FloatArray, distance: FloatArray, gain_db: FloatArray) -> FloatArray:
+        """Take the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``.
+
+        Returns:
+            their excess losses over the formula, dB.
+        """
+        return self.radio_map.measure(ids, place, -gain_db - path_loss_db(distance, self._scenario))
 
     def links(self, places: FloatArray, distance: FloatArray, ids: IntArray | None = None) -> ExpectedLinks:
         """The links from a UAV's places ``(P, 2)`` to sensors at distances ``(P, n)``, all or those named."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from shared.scenario import Scenario
 from shared.wire import (
@@ -19,8 +19,27 @@ from shared.wire import (
 )
 
 
+class LearnedWorld(Wire):
+    """How a fleet's reports show that its world differs from the scenario's formulas."""
+
+    offset_db: float = Field(description="excess of the path loss over the formula's that all links share, dB")
+    deviation_db: float = Field(description="standard deviation of the excess loss of a link never measured, dB")
+    rate_share: float = Field(description="the rate that transfers get, as a share of the formula's")
+    wind: list[float] = Field(
+        min_length=2, max_length=2, description="east and north, as a share of the way that the velocity commands"
+    )
+    dispersion: float = Field(description="the variance of arrivals over a Poisson's, at least 1; 1: no bursts")
+    dead_radios: list[int] = Field(description="sensors whose transmissions fail although their links hold")
+    excess_db: dict[int, float] = Field(
+        description="sensor: mean of its latest measured excess losses, dB, where that is more than 1 dB off"
+    )
+
+
 class MissionStatus(Wire):
     """``GET /missions/{id}``; ``experiences`` is their number, ``prompt.experiences`` the largest number."""
+
+    # The status of a newer edge may have more fields.
+    model_config = ConfigDict(extra="ignore")
 
     mission_id: MissionId
     scenario: Scenario
@@ -43,6 +62,12 @@ class MissionStatus(Wire):
     learner_updates: int
     learner_loss: float | None
     visits: dict[int, int] = Field(description="sensor: step of the last visit")
+    # Omitted where there is none: an older client refuses fields that it does not know.
+    learned: LearnedWorld | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="how the world differs from the scenario's formulas; omitted where nothing shows that it does",
+    )
 
 
 class WeightArray(Wire):

@@ -182,8 +182,8 @@ class RadioMap:
     def _dropped(self, ids: IntArray, here: FloatArray) -> IntArray:
         """The measurement that a full record of each sensor drops for one here.
 
-        It is the oldest one of the same place, so that no wrong one stays, or else the nearest one, which tells the most
-        of what the new one tells.
+        It is the oldest one of the same place, so that no wrong one stays, or else the nearest one, which tells the
+        most of what the new one tells.
         """
         apart = np.square(self.places[ids] - here).sum(axis=2)
         same = apart <= _SAME_PLACE_M**2

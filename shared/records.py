@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from shared.channel import FloatArray
 from shared.features import filled
 from shared.fleetplan import FleetBelief
+from shared.fleetplan.measured import Measured
 from shared.scenario import Scenario
 from shared.wire import UavState
 
@@ -97,8 +98,8 @@ class Records:
         self._arrivals, self._exposure = state["arrivals"], state["exposure"]
 
 
-def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> None:
-    """Add a UAV's full report to the sensors' records and to the belief."""
+def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
+    """Add a UAV's full report to the sensors' records and to the belief; returns what its gains show."""
     ids = np.asarray(uav.sensors.id)
     seen = filled(uav.sensors.last_seen, NEVER).astype(np.int64)
     queue = filled(uav.sensors.queue)
@@ -107,5 +108,6 @@ def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief)
     places = np.array((uav.sensors.x, uav.sensors.y), dtype=np.float64).T
     belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
     fresh = seen == step
-    belief.measure(uav.uav_id, ids[fresh], filled(uav.sensors.channel_gain)[fresh])
+    measured = belief.measure(uav.uav_id, ids[fresh], filled(uav.sensors.channel_gain)[fresh])
     records.hear(ids, seen, queue)
+    return measured

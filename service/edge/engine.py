@@ -223,6 +223,8 @@ class Engine:
         """Report an answer to metrics, traces, the log and the mission page; nothing else reports decisions to them."""
         task, choice = decided.task, decided.choice
         self._metrics.record_decision(answer)
+        if (measured := task.mission.measured.pop(task.uav.uav_id, None)) is not None:
+            self._metrics.record_measured(measured)
         self._metrics.overflow_risk.observe(decided.state.state.overflow_risk)
         if task.mission.mode == "llm" and choice.reason != "no_candidate":
             self._metrics.llm_requests.labels(choice.reason or "ok").inc()

@@ -18,6 +18,7 @@ from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.mission.delta_reports import DeltaReports
 from service.mission.events import AdviserReport, Decided, Event, Guided, Pending, Reported, Settled, ignore_event
 from service.mission.idempotency import IdempotentAnswers
+from service.mission.learned_world import learned_world
 from service.mission.pending_decisions import PENDING_PER_UAV, PendingDecisions
 from service.mission.planner import Planner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
@@ -25,6 +26,7 @@ from service.mission.reservations import Reservation, Reservations
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.experiences import Experience, Experiences
 from shared.fleetplan import FleetBelief
+from shared.fleetplan.measured import Measured
 from shared.guidance import Guidance, GuidanceAnswer
 from shared.missions import MissionStatus
 from shared.records import Records, take_report
@@ -43,6 +45,7 @@ class Mission:
     Attributes:
         requested_spec: the spec of the request; ``spec`` is the resolved one.
         prompt_fits: whether the LLM's context is large enough for every prompt; True in a mode without an LLM.
+        measured: by UAV, what the gains of its newest report show, until it is told.
         trust: in mode ``guided``, the trust in the advisers, by the LLM's name.
 
     Args:
@@ -84,6 +87,7 @@ class Mission:
         self.pending = PendingDecisions(mission_id, self.scenario)
         self.idempotent_answers = IdempotentAnswers(PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
+        self.measured: dict[int, Measured] = {}
         self.delta_reports = DeltaReports()
         planned = spec.planner == "on" and can_plan(self.scenario)
         self.planner = Planner(self.scenario, self.belief) if planned else None
@@ -127,7 +131,7 @@ class Mission:
         """
         if self.planner is not None:
             self.planner.begin(step)
-        take_report(uav, step, self.records, self.belief)
+        self.measured[uav.uav_id] = take_report(uav, step, self.records, self.belief)
         self.record(Reported(step, uav))
         return self.reservations.attempt(step, uav.uav_id)
 
@@ -250,4 +254,5 @@ class Mission:
             learner_updates=self.learner.updates,
             learner_loss=self.learner.last_loss,
             visits={int(s): int(visits[s]) for s in np.flatnonzero(visits >= 0)},
+            learned=learned_world(self.belief),
         )

@@ -10,11 +10,13 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 
+from shared.fleetplan.measured import Measured
 from shared.wire import DecideResponse
 
 _DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
 _OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)
 _SHARE_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
+_EXCESS_BUCKETS_DB = (-20, -10, -6, -3, -1, 0, 1, 3, 6, 10, 15, 20, 30, 40)
 _STATUSES = ("loading", "ready", "unavailable", "off")
 
 
@@ -69,6 +71,15 @@ class Metrics:
             registry=r,
             buckets=_SHARE_BUCKETS,
         )
+        self.link_excess_db = Histogram(
+            "aicvds_link_excess_db",
+            "Excess of the path losses that beacons show over the formula's, dB",
+            registry=r,
+            buckets=_EXCESS_BUCKETS_DB,
+        )
+        self.radio_failures = Counter(
+            "aicvds_radio_failures", "Transmissions that failed although their links held", registry=r
+        )
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
         self.missions = Gauge("aicvds_missions", "Missions in memory or in the store", registry=r)
@@ -90,6 +101,12 @@ class Metrics:
         for status in _STATUSES:
             self.llm_servers.labels(status).set(statuses.get(status, 0))
         self.llm_breaker_open.set(breakers_open)
+
+    def record_measured(self, measured: Measured) -> None:
+        """Count what the gains of one report show."""
+        for excess_db in measured.excess_db.tolist():
+            self.link_excess_db.observe(excess_db)
+        self.radio_failures.inc(measured.radio_failed)
 
     def record_decision(self, decision: DecideResponse) -> None:
         """Count one answered decision: source, stages, overhead, tokens, lateness."""

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from shared.channel import FloatArray, IntArray, Links
 from shared.drift import Drift
 from shared.fleetplan.arrivals import Arrivals, Which
+from shared.fleetplan.measured import NOTHING_MEASURED, Measured
 from shared.fleetplan.whereabouts import Visit, Whereabouts
 from shared.learned_channel import ExpectedLinks, LearnedChannel
 from shared.radio_failures import GOOD_LINK_DB
@@ -114,7 +115,7 @@ class FleetBelief:
                 self.drift.learn(path, visit.start_m, visit.velocity * self._scenario.step_s, reported_m)
         self.uavs[uav] = Whereabouts(step, here, progress, visit=visit, taught=taught)
 
-    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
+    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:
         """Take the gains ``(n,)`` of the beacons that a UAV hears where it was located.
 
         A transmission of the UAV's last step was over the same link as the beacon now. If it failed although that link
@@ -122,35 +123,41 @@ class FleetBelief:
         """
         last = self.uavs[uav]
         if last.taught == last.step:
-            return
+            return NOTHING_MEASURED
         last.taught = last.step
         place = np.asarray(last.position)
         offset = self.places[ids] - place
         distance = np.hypot(offset[:, 0], offset[:, 1])
         near = distance <= self._scenario.radio_radius_m
-        self.channel.measure(ids[near], place, distance[near], gain_db[near])
+        excess_db = self.channel.measure(ids[near], place, distance[near], gain_db[near])
         visit = last.visit
         if visit is None or visit.failed is None or visit.step != last.step - 1:
-            return
+            return Measured(excess_db)
         row = np.flatnonzero(near & (ids == visit.sensor))
         others = (other.visit for index, other in self.uavs.items() if index != uav)
         contested = any(o is not None and (o.sensor, o.step) == (visit.sensor, visit.step) for o in others)
         # A sensor serves one UAV in a step, whatever its radio does.
         if not len(row) or contested:
-            return
-        gain = float(gain_db[row[0]])
-        link = Links(distance[row[0]], np.asarray(-gain), self._scenario)
+            return Measured(excess_db)
+        link = Links(distance[row[0]], np.asarray(-gain_db[row[0]]), self._scenario)
+        return Measured(excess_db, radio_failed=self._learn_of_visit(visit, link))
+
+    def _learn_of_visit(self, visit: Visit, link: Links) -> bool:
+        """Learn from the outcome of a UAV's last visit, over this link; whether the sensor's radio failed."""
         if self.battery[visit.sensor] < link.packet_j:
-            return
-        if gain > GOOD_LINK_DB - self._scenario.path_loss_limit_db:
-            self.channel.failures.settle(visit.sensor, visit.failed)
-        if not visit.failed and visit.since == visit.step and self.since[visit.sensor] == last.step:
+            return False
+        failed = bool(visit.failed)
+        good = bool(link.loss_db < self._scenario.path_loss_limit_db - GOOD_LINK_DB)
+        if good:
+            self.channel.failures.settle(visit.sensor, failed)
+        if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
             # The queue was known before and after: it tells what the link moved.
             soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(np.array(1))
             rate = float((self.rate + soon)[visit.sensor])
             moved = visit.base + rate - float(self.base[visit.sensor])
             slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
             self.channel.moved(moved, visit.base, int(link.packets), slack)
+        return good and failed
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""

@@ -80,7 +80,11 @@ def test_a_link_that_moves_nothing_is_a_failure() -> None:
 def test_a_sensor_probably_visited_keeps_the_rest_of_its_risk() -> None:
     risk = np.zeros((HORIZON + 1, HORIZON + 1, SENSORS))
     risk[0, :, 0] = 10.0
-    emptied = {"queue": np.array([0, 0]), "arrivals": np.zeros((HORIZON, SENSORS), dtype=np.int64), "risk": risk}
+    emptied: dict[str, Any] = {
+        "queue": np.array([0, 0]),
+        "arrivals": np.zeros((HORIZON, SENSORS), dtype=np.int64),
+        "risk": risk,
+    }
     costs = [price(problem(chance, **emptied), actions((0, 0), (1, 0)))[1] for chance in (0.0, 0.3, 1.0)]
     assert costs == pytest.approx([30.0, 21.0, 0.0])
     # A second visit cancels as much again.

@@ -1,0 +1,30 @@
+"""What a mission's fleet has learned of its world, as the mission's status tells it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from shared.fleetplan import FleetBelief
+from shared.missions import LearnedWorld
+
+# A sensor whose measurements are on the mean within this of the formula is not named, dB.
+_TOLD_DB = 1.0
+
+
+def learned_world(belief: FleetBelief) -> LearnedWorld | None:
+    """How the world differs from the scenario's formulas; None where nothing yet shows that it does."""
+    channel, dispersion = belief.channel, belief.arrivals.dispersion
+    if channel.by_formula and belief.drift.none and dispersion == 1.0:
+        return None
+    measured = channel.radio_map.measured_db
+    east, north = belief.drift.wind.tolist()
+    return LearnedWorld(
+        offset_db=channel.radio_map.offset_db,
+        deviation_db=channel.radio_map.deviation_db,
+        rate_share=channel.share,
+        wind=[east, north],
+        dispersion=dispersion,
+        dead_radios=channel.failures.dead,
+        # A comparison with NaN, of a sensor never measured, is False.
+        excess_db={int(j): float(measured[j]) for j in np.flatnonzero(np.abs(measured) > _TOLD_DB)},
+    )
