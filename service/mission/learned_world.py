@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from shared.fleetplan import FleetBelief
 from shared.missions import LearnedWorld
 
@@ -16,7 +14,7 @@ def learned_world(belief: FleetBelief) -> LearnedWorld | None:
     channel, dispersion = belief.channel, belief.arrivals.dispersion
     if channel.by_formula and belief.drift.none and dispersion == 1.0:
         return None
-    measured = channel.radio_map.measured_db
+    measured = channel.radio_map.measured_db()
     east, north = belief.drift.wind.tolist()
     return LearnedWorld(
         offset_db=channel.radio_map.offset_db,
@@ -25,6 +23,5 @@ def learned_world(belief: FleetBelief) -> LearnedWorld | None:
         wind=[east, north],
         dispersion=dispersion,
         dead_radios=channel.failures.dead,
-        # A comparison with NaN, of a sensor never measured, is False.
-        excess_db={int(j): float(measured[j]) for j in np.flatnonzero(np.abs(measured) > _TOLD_DB)},
+        excess_db={sensor: excess for sensor, excess in measured.items() if abs(excess) > _TOLD_DB},
     )
