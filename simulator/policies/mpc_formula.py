@@ -6,6 +6,7 @@ from shared.channel import FloatArray, IntArray
 from shared.drift import Drift
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.arrivals import Arrivals
+from shared.fleetplan.measured import NOTHING_MEASURED, Measured
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory
 from simulator.policies.mpc import RecedingHorizon
@@ -29,8 +30,9 @@ class _Formula(FleetBelief):
         self.arrivals = _MeanArrivals(scenario)
         self.drift = _StillAir()
 
-    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> None:
+    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:
         """A link has the mean path loss, whatever gain was measured."""
+        return NOTHING_MEASURED
 
     def settle(self, uav: int, step: int, failed: bool) -> None:
         """A transfer is what was planned, until a beacon says otherwise."""
