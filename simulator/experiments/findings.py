@@ -186,7 +186,7 @@ def _notes(plan: Plan, setup: Setup, groups: Sequence[Group]) -> list[str]:
 def _below_bound(groups: Sequence[Group]) -> list[str]:
     least = {(g.site, f.seed): f.bound.lower_bound for g in groups for f in g.flights if f.bound}
     below = [
-        f"{group.scheme.label}, seed {flight.seed}"
+        f"{group.scheme.label}{group.suffix}, seed {flight.seed}"
         for group in groups
         for flight in group.flights
         if not flight.bound and sum(flight.lost_packets) < least.get((group.site, flight.seed), 0)
@@ -210,7 +210,8 @@ def _doubts(group: Group) -> list[str]:
     if unproven:
         gap = max(b.lost_packets - b.lower_bound for b in unproven)
         notes.append(
-            f"{group.scheme.label}: proven optimal on {len(group.flights) - len(unproven)} of {len(group.flights)} "
-            f"seeds; on the others the best plan found loses up to {gap:g} packets more than the proven bound."
+            f"{group.scheme.label}{group.suffix}: proven optimal on {len(group.flights) - len(unproven)} of "
+            f"{len(group.flights)} seeds; on the others the best plan found loses up to {gap:g} packets more than the "
+            "proven bound."
         )
     return notes

@@ -115,6 +115,7 @@ def test_each_site_has_a_bound_and_a_best_heuristic_of_its_own() -> None:
     assert {"experiment": "tiny", "scheme": "bound", "seed": "2", "measure": "lost_packets@stress", "value": "4"} in [
         *csv.DictReader(StringIO(tidy(result)))
     ]
+    assert any("clairvoyant bound@stress: proven optimal on 2 of 3 seeds" in note for note in result.notes)
     [lost, *_] = measure_tables(result)
     assert lost.rows[-1][0] == BOUND_LABEL and lost.rows[-1][1].startswith("3.0")
 
