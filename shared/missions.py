@@ -29,7 +29,7 @@ class LearnedWorld(Wire):
         min_length=2, max_length=2, description="east and north, as a share of the way that the velocity commands"
     )
     dispersion: float = Field(description="the variance of arrivals over a Poisson's, at least 1; 1: no bursts")
-    dead_radios: list[int] = Field(description="sensors whose transmissions fail although their links hold")
+    failed_radios: list[int] = Field(description="sensors whose transmissions fail although their links hold")
     excess_db: dict[int, float] = Field(
         description="sensor: mean of its latest measured excess losses, dB, where that is more than 1 dB off"
     )

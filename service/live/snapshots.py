@@ -99,7 +99,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "battery": np.round(belief.battery / scenario.battery_j, 3).tolist(),
         "heard": belief.heard.tolist(),
         "visits": mission.records.visits.tolist(),
-        "dead_radios": belief.channel.failures.dead,
+        "failed_radios": belief.channel.failures.dead,
         "excess_db": {
             sensor: round(excess, 1)
             for sensor, excess in belief.channel.radio_map.measured_db().items()

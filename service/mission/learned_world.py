@@ -22,6 +22,6 @@ def learned_world(belief: FleetBelief) -> LearnedWorld | None:
         rate_share=channel.share,
         wind=[east, north],
         dispersion=dispersion,
-        dead_radios=channel.failures.dead,
+        failed_radios=channel.failures.dead,
         excess_db={sensor: excess for sensor, excess in measured.items() if abs(excess) > _TOLD_DB},
     )

@@ -31,7 +31,7 @@ export function alarms(now, capacity) {
     [`Full within ${SOON_STEPS} steps`, soon.map((id) => `S${id} (${shown(now.full_in[id])})`)],
     ["In radio range but not heard", silent.map((id) => `S${id} (step ${now.silent[id]})`)],
     [`Not heard for more than ${UNHEARD_STEPS} steps`, unheard.map((id) => `S${id} (${now.heard[id] < 0 ? "never" : `step ${now.heard[id]}`})`)],
-    ["Radio probably dead", now.dead_radios.map((id) => `S${id}`)],
+    ["Radio probably dead", now.failed_radios.map((id) => `S${id}`)],
     ["Links worse than modelled", worse.map((id) => `S${id} (${shown(now.excess_db[id], 0)} dB)`)],
     [`Battery below ${100 * BATTERY}%`, low.map((id) => `S${id} (${shown(100 * now.battery[id], 0)}%)`)],
   ].filter(([, sensors]) => sensors.length > 0);

@@ -56,7 +56,7 @@ def test_the_status_tells_what_differs(edge: Edge, report: Report) -> None:
     assert status.learned.excess_db[0] == pytest.approx(12.0)
 
 
-def test_the_status_names_dead_radios_wind_bursts_and_the_rate() -> None:
+def test_the_status_names_failed_radios_wind_bursts_and_the_rate() -> None:
     belief = FleetBelief(PAPER)
     assert learned_world(belief) is None
     for _ in range(2):
@@ -69,7 +69,7 @@ def test_the_status_names_dead_radios_wind_bursts_and_the_rate() -> None:
         belief.arrivals.take(every, np.full(10, 20.0 * (step % 4 == 0)), one, one * step)
     learned = learned_world(belief)
     assert learned is not None
-    assert learned.dead_radios == [3]
+    assert learned.failed_radios == [3]
     assert learned.rate_share == pytest.approx(0.5)
     # The lap begins to the north.
     assert learned.wind[1] > 0.1 > abs(learned.wind[0])
