@@ -61,7 +61,8 @@ class Arrivals:
         """Take the packets ``(n,)`` that came to sensors ``(n,)`` in so many steps, until these steps."""
         rate = self.arrived[ids] / self.watched[ids]
         expected = rate * steps
-        variance = expected + np.square(steps) * rate / self.watched[ids]
+        # At least a packet's: where next to nothing is expected, one packet is no burst.
+        variance = np.maximum(expected + np.square(steps) * rate / self.watched[ids], 1.0)
         self._surprise += float(np.sum(np.square(came - expected) / variance))
         self._intervals += len(ids)
         self.recent[ids], self.recent_at[ids] = came / steps, at

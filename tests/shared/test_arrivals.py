@@ -7,7 +7,7 @@ import pytest
 
 from shared.channel import IntArray
 from shared.fleetplan.arrivals import Arrivals
-from shared.scenario import Scenario
+from shared.scenario import SCENARIOS, Scenario
 
 WORLD = Scenario(name="ten", sensors=10, uavs=2)
 ALL = np.arange(10)
@@ -74,3 +74,13 @@ def test_a_state_of_an_earlier_version_knows_rates_alone() -> None:
     np.testing.assert_array_equal(again.rate(), told(bursts()).rate())
     assert again.dispersion == 1.0
     assert not again.burst(200).any()
+
+
+def test_where_nothing_is_expected_nothing_is_no_surprise_and_a_packet_is_no_burst() -> None:
+    nothing = SCENARIOS["paper"].model_copy(update={"arrival_rate_min": 0.0, "arrival_rate_max": 0.0})
+    arrivals, ids = Arrivals(nothing), np.arange(10)
+    for step in range(1, 10):
+        arrivals.take(ids, np.zeros(10), np.ones(10, dtype=np.int64), np.full(10, step))
+    arrivals.take(ids[:1], np.ones(1), np.ones(1, dtype=np.int64), np.array([10]))
+    assert arrivals.dispersion == 1.0
+    assert not arrivals.burst(11).any()
