@@ -153,7 +153,7 @@ def test_mode_guided_shows_candidates_with_probabilities_and_trust(visit: Open, 
         best = answer["guided"]["candidates"][0]
         expect(dialog.locator("tbody tr").first).to_contain_text(f"{best['llm']:.3f}{best['mixture']:.3f}")
         expect(dialog.locator("meter")).to_have_count(len(answer["guided"]["trust"]))
-        expect(dialog).to_contain_text("As the LLM got it.")
+        expect(dialog).to_contain_text("As the LLM received it.")
         assert violations(page) == []
 
 

@@ -14,12 +14,6 @@ from tests.running import serving
 from tests.service.stub_llm import StubLlm
 
 
-@pytest.fixture(autouse=True)
-def no_other_variables(monkeypatch: pytest.MonkeyPatch) -> None:
-    """CI sets one of the tests' own, which is no setting of an edge."""
-    monkeypatch.delenv("AICVDS_TESTS_COMPLETE", raising=False)
-
-
 def free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
