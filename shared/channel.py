@@ -118,17 +118,11 @@ def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     return Links.at(distance_m, scenario).rate_bps
 
 
-def packets_per_step(distance_m: ArrayLike, scenario: Scenario, excess_db: ArrayLike = 0.0) -> NDArray[np.int64]:
-    """Whole packets that one step can move at that distance; 0 where the link fails.
-
-    ``excess_db`` as for :meth:`Links.at`.
-    """
-    d, excess = np.asarray(distance_m, dtype=np.float64), np.asarray(excess_db, dtype=np.float64)
-    # Broadcasting takes as long as a small array's path loss.
-    if excess.ndim:
-        d, excess = np.broadcast_arrays(d, excess)
+def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.int64]:
+    """Whole packets that one step can move at that distance; 0 where the link fails."""
+    d = np.asarray(distance_m, dtype=np.float64)
     packets = np.zeros(d.shape, dtype=np.int64)
     # The path loss takes most of the time, and of many sensors most are out of radio range.
     near = d <= scenario.radio_radius_m
-    packets[near] = Links.at(d[near], scenario, excess[near] if excess.ndim else excess).packets
+    packets[near] = Links.at(d[near], scenario).packets
     return packets

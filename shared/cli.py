@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from difflib import get_close_matches
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
+
+from shared.faults import suggestion
 
 _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
@@ -67,9 +68,7 @@ def main() -> int:
         return 0
     found = [e for e in entry_points(group="aicvds.commands") if e.name == name]
     if not found:
-        near = get_close_matches(name, _SUMMARIES, n=1)
-        meant = f"; did you mean `aicvds {near[0]}`?" if near else ""
-        print(f"aicvds: there is no command {name!r}{meant}\n\n{usage()}", file=sys.stderr)
+        print(f"aicvds: there is no command {name!r}{suggestion(name, _SUMMARIES)}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
         return int(found[0].load()(rest) or 0)

@@ -156,7 +156,7 @@ def augment(
     given_away = np.zeros(scenario.sensors, dtype=np.bool_)
     given_away[list(reserved)] = True
     channel = None if belief is None else belief.channel
-    if channel is None or channel.radio_map.exact:
+    if channel is None:
         expected = channel_gain_db(distance, scenario)
     else:
         expected = channel.gain_db(np.asarray(position), distance, ids)

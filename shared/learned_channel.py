@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shared.channel import FloatArray, IntArray, Links, link_holds, packets_per_step, path_loss_db
 from shared.radio_failures import RadioFailures
@@ -23,7 +22,7 @@ _SHARE_VISITS = 5
 _WHOLE_SHARE, _LEAST_SHARE = 0.93, 0.05
 
 
-def normal_below(z: FloatArray) -> FloatArray:
+def nearly_normal_below(z: FloatArray) -> FloatArray:
     """``Phi(z)`` within 0.01, by the logistic function: the standard library has no vectorised erf."""
     return np.asarray(1.0 / (1.0 + np.exp(np.clip(-1.702 * z, -50.0, 50.0))))
 
@@ -60,7 +59,7 @@ class ExpectedLinks:
         if self.margin is None:
             likely = link_holds(self.distance[rows], self.scenario).astype(np.float64)
         else:
-            likely = normal_below(self.margin[rows])
+            likely = nearly_normal_below(self.margin[rows])
         return likely if self.alive is None else likely * self.alive
 
     @property
@@ -169,8 +168,3 @@ class LearnedChannel:
         self.radio_map.load_state_dict(state["map"])
         self.failures.load_state_dict(state["failures"])
         self._shares = list(state["shares"])
-
-
-def likely_to_hold(hold: FloatArray) -> NDArray[np.bool_]:
-    """Whether links with these probabilities count as links."""
-    return np.asarray(hold >= LIKELY)

@@ -17,7 +17,7 @@ _MOST_KEPT, _MOST_OF_ONE = 4096, 24
 _PRIOR_DB, _PRIOR_WEIGHT = 6.0, 0.03
 # The weight of the prior of the offset that all links share, an offset of 0 dB, in independent sensors.
 _OFFSET_WEIGHT = 2.0
-# No radio differs more from the formula, dB: a report that says so is wrong, or is a lie.
+# A measurement counts as at most this much, dB: it bounds how far a wrong report moves the map.
 LARGEST_EXCESS_DB = 40.0
 # A measurement this many standard deviations off its prediction counts less, as in Huber's estimator.
 _HUBER = 3.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shared.channel import FloatArray
 from shared.drift import Drift
-from shared.learned_channel import ExpectedLinks, likely_to_hold
+from shared.learned_channel import LIKELY, ExpectedLinks
 from shared.scenario import Point, Scenario
 from shared.trajectory import progress_of, trajectories
 
@@ -73,7 +73,7 @@ class Reach:
     @property
     def likely(self) -> NDArray[np.bool_]:
         """Whether each link is likely to hold."""
-        return likely_to_hold(self.links.hold)
+        return np.asarray(self.links.hold >= LIKELY)
 
     @cached_property
     def best(self) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.arrivals import Arrivals
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
-from shared.learned_channel import normal_below
+from shared.learned_channel import nearly_normal_below
 from shared.reach import VELOCITY_BONUS
 from shared.scenario import Scenario
 from shared.urgency import urgency
@@ -271,7 +271,7 @@ class _RolloutBatch:
             uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.margins.items()
         }
         self._holds = {
-            uav: sliding_window_view(normal_below(table) * state.alive, scenario.max_velocity + 1, axis=0)
+            uav: sliding_window_view(nearly_normal_below(table) * state.alive, scenario.max_velocity + 1, axis=0)
             for uav, table in state.margins.items()
         }
         self._fades = fades

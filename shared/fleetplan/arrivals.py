@@ -80,7 +80,7 @@ class Arrivals:
         """Packets a step that are expected in the steps from this one to the horizon, ``(J,)``."""
         if self.dispersion == 1.0:
             return self.rate()
-        return self.rate() + self.burst(step) * float(self.burst_over(np.array(horizon))) / horizon
+        return self.rate() + self.burst(step) * float(self.burst_over(horizon)) / horizon
 
     @staticmethod
     def burst_over(steps: ArrayLike) -> FloatArray:

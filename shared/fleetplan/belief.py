@@ -152,7 +152,7 @@ class FleetBelief:
             self.channel.failures.settle(visit.sensor, failed)
         if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
             # The queue was known before and after: it tells what the link moved.
-            soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(np.array(1))
+            soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(1)
             rate = float((self.rate + soon)[visit.sensor])
             moved = visit.base + rate - float(self.base[visit.sensor])
             slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0

@@ -102,7 +102,7 @@ def test_delta_is_right_where_requests_and_answers_are_lost(edge: Edge) -> None:
     lossy = LossyTransport(Deaf(), drop=0.3, jitter_ms=2, seed=0)
     full, delta = flown(url, "full", "full"), flown(url, "delta", "delta", lossy)
     with EdgeClient(url, timeout_s=PATIENCE_S) as ground:
-        # What was sent again was decided once.
+        # The edge decides once for a request that is sent again.
         assert ground.mission("delta").decisions == len(delta.decisions)
     assert max(d.attempts for d in delta.decisions) > 1
     assert decided(delta) == decided(full)

@@ -119,7 +119,7 @@ def test_kills_under_load(tmp_path: Path, report: Report, tables: Tables) -> Non
                 assert uav.error is None
     else:
         raise AssertionError("unreachable")
-    # Nobody asks meanwhile: what the fleet has learned of its links is there to the bit, after one more kill too.
+    # No UAV asks in between, so that the learned channel is equal to the bit, after one more kill too.
     learned = []
     for _ in range(2):
         with serving_edge(**settings) as (url, process), httpx.Client(base_url=url, timeout=30) as client:
