@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import shutil
+import signal
 import ssl
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -26,6 +27,10 @@ from tests.waiting import PATIENCE_S
 
 # An edge started as a process has no store unless a test gives one: otherwise all would share the user's store.
 os.environ["AICVDS_STORE"] = "none"
+
+# A shell starts `make test &` with SIGINT ignored, and every process of a test would inherit that and outlive Ctrl-C.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # As in an edge: pytest's workers already take every core.
 torch.set_num_threads(1)
