@@ -61,14 +61,17 @@ def read_rollouts(path: Path) -> tuple[Header, Iterator[RolloutStep]]:
     """
 
     def parsed() -> Iterator[Header | RolloutStep]:
+        number = 0
         with gzip.open(path, "rt", encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
-                model = Header if number == 1 else RolloutStep
-                try:
+            try:
+                for number, line in enumerate(file, start=1):
+                    model = Header if number == 1 else RolloutStep
                     yield model.model_validate_json(line)
-                except ValidationError as error:
-                    fault = error.errors(include_url=False)[0]["msg"]
-                    raise ValueError(f"{path}, line {number}: {fault}") from None
+            except ValidationError as error:
+                fault = error.errors(include_url=False)[0]["msg"]
+                raise ValueError(f"{path}, line {number}: {fault}") from None
+            except EOFError:
+                raise ValueError(f"{path} ends after line {number}: its recording was stopped") from None
 
     lines = parsed()
     header = next(lines, None)

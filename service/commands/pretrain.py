@@ -28,6 +28,8 @@ def main(argv: list[str]) -> int:
 
 
 def _check(args: Pretrain) -> None:
+    if not args.rollouts:
+        raise ValueError("name a file that aicvds explore wrote, or several")
     for name in ("epochs", "horizon", "batch"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name} {getattr(args, name)} is not at least 1")

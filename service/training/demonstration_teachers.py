@@ -9,16 +9,16 @@ from itertools import groupby
 import numpy as np
 
 from service.config.settings import Settings
-from service.deciding.attended_state import AttendedState
 from service.deciding.look_ahead import look_ahead
 from service.mission.mission import Mission
 from service.prompting.demonstrations import Demonstration
+from service.training.recorded_states import recorded_states
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import State
 from shared.rollouts import Header, RolloutStep
 from shared.scenario import Scenario
-from shared.wire import MissionSpec, Outcome, UavState
+from shared.wire import MissionSpec, UavState
 
 # A function of a recorded decision, the edge's state, the scenario and the reserved sensors. It returns an action, or
 # None where the teacher has no answer.
@@ -55,18 +55,13 @@ def solutions(
     spec = MissionSpec(scenario=header.scenario, features="reach", belief="reported", planner="off", init="random")
     for mission_id, group in groupby(steps, key=lambda step: step.request.mission_id):
         mission = Mission(mission_id, spec, settings)
-        for number, step in enumerate(group):
-            uav, decision_id = step.request, f"{number:032x}"
-            mission.observe(uav, uav.step)
-            state = AttendedState.of(mission, uav, uav.step)
-            if state.state.admissible.sum() > 1:
-                reserved = mission.reservations.of_others(uav.step, uav.uav_id)
-                answer = teacher(step, state.state, mission.scenario, reserved)
-                if answer is not None and _collects(state.state, *answer):
-                    demonstration = _demonstration(mission, uav, uav.step, answer)
-                    yield demonstration, point(state.state, *answer, mission.scenario)
-            mission.commit(state.pending(decision_id, Action(step.sensor_id, step.velocity)))
-            mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
+        for step, state in recorded_states(mission, group):
+            if state.state.admissible.sum() <= 1:
+                continue
+            answer = teacher(step, state.state, mission.scenario, state.reserved)
+            if answer is not None and _collects(state.state, *answer):
+                demonstration = _demonstration(mission, step.request, state.step, answer)
+                yield demonstration, point(state.state, *answer, mission.scenario)
 
 
 def _collects(state: State, sensor_id: int, velocity: int) -> bool:

@@ -21,18 +21,20 @@ class Pretrain:
 
     Then:  aicvds pretrain runs/rollouts.jsonl.gz --features reach --out runs/reach.pt
 
+    Several files train on several scenarios, every decision with the same weight. Their UAVs need the same velocities.
+
     Target `return`: value regression as online, but of the discounted cost over several steps, since the loss of a bad
     decision comes after it; and s_j and u_v learn to rank the teacher's sensor and a velocity for it first
     (cross-entropy of their softmax).
     Target `immediate` is the paper's: regression of this one step's cost, without a teacher.
 
-    Every eleventh mission is held out. The command prints the loss on these missions. For the trained weights, random
-    weights and the package's own checkpoint it also prints how often each teacher's sensor is among the k best, and how
-    near the velocity is to the teacher's. The same command writes the same weights.
+    Every eleventh mission of a file is held out. The command prints the loss on these missions. For each file, and the
+    trained weights, random weights and the package's own checkpoint, it also prints how often each teacher's sensor is
+    among the k best, and how near the velocity is to the teacher's. The same command writes the same weights.
     """
 
-    rollouts: Annotated[tyro.conf.Positional[Path], arg(metavar="FILE")]
-    """What `aicvds explore` wrote."""
+    rollouts: Annotated[tyro.conf.Positional[tuple[Path, ...]], arg(metavar="FILE FILE...")]
+    """What `aicvds explore` wrote, one file or more."""
     out: Annotated[Path, arg(metavar="FILE")]
     """Checkpoint to write. The package's own are service/checkpoints/paper.pt and reach.pt, one a feature preset."""
     features: Features = "paper"

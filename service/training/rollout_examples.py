@@ -16,13 +16,14 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.look_ahead import look_ahead
 from service.learning.modules import Sample
 from service.mission.mission import Mission
+from service.training.recorded_states import recorded_states
 from service.training.reward import Reward, Speed
 from shared.actions import Action
 from shared.features import State
 from shared.reach import Reach, distances_between, places_ahead
 from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
-from shared.wire import Belief, Features, MissionSpec, Outcome
+from shared.wire import Belief, Features, MissionSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ def replay(
     features: Features = "paper",
     belief: Belief | None = None,
 ) -> Iterator[list[Example]]:
-    """Each mission's examples, with the same visiting records, arrival rates and features as online.
+    """Each mission's examples, with the same visiting records, arrival rates, links and features as online.
 
     Args:
         belief: the source of the features; by default the one that missions with these features have.
@@ -79,16 +80,11 @@ def replay(
         rewards = {uav: iter(reward.of(own, header.scenario)) for uav, own in by_uav.items()}
         mission = Mission(mission_id, spec, settings)
         examples = []
-        for number, step in enumerate(logged):
-            decision_id = f"{number:032x}"
-            mission.observe(step.request, step.request.step)
-            state = AttendedState.of(mission, step.request, step.request.step)
-            taught = _taught(mission, state, step.reference)
-            mission.commit(state.pending(decision_id, Action(step.sensor_id, step.velocity)))
-            sample = mission.apply(Outcome(decision_id=decision_id, cost=step.cost, failed=step.failed))
+        for step, state in recorded_states(mission, logged):
+            sample = state.pending("recorded", Action(step.sensor_id, step.velocity)).sample
             worth = next(rewards[step.request.uav_id])
             if sample is not None and worth is not None:
-                examples.append(Example(sample, worth, taught))
+                examples.append(Example(sample, worth, _taught(mission, state, step.reference)))
         yield examples
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
 
 import torch
 from rich.console import Console
@@ -19,6 +22,7 @@ from service.training.reward import Reward
 from service.training.rollout_examples import Batch, Choices, Example, replay
 from service.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from shared.rollouts import read_rollouts
+from shared.scenario import Scenario
 
 
 def pretrain(args: Pretrain, console: Console) -> None:
@@ -30,32 +34,69 @@ def pretrain(args: Pretrain, console: Console) -> None:
     """
     # More threads sum in another order, and are not faster with such small modules.
     torch.set_num_threads(1)
-    header, steps = read_rollouts(args.rollouts)
     reward = Reward(args.target, args.horizon, args.discount)
-    replayed = replay(header, steps, reward, args.features, args.belief)
-    missions = list(track(replayed, "Replaying the rollouts", header.missions, console=console))
-    # Every eleventh mission: teachers alternate, and each gets its share this way.
-    held_out = set(range(10, len(missions), 11)) or {len(missions) - 1}
-    train = [example for n, mission in enumerate(missions) if n not in held_out for example in mission]
-    test = [example for n in sorted(held_out) for example in missions[n]]
-    if not train or not test:
-        raise ValueError(f"{args.rollouts} has {len(missions)} missions; at least 2 are needed")
-    levels = header.scenario.max_velocity + 1
+    recordings = [_replayed(path, reward, args, console) for path in args.rollouts]
+    levels = _levels(recordings)
+    train, test = ([*chain.from_iterable(missions)] for missions in zip(*map(_split, recordings), strict=True))
     modules = fit(Batch.of(train, args.speed), Batch.of(test, args.speed), levels, args, console)
-    console.print(_report(modules, test, args, levels))
+    for recording in recordings:
+        console.print(_report(modules, recording, args, levels))
     args.out.parent.mkdir(parents=True, exist_ok=True)
     save(modules, args.out)
 
 
-def _report(modules: Modules, test: Sequence[Example], args: Pretrain, levels: int) -> Table:
+@dataclass(frozen=True)
+class _Recording:
+    """One file's scenario, and its missions' examples."""
+
+    path: Path
+    scenario: Scenario
+    missions: list[list[Example]]
+
+
+def _replayed(path: Path, reward: Reward, args: Pretrain, console: Console) -> _Recording:
+    header, steps = read_rollouts(path)
+    replayed = replay(header, steps, reward, args.features, args.belief)
+    description = f"Replaying {header.scenario.name}"
+    return _Recording(path, header.scenario, [*track(replayed, description, header.missions, console=console)])
+
+
+def _levels(recordings: Sequence[_Recording]) -> int:
+    """The number of velocities, which all files have in common."""
+    first = recordings[0]
+    for recording in recordings:
+        if recording.scenario.max_velocity != first.scenario.max_velocity:
+            raise ValueError(
+                f"UAVs fly up to {first.scenario.max_velocity} m/s in {first.path}, "
+                f"and up to {recording.scenario.max_velocity} m/s in {recording.path}"
+            )
+    return first.scenario.max_velocity + 1
+
+
+def _split(recording: _Recording) -> tuple[list[Example], list[Example]]:
+    """The examples to train on, and those held out: of every eleventh mission.
+
+    Teachers alternate, and each gets its share this way.
+    """
+    missions = recording.missions
+    held_out = set(range(10, len(missions), 11)) or {len(missions) - 1}
+    train = [example for n, mission in enumerate(missions) if n not in held_out for example in mission]
+    test = [example for n in sorted(held_out) for example in missions[n]]
+    if not train or not test:
+        raise ValueError(f"{recording.path} has {len(missions)} missions; at least 2 are needed")
+    return train, test
+
+
+def _report(modules: Modules, recording: _Recording, args: Pretrain, levels: int) -> Table:
     """The agreement of these modules, the shipped ones and random ones with each teacher on the held-out missions."""
     ranked = {"random": Modules(args.features, levels, args.seed).weights()}
     # The shipped checkpoint may be missing or of another shape, before this command makes it.
     with suppress(OSError, RuntimeError):
         ranked["shipped"] = initial_weights("pretrained", args.features, levels, args.seed)
     ranked["trained"] = modules.weights()
-    table = Table("held-out missions", *ranked, title=f"Features {args.features}, target {args.target}")
-    for teacher, taught in references(test).items():
+    title = f"Scenario {recording.scenario.name}, features {args.features}, target {args.target}"
+    table = Table("held-out missions", *ranked, title=title)
+    for teacher, taught in references(_split(recording)[1]).items():
         for k in (1, 3, 5):
             table.add_row(
                 f"{teacher}'s sensor in the top {k}", *(f"{recall(m, taught, k):.3f}" for m in ranked.values())

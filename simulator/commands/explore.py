@@ -44,7 +44,8 @@ class Explore:
     while the fleet deviates, and plans again afterwards.
 
     Further worlds have no teacher, and every step deviates. The same command writes the same decisions, whatever the
-    number of workers.
+    number of workers. `--first` adds further worlds in a file of their own; `aicvds pretrain` takes several files, of
+    several scenarios.
     """
 
     out: Annotated[Path, arg(metavar="FILE")]
@@ -57,6 +58,8 @@ class Explore:
     """The teacher: the planner, a clairvoyant, or both in alternation."""
     scenario: Annotated[str, arg(metavar="NAME")] = "paper"
     """The worlds' scenario."""
+    first: Annotated[int, arg(metavar="N")] = 0
+    """Number of the first world: its seed is 1,000,000 more."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes that fly the worlds, 1 to 64."""
 
@@ -66,7 +69,7 @@ def main(argv: list[str]) -> int:
     args = tyro.cli(Explore, prog="aicvds explore", args=argv)
     try:
         scenario = scenario_named(args.scenario)
-        for name in ("missions", "untaught"):
+        for name in ("missions", "untaught", "first"):
             if getattr(args, name) < 0:
                 raise ValueError(f"--{name} {getattr(args, name)} is less than 0")
         if args.missions + args.untaught < 1:
@@ -88,15 +91,17 @@ def main(argv: list[str]) -> int:
 
 
 def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
-    teachers = [teacher_of(args.teacher, mission) for mission in range(args.missions)] + [None] * args.untaught
+    taught = range(args.first, args.first + args.missions)
+    teachers = [teacher_of(args.teacher, mission) for mission in taught] + [None] * args.untaught
+    worlds = list(enumerate(teachers, start=args.first))
     fly = partial(_mission, scenario)
-    tracked = partial(track, description="Exploring", total=len(teachers), console=Console(stderr=True))
+    tracked = partial(track, description="Exploring", total=len(worlds), console=Console(stderr=True))
     if args.workers == 1:
-        for steps in tracked(map(fly, enumerate(teachers))):
+        for steps in tracked(map(fly, worlds)):
             yield from steps
         return
     with get_context("spawn").Pool(args.workers) as pool:
-        for steps in tracked(pool.imap(fly, enumerate(teachers))):
+        for steps in tracked(pool.imap(fly, worlds)):
             yield from steps
 
 

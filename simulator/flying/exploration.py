@@ -51,6 +51,8 @@ def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None
         observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in choices.items()})
         for uav, (sensor, velocity) in choices.items():
             info = infos[f"uav_{uav}"]
+            if guide is not None:
+                guide.learn(uav, step, bool(info["failed"]))
             yield RolloutStep(
                 request=requests[uav],
                 sensor_id=sensor,

@@ -43,6 +43,9 @@ class Teacher(Protocol):
     def flown(self, uav: int, step: int, action: Action) -> None:
         """Record the UAV's action in that step, which may differ from the reference."""
 
+    def learn(self, uav: int, step: int, failed: bool) -> None:
+        """Take the outcome of the UAV's action in that step."""
+
 
 class Planner(RecedingHorizon):
     """The receding-horizon planner with the fleet's belief; it has a reference action at every step."""
@@ -89,6 +92,9 @@ class Clairvoyant:
         row = step - self._first_step
         if self._plan is not None and row < len(self._plan) and tuple(self._plan[row, uav]) != action:
             self._plan = None
+
+    def learn(self, uav: int, step: int, failed: bool) -> None:
+        """Nothing: the clairvoyant knew it."""
 
     def _planned(self) -> NDArray[np.int64]:
         """The best flight ``(H, I, 2)`` found from the world's current state to its end, in wind for one step."""

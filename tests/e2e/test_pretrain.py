@@ -12,8 +12,8 @@ from service.training.reward import Reward
 from service.training.rollout_examples import Batch, Example, replay
 from service.training.teacher_agreement import recall, references
 from service.training.training_loop import losses
-from shared.rollouts import Header, RolloutStep, read_rollouts
-from shared.scenario import SCENARIOS
+from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
+from shared.scenario import SCENARIOS, Scenario
 from shared.wire import Features
 from simulator.flying.exploration import explore
 from tests.e2e.processes import run, run_here
@@ -130,6 +130,54 @@ def test_bad_use_is_one_clear_line(tmp_path: Path, option: str, said: str) -> No
     assert ended.returncode == 2
     assert f"{option} 0 is {said}" in ended.stderr
     assert ended.stderr.count("\n") == 1
+
+
+def test_a_run_without_a_file_is_one_clear_line(tmp_path: Path) -> None:
+    ended = run_here("pretrain", "--out", str(tmp_path / "c.pt"))
+    assert ended.returncode == 2
+    assert "name a file" in ended.stderr
+
+
+def recorded(path: Path, scenario: Scenario, missions: int = 2) -> Path:
+    header = Header(scenario=scenario, missions=missions, behaviour="test")
+    write_rollouts(path, header, (step for n in range(missions) for step in explore(scenario, n)))
+    return path
+
+
+def test_several_files_train_one_checkpoint_and_each_is_reported(tmp_path: Path) -> None:
+    short = [SCENARIOS[name].model_copy(update={"steps": 12}) for name in ("paper", "shadowed")]
+    files = [recorded(tmp_path / f"{scenario.name}.gz", scenario) for scenario in short]
+    printed, weights = [], []
+    for chosen in (files, files[:1]):
+        out = tmp_path / f"{len(chosen)}.pt"
+        ended = run_here("pretrain", *map(str, chosen), "--out", str(out), "--epochs", "1", "--features", "reach")
+        assert ended.returncode == 0, ended.stderr
+        printed.append(ended.stdout)
+        weights.append(torch.load(out, weights_only=True)["weights"]["attention.score.weight"])
+    assert "Scenario paper" in printed[0]
+    assert "Scenario shadowed" in printed[0]
+    assert "Scenario shadowed" not in printed[1]
+    assert not torch.equal(*weights)
+
+
+def test_files_whose_uavs_have_other_velocities_are_refused(tmp_path: Path) -> None:
+    fast = PAPER.model_copy(update={"steps": 12})
+    slow = fast.model_copy(update={"max_velocity": 8})
+    files = [recorded(tmp_path / "fast.gz", fast), recorded(tmp_path / "slow.gz", slow)]
+    ended = run_here("pretrain", *map(str, files), "--out", str(tmp_path / "c.pt"))
+    assert ended.returncode == 2
+    assert "up to 14 m/s" in ended.stderr
+    assert "up to 8 m/s" in ended.stderr
+
+
+def test_a_file_whose_recording_was_stopped_is_one_clear_line(tmp_path: Path) -> None:
+    whole = recorded(tmp_path / "whole.gz", PAPER.model_copy(update={"steps": 12}))
+    cut = tmp_path / "cut.gz"
+    cut.write_bytes(whole.read_bytes()[:-500])
+    ended = run_here("pretrain", str(cut), "--out", str(tmp_path / "c.pt"))
+    assert ended.returncode == 2
+    assert "its recording was stopped" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.parametrize("content", [b"", b"not gzip"])

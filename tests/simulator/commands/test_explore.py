@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.rollouts import read_rollouts
+from shared.rollouts import RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from simulator.commands.explore import main, teacher_of
 from simulator.flying.teachers import TEACHERS, TeacherName
@@ -35,11 +35,23 @@ def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path, monkey
     assert taught == [{"planner"}, {"clairvoyant"}, set()]
 
 
+def test_a_second_file_goes_on_with_further_worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENARIOS, "paper", SHORT)
+    found: dict[str, list[RolloutStep]] = {}
+    for name, first, worlds in (("both", 0, 2), ("second", 1, 1)):
+        out = tmp_path / f"{name}.gz"
+        options = ["--missions", "0", "--untaught", str(worlds), "--first", str(first)]
+        assert main(["--out", str(out), *options]) == 0
+        found[name] = list(read_rollouts(out)[1])
+    assert found["second"] == found["both"][36:]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--missions", "-1"], "--missions -1 is less than 0"),
         (["--missions", "0", "--untaught", "0"], "there is nothing to fly"),
+        (["--first", "-1"], "--first -1 is less than 0"),
         (["--workers", "0"], "--workers 0 is not between 1 and 64"),
         (["--scenario", "moon"], "unknown scenario 'moon'"),
     ],

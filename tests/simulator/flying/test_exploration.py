@@ -70,6 +70,20 @@ def test_a_fleet_mostly_follows_its_teacher_and_sometimes_deviates(
     assert 0.4 < share < 1
 
 
+@pytest.mark.usefixtures("brief")
+def test_a_planner_learns_from_every_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    learned: list[tuple[int, int, bool]] = []
+
+    def learn(planner: Planner, uav: int, step: int, failed: bool) -> None:
+        learned.append((uav, step, failed))
+        planner.belief.settle(uav, step, failed)
+
+    monkeypatch.setattr(Planner, "learn", learn)
+    steps = list(explore(SHORT, 8, "planner"))
+    assert learned == [(step.request.uav_id, step.request.step, step.failed) for step in steps]
+    assert {failed for _, _, failed in learned} == {True, False}
+
+
 @pytest.mark.long
 def test_a_planner_has_references_after_deviations_too() -> None:
     left = [step for step in explore(SHORT, 8, "planner") if not flown_as_advised(step)]
