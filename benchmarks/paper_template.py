@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from service.prompting.experiences import Experiences
 from service.prompting.prompt import Prompt, Template
 from service.prompting.row_formats import UNKNOWN, Cells
-from service.prompting.unpruned_baseline import UnprunedState
+from service.prompting.token_accounting import UnprunedState
 from shared.features import State
 from shared.scenario import Scenario
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from service.prompting.candidates import CandidateSet, Letters
 from service.prompting.prompt import Prompt, Template, note_block
 from service.prompting.row_formats import FORMATS, Cells
-from service.prompting.unpruned_baseline import UnprunedState
+from service.prompting.token_accounting import UnprunedState
 from shared.features import State
 from shared.scenario import Scenario
 

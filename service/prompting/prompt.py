@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from service.prompting.demonstrations import Solved
 from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
-from service.prompting.unpruned_baseline import UnprunedState
+from service.prompting.token_accounting import UnprunedState
 from shared.features import State
 from shared.scenario import Scenario
 from shared.wire import Features, PromptStyle

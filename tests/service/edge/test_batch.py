@@ -20,7 +20,7 @@ from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
-from service.prompting.unpruned_baseline import UnprunedState
+from service.prompting.token_accounting import UnprunedState
 from shared.actions import Action
 from tests.running import serving
 from tests.service.making import PAPER, attended, mission, uav

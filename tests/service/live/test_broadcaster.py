@@ -24,7 +24,7 @@ from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
-from service.prompting.unpruned_baseline import UnprunedState
+from service.prompting.token_accounting import UnprunedState
 from service.storage.serialization import decode, encode, pack
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge

@@ -7,9 +7,8 @@ import pytest
 
 from service.config.settings import Settings
 from service.prompting.row_formats import FORMATS
-from service.prompting.token_accounting import TokenCounter, price_usd
+from service.prompting.token_accounting import TokenCounter, UnprunedState, price_usd
 from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
-from service.prompting.unpruned_baseline import UnprunedState
 from shared.scenario import Scenario
 from shared.wire import Features, MissionSpec, PromptStyle
 from tests.service.making import attended, mission, uav
