@@ -26,7 +26,7 @@ from rich.progress import track
 from service.api.app import create_app
 from service.config.settings import Settings
 from service.deciding.deadline import Deadline
-from service.deciding.llm_query import LlmAdvice, by_action
+from service.deciding.llm_query import LlmAdvice
 from service.edge.engine import Engine
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
@@ -73,7 +73,7 @@ class Echo:
         there = [letter for letter in letters if offer.actions[offer.labels[letter]][0] == sensor] or letters[:1]
         said = min(there, key=lambda letter: abs(offer.actions[offer.labels[letter]][1] - velocity))
         told = {letter: _DOUBT / len(letters) + (1.0 - _DOUBT) * (letter == said) for letter in letters}
-        return LlmAdvice(prompt, by_action(offer, told), None, None, calibrated=False, model=None)
+        return LlmAdvice(prompt, offer.by_action(told), None, None, calibrated=False, model=None)
 
 
 class Pilot(EdgePilot):

@@ -7,6 +7,7 @@ import logging
 import math
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -59,11 +60,30 @@ class LlmAdvice:
         forbidden it since.
         """
         found = np.zeros(len(actions))
-        for (sensor, velocity), probability in (self.probabilities or {}).items():
-            same = [i for i, action in enumerate(actions) if action.sensor_id == sensor]
-            if same:
-                found[min(same, key=lambda i: abs(actions[i].velocity - velocity))] += probability
+        index = {action: i for i, action in enumerate(actions)}
+        for action, probability in (self.probabilities or {}).items():
+            at = index.get(action)
+            if at is None:
+                same = [other for other in actions if other.sensor_id == action.sensor_id]
+                if not same:
+                    continue
+                at = index[min(same, key=lambda other: abs(other.velocity - action.velocity))]
+            found[at] += probability
         return found / found.sum() if found.sum() > 0.0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """A query's answer: the probabilities of each UAV's labels, or the reason why there are none.
+
+    ``model`` is the LLM that answered, or would have.
+    """
+
+    completion: Completion | None
+    by_label: list[dict[str, float]] | None
+    reason: Reason | None
+    calibrated: bool
+    model: str | None
 
 
 class LlmQueries:
@@ -99,14 +119,13 @@ class LlmQueries:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
         if not mission.prompt_fits:
             return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
-        template = template_of(mission)
-        labels = [list(candidates.labels)]
-        completion, by_label, reason = await self._query(mission, prompt.static, prompt.user, labels, deadline)
-        calibrated, model = self._calibrated(completion, prompt.static, labels), self._model(completion)
-        if by_label is None:
-            return LlmAdvice(prompt, None, reason, completion, calibrated, model)
-        self._labels.calibrate(model, prompt.static, template.content_free(), [template.labels])
-        return LlmAdvice(prompt, by_action(candidates, by_label[0]), None, completion, calibrated, model)
+        answer = await self._query(mission, prompt.static, prompt.user, [list(candidates.labels)], deadline)
+        probabilities = None
+        if answer.by_label is not None:
+            template = template_of(mission)
+            self._labels.calibrate(answer.model, prompt.static, template.content_free, [template.labels])
+            probabilities = candidates.by_action(answer.by_label[0])
+        return LlmAdvice(prompt, probabilities, answer.reason, answer.completion, answer.calibrated, answer.model)
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
@@ -133,18 +152,18 @@ class LlmQueries:
         )
         static, user = template.fleet_static, "".join(prompt.user for prompt in prompts.values())
         labels = [list(candidates.labels) for _, candidates in asked.values()]
-        completion, by_label, reason = await self._query(mission, static, user, labels, deadline)
-        self._note_lateness(len(asked), reason)
-        if reason is not None and reason != "llm_timeout":
+        answer = await self._query(mission, static, user, labels, deadline)
+        self._note_lateness(len(asked), answer.reason)
+        if answer.reason is not None and answer.reason != "llm_timeout":
             return {}
-        calibrated, model = self._calibrated(completion, static, labels), self._model(completion)
-        if by_label is not None:
-            self._labels.calibrate(model, static, template.content_free(list(asked)), [template.labels] * len(asked))
+        if answer.by_label is not None:
+            texts = partial(template.content_free, list(asked))
+            self._labels.calibrate(answer.model, static, texts, [template.labels] * len(asked))
         advice = {}
         for index, (uav, (_, candidates)) in enumerate(asked.items()):
-            probabilities = None if by_label is None else by_action(candidates, by_label[index])
-            whole = None if index else completion
-            advice[uav] = LlmAdvice(prompts[uav], probabilities, reason, whole, calibrated, model)
+            probabilities = None if answer.by_label is None else candidates.by_action(answer.by_label[index])
+            whole = None if index else answer.completion
+            advice[uav] = LlmAdvice(prompts[uav], probabilities, answer.reason, whole, answer.calibrated, answer.model)
         return advice
 
     def _note_lateness(self, uavs: int, reason: Reason | None) -> None:
@@ -157,8 +176,7 @@ class LlmQueries:
 
     async def _query(
         self, mission: Mission, static: str, user: str, labels: Sequence[Sequence[str]], deadline: Deadline
-    ) -> tuple[Completion | None, list[dict[str, float]] | None, Reason | None]:
-        """The completion and the probabilities of each UAV's labels, or the reason why there are none."""
+    ) -> _Answer:
         completion, by_label, reason = None, None, None
         try:
             completion = await self._within(self._llm.ask_labels(static, user, labels), deadline)
@@ -167,15 +185,10 @@ class LlmQueries:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()
-        return completion, by_label, reason
-
-    def _model(self, completion: Completion | None) -> str | None:
-        """The LLM that answered, or would have."""
-        return self._llm.model if completion is None else completion.model
-
-    def _calibrated(self, completion: Completion | None, static: str, labels: Sequence[Sequence[str]]) -> bool:
-        known = self._labels.bias(self._model(completion), static, len(labels)) is not None
-        return known and completion is not None and bool(completion.positions)
+        if completion is None:
+            return _Answer(None, None, reason, calibrated=False, model=self._llm.model)
+        calibrated = self._labels.bias(completion, static, len(labels)) is not None
+        return _Answer(completion, by_label, reason, calibrated, completion.model)
 
     async def _within(self, query: Coroutine[Any, Any, Completion], deadline: Deadline) -> Completion:
         if len(self._waiting) >= self._limit:
@@ -190,8 +203,3 @@ class LlmQueries:
             raise NoDecision("llm_timeout", "no answer within the deadline") from None
         finally:
             self._waiting.discard(limit)
-
-
-def by_action(candidates: CandidateSet, by_label: dict[str, float]) -> dict[Action, float]:
-    """Probabilities of the candidates' labels as those of their actions."""
-    return dict(zip(candidates.actions, candidates.sum_by_action(by_label).tolist(), strict=True))

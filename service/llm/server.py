@@ -217,7 +217,7 @@ class LlmServer:
         if self._client is None or self.status != "ready":
             raise NoDecision("llm_loading" if self.status == "loading" else "llm_unavailable", self.status)
         try:
-            return await self._client.complete(body)
+            return replace(await self._client.complete(body), model=self.model)
         except Unreachable as gone:
             if self.status == "ready":
                 self._status = _Status("unavailable", str(gone))

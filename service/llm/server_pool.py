@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 from service.config.settings import Settings
@@ -107,15 +106,17 @@ class ServerPool:
         """As :meth:`LlmServer.rewrite`, by the active server."""
         return await self.active.rewrite(wanted, temperature=temperature, seed=seed)
 
-    async def _first(self, call: Call, uavs: int = 1) -> Completion:
-        """The first answer of the ready servers, called one after another; without an answer the first failure."""
+    def _first(self, call: Call, uavs: int = 1) -> Answer:
+        """The first answer of the ready servers."""
         ready = [server for server in self._each if server.status == "ready" and server.max_uavs_per_call >= uavs]
         waiting = deque(ready or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
             # A hedge to the same address: there may be several machines behind it.
             waiting.append(waiting[0])
-        if len(waiting) == 1:
-            return replace(await call(waiting[0]), model=waiting[0].model)
+        return call(waiting[0]) if len(waiting) == 1 else self._of_several(call, waiting)
+
+    async def _of_several(self, call: Call, waiting: deque[LlmServer]) -> Completion:
+        """The first answer of servers that are called one after another; without an answer the first failure."""
         running: dict[asyncio.Task[Completion], LlmServer] = {}
         failure: NoDecision | None = None
         # Once a call is answered: the calls that began after it. Their silence is no failure of their servers.
@@ -132,7 +133,7 @@ class ServerPool:
                     later = list(running)[list(running).index(task) + 1 :]
                     server = running.pop(task)
                     try:
-                        return replace(task.result(), model=server.model)
+                        return task.result()
                     except NoDecision as error:
                         failure = failure or error
                         waiting = deque(other for other in waiting if other is not server)

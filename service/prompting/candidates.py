@@ -18,7 +18,6 @@ import numpy as np
 
 from service.prompting.row_formats import cells
 from shared.actions import Action
-from shared.channel import FloatArray
 from shared.features import State
 from shared.reach import Reach
 
@@ -105,12 +104,12 @@ class CandidateSet:
             f"{row[0]}{self.actions[self.labels[row[0]]][0]},{row[1:]}" for row in self.rows.splitlines(keepends=True)
         )
 
-    def sum_by_action(self, by_label: Mapping[str, float]) -> FloatArray:
-        """The probabilities of the letters, added up for each action, ``(n,)``."""
-        probabilities = np.zeros(len(self.actions))
+    def by_action(self, by_label: Mapping[str, float]) -> dict[Action, float]:
+        """The probabilities of the letters, added up for each action."""
+        probabilities = [0.0] * len(self.actions)
         for label, probability in by_label.items():
             probabilities[self.labels[label]] += probability
-        return probabilities
+        return dict(zip(self.actions, probabilities, strict=True))
 
 
 def velocity_options(reach: Reach, row: int, count: int) -> list[int]:

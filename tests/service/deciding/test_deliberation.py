@@ -239,7 +239,7 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
         labels = made.candidates.labels
         worst = max(labels, key=lambda name: judgement.lost[labels[name]])
         told = worst if answer == "worst" else str(random.choice(list(labels)))
-        word = made.candidates.sum_by_action({name: float(name == told) for name in labels})
+        word = np.array(list(made.candidates.by_action({name: float(name == told) for name in labels}).values()))
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None and verdict.action == plan
         assert set(verdict.report.trust) == {"llm", "planner", "value", "policy"}
@@ -252,7 +252,9 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
         view, made = deliberation(mission, step)
         judgement = made.evaluate()
         label = answer(made, judgement.lost)
-        word = made.candidates.sum_by_action({name: float(name == label) for name in made.candidates.labels})
+        word = np.array(
+            list(made.candidates.by_action({name: float(name == label) for name in made.candidates.labels}).values())
+        )
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None
         decision_id = f"{step:032x}"
@@ -278,7 +280,9 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     judgement = made.evaluate()
     worst = max(made.candidates.labels, key=lambda name: judgement.lost[made.candidates.labels[name]])
     assert judgement.lost.max() - judgement.lost.min() > 8
-    told = made.candidates.sum_by_action({name: float(name == worst) for name in made.candidates.labels})
+    told = np.array(
+        list(made.candidates.by_action({name: float(name == worst) for name in made.candidates.labels}).values())
+    )
     verdict = made.conclude(mission.trust_in("stub"), judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]
