@@ -7,14 +7,14 @@ It runs `aicvds serve` in a process of its own for each mode and round, in the m
 planner, and an LLM that answers at once from a thread of the same process. After four decisions it counts two requests
 of UAV 0 with the README's four sensors, first without an outcome, then with an earlier decision's outcome.
 
-`sys.setprofile` counts, from the request to the answer, every `call` event of a Python function in the packages
-`service` and `shared`; a coroutine that resumes is one more call. A file counts once it is entered. A function is known
-by its file and qualified name; lambdas and comprehensions do not count. A change of file is a call on the event loop's
-thread in another file than the call before it; a return to a caller is none. The other threads (plan search, rollout
-evaluator) count apart, and the process that writes SQLite does not count. Learning from the outcome is part of the way,
-and so are the limits on headers, the startup gate and the client of the LLM. The number of a coroutine's resumptions
-depends a little on timing, so each mode is measured several times, and the result is the median. It prints a table and
-writes JSON.
+`sys.setprofile` counts, from the request to the last byte of the answer, every `call` event of a Python function in the
+packages `service` and `shared`; a coroutine that resumes is one more call. A file counts once it is entered. A function
+is known by its file and qualified name; lambdas and comprehensions do not count. A change of file is a call on the
+event loop's thread in another file than the call before it; a return to a caller is none. The other threads (plan
+search, rollout evaluator) count apart, and the process that writes SQLite does not count. Learning from the outcome is
+part of the way, and so are the limits on headers, the startup gate and the client of the LLM. The number of a
+coroutine's resumptions depends a little on timing, so each mode is measured several times, and the result is the
+median. It prints a table and writes JSON.
 
 Commit 601e8f2, mode guided, with an outcome: 69 files (55 service, 14 shared), 281 functions, 330 changes of file;
 without: 66, 251, 310. Mode llm: 60 files (48, 12), 204 functions, 187 changes; without: 57, 176, 165.
@@ -43,10 +43,13 @@ from typing import Annotated, Any
 
 import httpx
 import tyro
+import uvicorn.protocols.http.httptools_impl as uvicorn_http
 from rich.console import Console
 from rich.table import Table
 
 PACKAGES = ("service", "shared")
+# Writes each part of an answer to the connection.
+_SEND = uvicorn_http.RequestResponseCycle.send
 # The first argument of a counting process; its mode follows.
 COUNTED = "counted"
 SENSORS: dict[str, list[Any]] = {
@@ -91,7 +94,12 @@ class Calls:
 
     def heard(self, frame: FrameType, event: str, _: object) -> None:
         """For ``sys.setprofile``."""
-        if not self.on or event != "call":
+        if not self.on:
+            return
+        if event == "return" and frame.f_code is _SEND.__code__:
+            # What comes after the answer's last byte is not on its way.
+            self.on = not frame.f_locals["self"].response_complete
+        if event != "call":
             return
         name = frame.f_code.co_filename
         for package, root in self._roots.items():

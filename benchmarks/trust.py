@@ -25,7 +25,7 @@ from rich.progress import track
 
 from service.api.app import create_app
 from service.config.settings import Settings
-from service.deciding.deadline import Deadline
+from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmAdvice
 from service.edge.engine import Engine
 from service.mission.mission import Mission

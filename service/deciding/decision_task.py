@@ -5,17 +5,15 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from service.deciding.deadline import Deadline
+from service.deciding.decision_time import Deadline, Stopwatch
 from service.deciding.llm_query import LlmAdvice
 from service.learning.trust import Advice
 from service.llm.answers import Completion
 from service.mission.mission import Mission
-from service.observability.stopwatch import Stopwatch
 from shared.actions import Action
 from shared.reasons import Reason
-from shared.wire import Guided, Source, UavState
+from shared.wire import Guided, UavState
 
-_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value", "mode_policy": "policy"}
 # Kept back of a deadline for the check, the answer and the way through the event loop.
 RESERVE_S = 0.02
 
@@ -44,12 +42,6 @@ class DecisionTask:
     plan: asyncio.Task[None] | None
     advice: LlmAdvice | None = None
 
-    async def await_plan(self) -> None:
-        """Wait for the plan until the deadline; a later plan serves the fleet's next decisions."""
-        if self.plan is not None:
-            await asyncio.wait({self.plan}, timeout=self.deadline.left())
-        self.watch.lap("plan")
-
 
 @dataclass(frozen=True, slots=True)
 class Choice:
@@ -68,11 +60,6 @@ class Choice:
     report: Guided | None = None
     advice: Advice | None = None
     evaluated_late: bool = False
-
-    @property
-    def source(self) -> Source:
-        """The decider's name in the response."""
-        return "guided" if self.report and self.reason is None else _SOURCES.get(self.reason, "policy")
 
 
 @dataclass(frozen=True, slots=True)

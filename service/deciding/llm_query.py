@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.deadline import Deadline
+from service.deciding.decision_time import Deadline
 from service.deciding.deliberation import candidates_of, template_of
 from service.llm.answers import Completion, NoDecision
 from service.llm.calibration import LabelReader

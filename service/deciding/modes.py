@@ -6,7 +6,7 @@ import asyncio
 import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
@@ -133,16 +133,22 @@ class Guided(Policy):
         if deliberation is None:
             return Fallback("no_candidate")
         result = asyncio.get_running_loop().run_in_executor(self._evaluating, deliberation.evaluate)
+        waiting: set[asyncio.Future[Any]] = {result}
+        if advice is None:
+            asking = asyncio.create_task(
+                self._queries.ask(mission, deliberation.candidates, deliberation.prompt, task.deadline)
+            )
+            asking.add_done_callback(lambda _: task.watch.lap("llm"))
+            waiting.add(asking)
         try:
-            if advice is None:
-                candidates, prompt = deliberation.candidates, deliberation.prompt
-                advice = await self._queries.ask(mission, candidates, prompt, task.deadline)
-                task.watch.lap("llm")
-            await asyncio.wait({result}, timeout=task.evaluation_deadline.left())
+            await asyncio.wait(waiting, timeout=task.evaluation_deadline.left())
+            # The query ends with its own deadline, which is no later than the evaluation's.
+            advice = advice or await asking
             evaluation = result.result() if result.done() else None
         finally:
             # An evaluation that still waits for a thread does not begin.
-            result.cancel()
+            for unfinished in waiting:
+                unfinished.cancel()
         task.watch.lap("judge")
         if evaluation is None:
             reason = advice.reason or "critic_timeout"

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from service.config.cores import usable_cores
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.deadline import Deadline
 from service.deciding.decision_task import RESERVE_S, Choice, DecisionTask, Fallback
+from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmQueries
 from service.deciding.look_ahead import look_ahead
 from service.deciding.modes import Guided, Llm, Mode, Policy, Value
@@ -23,6 +23,9 @@ from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
 from shared.wire import Mode as ModeName
 from shared.wire import Tokens
+
+# The initial estimate of a decision's own seconds, and the length of its average.
+_OWN_S, _OWN_MEMORY = 0.03, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +47,14 @@ class Decided:
 
 
 class Pipeline:
-    """Decides for one UAV at a time, in the mode of its mission, and begins the fleets' plans."""
+    """Decides for one UAV at a time, in the mode of its mission, and begins the fleets' plans.
+
+    Attributes:
+        own_s: the average of the seconds that a decision takes besides the LLM and the plan.
+    """
 
     def __init__(self, settings: Settings, queries: LlmQueries, counter: TokenCounter) -> None:
+        self.own_s = _OWN_S
         self._counter = counter
         self._planner_s = settings.planner_ms / 1e3
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
@@ -63,7 +71,7 @@ class Pipeline:
         """Decide for one UAV, and record the decision in its mission; raises as :meth:`Mission.commit`."""
         mode = self._modes[task.mission.mode]
         if mode.plan_first:
-            await task.await_plan()
+            await _await_plan(task)
         state = AttendedState.of(task.mission, task.uav, task.step, task.watch)
         question = mode.question(state, task)
         tokens = self._counter.account(question.prompt)
@@ -71,9 +79,13 @@ class Pipeline:
         choice = await mode.choose(state, question, task)
         if isinstance(choice, Fallback):
             if not mode.plan_first:
-                await task.await_plan()
+                await _await_plan(task)
             choice = choice.to(_without_llm(state))
-        return _commit(task, state, question.prompt, tokens, _enforce(task.mission, choice))
+        decided = _commit(task, state, question.prompt, tokens, _enforce(task.mission, choice))
+        times = decided.latency_ms
+        waited_ms = times.get("llm", 0.0) + times.get("plan", 0.0)
+        self.own_s += ((times["total"] - waited_ms) / 1e3 - self.own_s) / _OWN_MEMORY
+        return decided
 
     def begin_plan(
         self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline
@@ -94,6 +106,13 @@ class Pipeline:
         """Finish the plan and the evaluation that run, and drop the queued ones."""
         for threads in (self._planning, self._evaluating):
             await asyncio.to_thread(threads.shutdown, cancel_futures=True)
+
+
+async def _await_plan(task: DecisionTask) -> None:
+    """Wait for the plan until the deadline; a later plan serves the fleet's next decisions."""
+    if task.plan is not None:
+        await asyncio.wait({task.plan}, timeout=task.deadline.left())
+    task.watch.lap("plan")
 
 
 def _without_llm(state: AttendedState) -> Action:

@@ -6,33 +6,24 @@ import asyncio
 import time
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.deadline import Deadline
 from service.deciding.decision_task import RESERVE_S, DecisionTask
+from service.deciding.decision_time import Deadline, Stopwatch
 from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.deciding.pipeline import Decided, Pipeline
 from service.mission.mission import Mission
-from service.observability.stopwatch import Stopwatch
 from shared.wire import BatchRequest
 
 # A query about all UAVs may take at most the first share of the batch's time, and is not worth sending with less than
 # the second. The rest is for the UAVs' own decisions one after another, with a safety factor of two.
 _MAX_QUERY_SHARE, _MIN_QUERY_SHARE = 0.75, 0.25
-# The initial estimate of the seconds that a decision takes besides the LLM and the plan, and the average's length.
-_OWN_S, _OWN_MEMORY = 0.03, 20
 
 
 class BatchDecider:
-    """Decides for the UAVs of a batch in their order; it estimates the time of a decision without its waits."""
+    """Decides for the UAVs of a batch in their order."""
 
     def __init__(self, pipeline: Pipeline, queries: LlmQueries) -> None:
         self._pipeline = pipeline
         self._queries = queries
-        self._own_s = _OWN_S
-
-    def note(self, decided: Decided) -> None:
-        """Update the average time that a decision takes besides the LLM and the plan."""
-        waited_ms = decided.latency_ms.get("llm", 0.0) + decided.latency_ms.get("plan", 0.0)
-        self._own_s += ((decided.latency_ms["total"] - waited_ms) / 1e3 - self._own_s) / _OWN_MEMORY
 
     async def decide(
         self, mission: Mission, request: BatchRequest, watch: Stopwatch, deadline: Deadline
@@ -63,7 +54,7 @@ class BatchDecider:
             deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
             mine = Deadline.after(deadline_ms, own.started).earlier_by(RESERVE_S)
             # The evaluator may exceed its UAV's share, as long as enough time is left for the later UAVs.
-            evaluation = max(mine, deadline.earlier_by(RESERVE_S + self._own_s * later))
+            evaluation = max(mine, deadline.earlier_by(RESERVE_S + self._pipeline.own_s * later))
             task = DecisionTask(
                 mission,
                 uav,
@@ -77,7 +68,6 @@ class BatchDecider:
                 advice.get(uav.uav_id),
             )
             decided = await self._pipeline.decide_one(task)
-            self.note(decided)
             if mission.planner is None or mission.planner.action(uav.uav_id) != decided.choice.action:
                 plan = None
             decisions.append(decided)
@@ -87,5 +77,5 @@ class BatchDecider:
 
     def _query_s(self, total_s: float, uavs: int) -> float | None:
         """Seconds for a query about all UAVs at once; None where the batch has too little time."""
-        seconds = min(_MAX_QUERY_SHARE * total_s, total_s - 2 * uavs * self._own_s)
+        seconds = min(_MAX_QUERY_SHARE * total_s, total_s - 2 * uavs * self._pipeline.own_s)
         return seconds if seconds >= _MIN_QUERY_SHARE * total_s else None

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from pydantic import TypeAdapter
+from structlog.contextvars import bind_contextvars, clear_contextvars
 
 from service.config.settings import Settings
-from service.deciding.deadline import Deadline
 from service.deciding.decision_task import RESERVE_S, DecisionTask
+from service.deciding.decision_time import Deadline, Stopwatch
 from service.deciding.llm_query import LlmQueries
 from service.deciding.pipeline import Decided, Pipeline
 from service.edge.batch import BatchDecider
@@ -24,17 +26,18 @@ from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
 from service.observability import logs
 from service.observability.metrics import Metrics
-from service.observability.stopwatch import Stopwatch
 from service.observability.tracing import Traces
 from service.prompting.token_accounting import TokenCounter, with_usage
 from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
+from shared.reasons import Reason
 from shared.wire import (
     BatchRequest,
     DecideRequest,
     DecideResponse,
     FeedbackRequest,
     FeedbackResponse,
+    Source,
 )
 
 # The longest that an answer waits for the disk; a later answer goes out and says that it is not stored.
@@ -42,6 +45,8 @@ _STORE_S = 1.0
 # Seconds for the last checkpoints, and for the last commit, when the service ends.
 _LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 2.5
 _ANSWERS = TypeAdapter(list[DecideResponse])
+# The decider's name in the response, where it is not the LLM-free policy or mode `guided`.
+_SOURCES: dict[Reason | None, Source] = {None: "llm", "mode_value": "value"}
 
 
 class Engine:
@@ -103,9 +108,7 @@ class Engine:
         within_s = deadline.earlier_by(RESERVE_S).left()
         mission, report = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
 
-        async def make() -> list[Decided]:
-            return [await self._decide_one(mission, report, watch, deadline)]
-
+        make = partial(self._decide_one, mission, report, watch, deadline)
         return (await self._respond(mission, request, key, make, deadline))[0]
 
     async def decide_batch(
@@ -141,7 +144,7 @@ class Engine:
         try:
             await self.durable("decision_id")
         finally:
-            self._checkpoint_later(mission)
+            asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
         return FeedbackResponse(decision_id=request.decision_id, result=result)
 
     async def durable(self, field: str) -> None:
@@ -151,21 +154,21 @@ class Engine:
 
     def _start(self, request: DecideRequest | BatchRequest) -> tuple[Stopwatch, Deadline]:
         watch = Stopwatch()
-        logs.bind(request.mission_id, request.step)
+        clear_contextvars()
+        # Every log line of the request has these fields.
+        bind_contextvars(mission_id=request.mission_id, step=request.step)
         return watch, Deadline.after(request.deadline_ms or self._settings.deadline_ms, watch.started)
 
     async def _decide_one(
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
-    ) -> Decided:
+    ) -> list[Decided]:
         if request.outcome is not None:
             self._feedback.apply_reported(mission, request.outcome)
         attempt = mission.observe(request, request.step)
         plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, deadline)
         deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, deadline.earlier_by(RESERVE_S)
         task = DecisionTask(mission, request, request.step, attempt, deadline_ms, mine, mine, watch, plan)
-        decided = await self.pipeline.decide_one(task)
-        self._batches.note(decided)
-        return decided
+        return [await self.pipeline.decide_one(task)]
 
     async def _respond(
         self,
@@ -178,26 +181,40 @@ class Engine:
         """The answers under the idempotency key, made unless there are some, once they are on disk or late for it."""
         decisions: list[Decided] = []
         answers: list[DecideResponse] = []
+        try:
+            if key is None:
+                decisions = await make()
+                answers = [self._answer(decided) for decided in decisions]
+            else:
+                decisions, answers = await self._once(mission, request, key, make)
+            began = time.perf_counter()
+            stored = await self.journal.stored(min(_STORE_S, deadline.left()))
+            waited_ms = round((time.perf_counter() - began) * 1e3, 3)
+            answers = [_stored(answer, stored, waited_ms) for answer in answers]
+            return answers
+        finally:
+            # The event loop sends the answer first.
+            asyncio.get_running_loop().call_soon(self._follow_up, mission, decisions, answers)
+
+    async def _once(
+        self,
+        mission: Mission,
+        request: DecideRequest | BatchRequest,
+        key: str,
+        make: Callable[[], Awaitable[list[Decided]]],
+    ) -> tuple[list[Decided], list[DecideResponse]]:
+        """The answers under an idempotency key, and the decisions if they are made now."""
+        decisions: list[Decided] = []
+        answers: list[DecideResponse] = []
 
         async def made() -> str:
             decisions.extend(await make())
             answers.extend(self._answer(decided) for decided in decisions)
             # The journal records the answer under its key in the same commit as the decision.
-            return "" if key is None else _ANSWERS.dump_json(answers).decode()
+            return _ANSWERS.dump_json(answers).decode()
 
-        if key is None:
-            await made()
-        else:
-            text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
-            answers = answers or _ANSWERS.validate_json(text)
-        began = time.perf_counter()
-        stored = await self.journal.stored(min(_STORE_S, deadline.left()))
-        self._checkpoint_later(mission)
-        waited_ms = round((time.perf_counter() - began) * 1e3, 3)
-        answers = [_stored(answer, stored, waited_ms) for answer in answers]
-        for decided, answer in zip(decisions, answers, strict=False):
-            self._report(decided, answer)
-        return answers
+        text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
+        return decisions, answers or _ANSWERS.validate_json(text)
 
     def _answer(self, decided: Decided) -> DecideResponse:
         """The wire's form of a decision."""
@@ -209,7 +226,7 @@ class Engine:
             step=task.step,
             sensor_id=choice.action.sensor_id,
             velocity=choice.action.velocity,
-            source=choice.source,
+            source="guided" if choice.report and choice.reason is None else _SOURCES.get(choice.reason, "policy"),
             reason=choice.reason,
             model=None if choice.reason else choice.model,
             top_k=decided.state.candidates,
@@ -218,6 +235,12 @@ class Engine:
             deadline_ms=task.deadline_ms,
             latency_ms=decided.latency_ms,
         )
+
+    def _follow_up(self, mission: Mission, decisions: list[Decided], answers: list[DecideResponse]) -> None:
+        """What is left to do for a request whose answer is sent: report it, and write a checkpoint where one is due."""
+        self._feedback.follow_up(mission)
+        for decided, answer in zip(decisions, answers, strict=False):
+            self._report(decided, answer)
 
     def _report(self, decided: Decided, answer: DecideResponse) -> None:
         """Report an answer to metrics, traces, the log and the mission page; nothing else reports decisions to them."""
@@ -235,10 +258,6 @@ class Engine:
         self._traces.decided(answer)
         logs.decided(answer)
         self.live.decided(task.mission, task.uav, decided.prompt, answer)
-
-    def _checkpoint_later(self, mission: Mission) -> None:
-        """Where a checkpoint is due, write it once the event loop has sent the answer."""
-        asyncio.get_running_loop().call_soon(self._feedback.checkpoint, mission)
 
 
 def _stored(answer: DecideResponse, stored: bool, waited_ms: float) -> DecideResponse:

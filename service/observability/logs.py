@@ -115,12 +115,6 @@ def hurry() -> None:
             handler.hurry()
 
 
-def bind(mission_id: str, step: int) -> None:
-    """Add these fields to every line of this request."""
-    structlog.contextvars.clear_contextvars()
-    structlog.contextvars.bind_contextvars(mission_id=mission_id, step=step)
-
-
 def decided(answer: DecideResponse) -> None:
     """Log an answered decision; at level warning where it was late."""
     late = answer.latency_ms["total"] > answer.deadline_ms

@@ -14,7 +14,7 @@ from fastapi.responses import Response
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.deadline import Deadline
+from service.deciding.decision_time import Deadline
 from service.deciding.deliberation import Deliberation
 from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate

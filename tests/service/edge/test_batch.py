@@ -13,7 +13,7 @@ import pytest
 from fastapi.responses import JSONResponse, Response
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.deadline import Deadline
+from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmAdvice, LlmQueries
 from service.llm.request_bodies import constrain_labels
 from service.mission.mission import Mission
@@ -160,7 +160,7 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
         return await ask_for_fleet(self, mission, states, deadline)
 
     clock = Clock()
-    monkeypatch.setattr("service.deciding.deadline.time", clock)
+    monkeypatch.setattr("service.deciding.decision_time.time", clock)
     monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
     chorus = Chorus(hangs_on="UAV")
     with serving(chorus.app) as url, chorus.gate:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from service.config.settings import Settings
-from service.edge import learning_queue
+from service.edge import feedback
 from service.errors import Refused, Unavailable
 from service.mission.idempotency import IdempotentAnswers
 from service.mission.mission import Mission
@@ -246,8 +246,8 @@ def test_what_was_not_learned_is_not_learned_when_it_is_read_back(
     tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Of a batch's three outcomes, which come at once, two can wait.
-    monkeypatch.setattr(learning_queue, "_MAX_TASKS", 2)
-    monkeypatch.setattr(learning_queue, "_WARNING_S", 3600.0)
+    monkeypatch.setattr(feedback, "_MAX_TASKS", 2)
+    monkeypatch.setattr(feedback, "_WARNING_S", 3600.0)
     with running(tmp_path / "m.db") as (client, engine):
         owed: dict[int, str] = {}
         for step in range(6):

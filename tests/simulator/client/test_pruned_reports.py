@@ -13,7 +13,7 @@ import pytest
 
 from service.api.attention_weights import attention_of
 from service.config.settings import Settings
-from service.edge.learning_queue import LearningQueue
+from service.edge.feedback import LearningQueue
 from service.learning.modules import top_k
 from service.mission.mission import Mission
 from shared.features import FEATURES
