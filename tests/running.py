@@ -46,7 +46,15 @@ class _Server(uvicorn.Server):
 @contextmanager
 def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
     """Serve the application by a real uvicorn with the edge's limits on headers; yields its base URL."""
-    config = uvicorn.Config(app, host="127.0.0.1", port=port, log_level="warning", http=BoundedHttpProtocol, ws="none")
+    config = uvicorn.Config(
+        app,
+        interface="asgi3",
+        host="127.0.0.1",
+        port=port,
+        log_level="warning",
+        http=BoundedHttpProtocol,
+        ws="none",
+    )
     server = _Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

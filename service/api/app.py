@@ -15,9 +15,8 @@ from service.api import live_routes as live_routes
 from service.api import problem_details
 from service.api.api_keys import ApiKeys
 from service.api.authentication import KeyAuthentication
-from service.api.concurrency_limit import ConcurrencyLimit
 from service.api.openapi import schema_of
-from service.api.request_body import RequestBody
+from service.api.request_limits import RequestLimits
 from service.api.routes import router
 from service.config.settings import Settings
 from service.edge.engine import Engine
@@ -80,8 +79,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     app.include_router(router)
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
-    app.add_middleware(RequestBody, limit=settings.max_body_bytes)
-    app.add_middleware(ConcurrencyLimit, most=settings.max_requests)
+    app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if settings.keys is not None:
         app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))
     app.add_middleware(SecurityHeaders)

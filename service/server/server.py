@@ -32,6 +32,8 @@ class Server(uvicorn.Server):
         self._gate = StartupGate(load, self._end)
         config = uvicorn.Config(
             self._gate,
+            # uvicorn takes a plain function for an older interface.
+            interface="asgi3",
             log_config=None,
             http=BoundedHttpProtocol,
             # The edge has no websockets; their library would read request heads without a limit.

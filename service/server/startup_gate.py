@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from starlette.applications import Starlette
@@ -49,10 +49,15 @@ class StartupGate:
         self._opened = asyncio.Event()
         self._ending = asyncio.Event()
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
         if scope["type"] == "lifespan":
-            await self._live(receive, send)
-            return
+            return self._live(receive, send)
+        if self.app is None or not self._opened.is_set():
+            return self._before_loading(scope, receive, send)
+        # The application's own coroutine: a request resumes one coroutine less.
+        return self.app({**scope, "state": dict(self._state)}, receive, send)
+
+    async def _before_loading(self, scope: Scope, receive: Receive, send: Send) -> None:
         if not self._opened.is_set():
             if scope["type"] == "http" and (scope["method"], scope["path"]) == ("GET", "/healthz"):
                 await _ALIVE(scope, receive, send)

@@ -1,8 +1,9 @@
-"""Request bodies: limits on the time to receive them, and on their size before and after decompression."""
+"""Limits on requests: their number at once, and the time and the size of a body, before and after decompression."""
 
 from __future__ import annotations
 
 import asyncio
+import re
 import zlib
 from collections.abc import Callable
 
@@ -12,7 +13,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.problem_details import problem_response
 
-# A body that is still on its way counts against the concurrency limit.
+# Methods without a body.
+READING = ("GET", "HEAD")
+_NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
+# A page's stream lasts as long as the page and has a limit of its own.
+_STREAMS = re.compile(r"/missions/[^/]+/events")
+# A body that is still on its way counts against the limit of concurrent requests.
 _BODY_S = 10.0
 
 
@@ -24,41 +30,67 @@ class _Damaged(Exception):
     """The body does not match its Content-Encoding."""
 
 
-class RequestBody:
-    """Pure ASGI middleware: reads the body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``.
+class RequestLimits:
+    """Pure ASGI middleware: bounds the requests at once, and reads their bodies.
 
-    It answers 413 past the limit, 408 for a body that takes longer than 10 s, 415 for another encoding and 400 for a
-    damaged body, each as a problem document.
+    Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics and
+    the streams of pages do not count. It reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip |
+    zstd``. It answers 413 past the limit, 408 for a body that takes longer than 10 s, 415 for another encoding and 400
+    for a damaged body. Each refusal is a problem document.
     """
 
-    def __init__(self, app: ASGIApp, limit: int) -> None:
+    def __init__(self, app: ASGIApp, most: int, limit: int) -> None:
         self.app = app
-        self.limit = limit
+        self._most = most
+        self._limit = limit
+        self._running = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] not in ("POST", "PUT", "PATCH"):
+        if scope["type"] != "http" or (
+            scope["method"] in READING
+            and (scope["path"] in _NEVER_REFUSED or _STREAMS.fullmatch(scope["path"]) is not None)
+        ):
             await self.app(scope, receive, send)
             return
+        if self._running >= self._most:
+            response = problem_response(503, f"{self._most} requests are in progress already")
+            response.headers["Retry-After"] = "1"
+            response.headers["Connection"] = "close"
+            await response(scope, receive, send)
+            return
+        self._running += 1
+        try:
+            if scope["method"] in ("POST", "PUT", "PATCH"):
+                body = await self._body(scope, receive, send)
+                if body is None:
+                    return
+                receive = _replay(body, receive)
+            await self.app(scope, receive, send)
+        finally:
+            self._running -= 1
+
+    async def _body(self, scope: Scope, receive: Receive, send: Send) -> bytes | None:
+        """The decoded body, which the scope's headers then describe; None where there is nothing to answer any more."""
         headers = {name.lower(): value for name, value in scope["headers"]}
         encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
         if encoding not in _DECODERS and encoding not in _PLAIN:
             response = problem_response(415, f"Content-Encoding {encoding[:40]!r}: use gzip, zstd or none")
             response.headers["Accept-Encoding"] = "gzip, zstd"
             await response(scope, receive, send)
-            return
+            return None
         try:
             async with asyncio.timeout(_BODY_S):
                 body = await self._read(receive, headers.get(b"content-length", b""))
             if body is None:
-                return
+                return None
             if encoding in _DECODERS:
-                body = _DECODERS[encoding](body, self.limit)
+                body = _DECODERS[encoding](body, self._limit)
         except (_TooLarge, TimeoutError, _Damaged) as fault:
             await self._refusal(fault)(scope, receive, send)
-            return
+            return None
         scope["headers"] = [(n, v) for n, v in scope["headers"] if n.lower() not in _REWRITTEN]
         scope["headers"].append((b"content-length", str(len(body)).encode()))
-        await self.app(scope, _replay(body, receive), send)
+        return body
 
     def _refusal(self, fault: Exception) -> Response:
         """The problem document; the connection ends where the rest of the body may still arrive."""
@@ -68,7 +100,7 @@ class RequestBody:
             case _Damaged():
                 status, problem = 400, str(fault)
             case _:
-                status, problem = 413, f"larger than {self.limit} bytes"
+                status, problem = 413, f"larger than {self._limit} bytes"
         response = problem_response(status, f"body: {problem}", [{"field": "body", "problem": problem}])
         if status != 400:
             response.headers["Connection"] = "close"
@@ -76,7 +108,7 @@ class RequestBody:
 
     async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
         """The body; None where the client disconnected before its end."""
-        if content_length.isdigit() and int(content_length) > self.limit:
+        if content_length.isdigit() and int(content_length) > self._limit:
             raise _TooLarge
         body = bytearray()
         while True:
@@ -84,7 +116,7 @@ class RequestBody:
             if message["type"] == "http.disconnect":
                 return None
             body += message.get("body", b"")
-            if len(body) > self.limit:
+            if len(body) > self._limit:
                 raise _TooLarge
             if not message.get("more_body", False):
                 return bytes(body)
