@@ -14,7 +14,7 @@ from torch import Tensor
 from service.deciding.decision_time import Stopwatch
 from service.guidance.step_guidance import StepGuidance
 from service.learning.modules import Sample, top_k
-from service.mission.events import Pending
+from service.mission.decisions import Pending
 from service.mission.mission import Mission
 from service.prompting.row_formats import cells
 from shared.actions import Action

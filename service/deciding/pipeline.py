@@ -143,5 +143,5 @@ def _commit(task: DecisionTask, state: AttendedState, prompt: Prompt, tokens: To
     pending = state.pending(decision_id, choice.action)
     task.watch.lap("check")
     task.mission.commit(pending, task.attempt, report)
-    task.mission.delta_reports.remember(task.uav, task.step, decision_id)
+    task.mission.reports.remember(task.uav, task.step, decision_id)
     return Decided(decision_id, task, state, prompt, tokens, choice, task.watch.total())

@@ -13,7 +13,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.config.settings import Settings
 from service.errors import Conflict, NotFound, Unavailable
 from service.mission.mission import Mission
-from service.mission.report_checks import complete_report
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
 from service.storage.recovery import restore_mission
@@ -108,7 +107,7 @@ class MissionRegistry:
         Raises:
             NotFound: there is no such mission, and none may be made.
             Unavailable, Conflict: as :meth:`get`.
-            Refused: as :func:`complete_report`; nothing is recorded.
+            Refused: as :meth:`Reports.complete`; nothing is recorded.
         """
         mission_id = request.mission_id
         mission = await self._find(mission_id, within_s)
@@ -118,10 +117,10 @@ class MissionRegistry:
             raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
         mission = mission or Mission(mission_id, MissionSpec(), self._settings)
         if isinstance(request, DecideRequest):
-            full = complete_report(mission, request, request.step)
+            full = mission.reports.complete(request, request.step)
         else:
             uavs = [
-                complete_report(mission, u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)
+                mission.reports.complete(u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)
             ]
             full = request.model_copy(update={"uavs": uavs})
         self._add(mission)

@@ -2,46 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.learning.modules import Sample
 from service.learning.trust import Advice
+from service.mission.decisions import Pending
 from service.mission.idempotency import Answered
-from service.prompting.row_formats import Cells
 from shared.wire import Outcome, UavState
-
-
-@dataclass(frozen=True, slots=True)
-class Pending:
-    """A decision whose outcome is still to come.
-
-    Attributes:
-        seen: the chosen sensor's row at the decision.
-        sample: the training sample; None where the modules had no part in the decision.
-    """
-
-    decision_id: str
-    uav_id: int
-    step: int
-    sensor_id: int
-    velocity: int
-    seen: Cells
-    sample: Sample | None
-
-    def state_dict(self) -> dict[str, Any]:
-        """Plain values and arrays."""
-        sample = self.sample
-        fields = None if sample is None else [sample.features, sample.chosen, sample.approach, sample.velocity]
-        names = ("decision_id", "uav_id", "step", "sensor_id", "velocity")
-        return {**{name: getattr(self, name) for name in names}, "seen": dict(self.seen), "sample": fields}
-
-    @classmethod
-    def of(cls, state: Mapping[str, Any]) -> Pending:
-        """From its ``state_dict``."""
-        sample = None if state["sample"] is None else Sample(*state["sample"])
-        return cls(**{**state, "sample": sample})
 
 
 @dataclass(frozen=True, slots=True)

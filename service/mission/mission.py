@@ -15,14 +15,13 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
-from service.mission.delta_reports import DeltaReports
-from service.mission.events import AdviserReport, Decided, Event, Guided, Pending, Reported, Settled, ignore_event
+from service.mission.decisions import PENDING_PER_UAV, Pending, PendingDecisions, Reservation, Reservations
+from service.mission.events import AdviserReport, Decided, Event, Guided, Reported, Settled, ignore_event
 from service.mission.idempotency import IdempotentAnswers
 from service.mission.learned_world import learned_world
-from service.mission.pending_decisions import PENDING_PER_UAV, PendingDecisions
 from service.mission.planner import Planner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
-from service.mission.reservations import Reservation, Reservations
+from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.experiences import Experience, Experiences
 from shared.fleetplan import FleetBelief
@@ -88,7 +87,7 @@ class Mission:
         self.idempotent_answers = IdempotentAnswers(PENDING_PER_UAV * self.scenario.uavs)
         self.belief = FleetBelief(self.scenario)
         self.measured: dict[int, Measured] = {}
-        self.delta_reports = DeltaReports()
+        self.reports = Reports(mission_id, self.scenario, self.belief, self.pending)
         planned = spec.planner == "on" and can_plan(self.scenario)
         self.planner = Planner(self.scenario, self.belief) if planned else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)

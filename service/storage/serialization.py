@@ -11,7 +11,8 @@ import msgpack
 import numpy as np
 
 from service.learning.trust import Advice
-from service.mission.events import AdviserReport, Decided, Event, Guided, Pending, Reported, Settled
+from service.mission.decisions import Pending
+from service.mission.events import AdviserReport, Decided, Event, Guided, Reported, Settled
 from service.mission.idempotency import Answered
 from shared.wire import Outcome, UavState
 

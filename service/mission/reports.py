@@ -1,4 +1,7 @@
-"""Delta encoding of reports: a report may leave out what the UAV's reference report or an earlier report has."""
+"""Reports: each is completed and checked against its mission's world before it changes anything.
+
+A report may leave out what the UAV's reference report or an earlier report has (uplink ``delta``).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import Incomplete, Refused
+from service.mission.decisions import MAX_STEPS_APART, PendingDecisions
 from shared.channel import FloatArray
+from shared.fleetplan import FleetBelief
+from shared.scenario import Scenario
 from shared.wire import SensorColumns, UavState
 
 AnyReport = TypeVar("AnyReport", bound=UavState)
@@ -30,15 +36,49 @@ class ReferenceReport:
     columns: FloatArray
 
 
-class DeltaReports:
-    """The last report of each UAV that uses the uplink ``delta``, as the reference for its next one.
+class Reports:
+    """Completes and checks a mission's reports; the last one of each UAV with the uplink ``delta`` is its reference.
 
     The references are in memory only, 40 bytes a sensor. After the loss of the process or the mission a UAV sends a
     full report again.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, mission_id: str, scenario: Scenario, belief: FleetBelief, pending: PendingDecisions) -> None:
+        self._mission_id = mission_id
+        self._scenario = scenario
+        self._belief = belief
+        self._pending = pending
         self._references: dict[int, ReferenceReport] = {}
+
+    def complete(self, report: AnyReport, step: int, at: str = "") -> AnyReport:
+        """The report with everything that it leaves out, once it fits the mission's world.
+
+        Args:
+            at: the path of the UAV in the request's body, such as ``uavs[1].``.
+
+        Raises:
+            Refused: a step far past the newest one, an unknown UAV or sensor, a queue past its capacity, a beacon later
+                than the step, an outcome of another UAV's decision, a change of a sensor that the reference lacks, or a
+                reference later than the step.
+            Incomplete: the edge has no such reference report, or does not know a sensor's position.
+            NotFound: an outcome of a decision that the mission does not know.
+        """
+        scenario = self._scenario
+        self._check_step(step)
+        if report.uav_id >= scenario.uavs:
+            raise Refused(f"{at}uav_id", f"UAV {report.uav_id} is unknown: this mission has {scenario.uavs}, from 0")
+        if (highest := max(report.sensors.id, default=0)) >= scenario.sensors:
+            raise Refused(f"{at}sensors.id", f"sensor {highest} is unknown: there are {scenario.sensors}, from 0")
+        if report.base is not None or not report.sensors.x:
+            report = self._in_full(report, step, at)
+        fullest = max((q for q in report.sensors.queue if q is not None), default=0.0)
+        if fullest > scenario.queue_capacity:
+            raise Refused(f"{at}sensors.queue", f"{fullest:g} packets exceed the capacity of {scenario.queue_capacity}")
+        if (latest := max((s for s in report.sensors.last_seen if s is not None), default=0)) > step:
+            raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
+        if report.outcome is not None:
+            self._pending.check_outcome(report.outcome, report.uav_id, f"{at}outcome.")
+        return report
 
     def remember(self, uav: UavState, step: int, decision_id: str) -> None:
         """Make an answered report the UAV's reference; without an uplink in the report the UAV has none."""
@@ -47,22 +87,11 @@ class DeltaReports:
             return
         self._references[uav.uav_id] = ReferenceReport(decision_id, step, _array(uav.sensors))
 
-    def complete(self, uav: AnyReport, step: int, positions: FloatArray, at: str = "") -> AnyReport:
-        """The report in full. A report that leaves nothing out is returned unchanged.
-
-        Args:
-            positions: the latest known positions of the mission's sensors, ``(J, 2)`` metres, NaN where unknown. The
-                report names no other sensors.
-            at: the path of the UAV in the request's body, such as ``uavs[1].``.
-
-        Raises:
-            Incomplete: the edge has no such reference report, or does not know a sensor's position.
-            Refused: the report changes a sensor that its reference lacks, or the reference is later than the step.
-        """
+    def _in_full(self, uav: AnyReport, step: int, at: str) -> AnyReport:
+        """A report that leaves out positions, or sensors that its reference has, in full."""
+        positions = self._belief.places
         changed = uav.sensors
         if uav.base is None:
-            if changed.x:
-                return uav
             x, y = _positions_of(np.asarray(changed.id), positions, at)
             return uav.model_copy(update={"sensors": changed.model_copy(update={"x": x.tolist(), "y": y.tolist()})})
         columns = self._reference(uav, step, at).columns.copy()
@@ -86,6 +115,20 @@ class DeltaReports:
             last_seen=[None if step is None else int(step) for step in seen],
         )
         return uav.model_copy(update={"base": None, "uplink": "delta", "sensors": whole})
+
+    def _check_step(self, step: int) -> None:
+        """Refuse a report from the future: it would count as the newest, and later true reports would be too old.
+
+        A fleet may be out of contact for as long as its scenario lasts. The first report may be of any step: an edge
+        that lost its missions meets them in mid-flight, and fleets fly on past their scenario's last step.
+        """
+        newest, ahead = self._belief.newest, max(MAX_STEPS_APART, self._scenario.steps)
+        if newest is not None and step > newest + ahead:
+            raise Refused(
+                "step",
+                f"step {step} is more than {ahead} past {newest}, the newest step known of mission {self._mission_id}: "
+                "DELETE the mission if its fleet was out of contact for so long",
+            )
 
     def _reference(self, uav: UavState, step: int, at: str) -> ReferenceReport:
         reference = self._references.get(uav.uav_id)

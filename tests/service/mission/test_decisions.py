@@ -1,6 +1,6 @@
 import pytest
 
-from service.mission.pending_decisions import AppliedOutcomes
+from service.mission.decisions import AppliedOutcomes
 
 
 def test_what_was_applied_is_known_with_its_sign_and_its_zero() -> None:

@@ -1,18 +1,54 @@
-"""Decisions whose outcome is still to come, and the outcomes that are already applied."""
+"""A fleet's decisions: the sensors that they reserve, the outcomes that are still to come, and those applied."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from service.errors import Conflict, NotFound, Refused
-from service.mission.events import Pending
+from service.learning.modules import Sample
+from service.prompting.row_formats import Cells
 from shared.bounded import BoundedDict
 from shared.scenario import Scenario
 from shared.wire import Outcome
 
+# UAVs of one fleet may be this many steps apart.
+MAX_STEPS_APART = 64
 # An outcome comes with the UAV's next request, so a few steps of a fleet suffice. Older entries are forgotten.
 PENDING_PER_UAV = 8
 _APPLIED_PER_UAV = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A decision whose outcome is still to come.
+
+    Attributes:
+        seen: the chosen sensor's row at the decision.
+        sample: the training sample; None where the modules had no part in the decision.
+    """
+
+    decision_id: str
+    uav_id: int
+    step: int
+    sensor_id: int
+    velocity: int
+    seen: Cells
+    sample: Sample | None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values and arrays."""
+        sample = self.sample
+        fields = None if sample is None else [sample.features, sample.chosen, sample.approach, sample.velocity]
+        names = ("decision_id", "uav_id", "step", "sensor_id", "velocity")
+        return {**{name: getattr(self, name) for name in names}, "seen": dict(self.seen), "sample": fields}
+
+    @classmethod
+    def of(cls, state: Mapping[str, Any]) -> Pending:
+        """From its ``state_dict``."""
+        sample = None if state["sample"] is None else Sample(*state["sample"])
+        return cls(**{**state, "sample": sample})
 
 
 class AppliedOutcomes:
@@ -131,3 +167,74 @@ class PendingDecisions:
 
     def _unknown(self, name: str, field: str) -> NotFound:
         return NotFound(field, f"mission {self._mission_id} does not know decision {name}, or has forgotten it")
+
+
+@dataclass(frozen=True, slots=True)
+class Reservation:
+    """A UAV's sensor at a step, and the number of the UAV's attempt that reserved it."""
+
+    uav_id: int
+    sensor_id: int
+    decision_id: str
+    attempt: int
+
+
+class Reservations:
+    """Reservations and open attempts by step and UAV; past the limit the earliest step is forgotten."""
+
+    def __init__(self) -> None:
+        # Tuples, and attempts only while they are open, save memory: a mission has 64 steps of them.
+        self._by_step: dict[int, tuple[Reservation, ...]] = {}
+        self._attempts: dict[int, dict[int, int]] = {}
+
+    def of_others(self, step: int, uav_id: int) -> frozenset[int]:
+        """IDs of the sensors that other UAVs have at this step."""
+        return frozenset(other.sensor_id for other in self._by_step.get(step, ()) if other.uav_id != uav_id)
+
+    def attempt(self, step: int, uav_id: int) -> int:
+        """The number of a new request of a UAV at a step; of two attempts the later one's answer counts."""
+        answered = self.of(step, uav_id)
+        attempts = self._attempts.setdefault(step, {})
+        number = 1 + max(attempts.get(uav_id, 0), 0 if answered is None else answered.attempt)
+        attempts[uav_id] = number
+        _forget_earliest(self._attempts)
+        return number
+
+    def of(self, step: int, uav_id: int) -> Reservation | None:
+        """The UAV's reservation at this step."""
+        return next((own for own in self._by_step.get(step, ()) if own.uav_id == uav_id), None)
+
+    def reserve(self, step: int, reservation: Reservation) -> None:
+        """Reserve a sensor in place of the UAV's earlier one at this step; the attempt is no longer open."""
+        uav_id = reservation.uav_id
+        others = tuple(other for other in self._by_step.get(step, ()) if other.uav_id != uav_id)
+        self._by_step[step] = (*others, reservation)
+        _forget_earliest(self._by_step)
+        attempts = self._attempts.get(step, {})
+        if attempts.get(uav_id) == reservation.attempt:
+            del attempts[uav_id]
+            if not attempts:
+                del self._attempts[step]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Reservations and open attempts, as copies."""
+        return {
+            "given": {
+                step: {own.uav_id: [own.sensor_id, own.decision_id, own.attempt] for own in reservations}
+                for step, reservations in self._by_step.items()
+            },
+            "attempts": {step: dict(by_uav) for step, by_uav in self._attempts.items()},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a ``state_dict``."""
+        self._by_step = {
+            step: tuple(Reservation(uav, *reserved) for uav, reserved in by_uav.items())
+            for step, by_uav in state["given"].items()
+        }
+        self._attempts = state["attempts"]
+
+
+def _forget_earliest(by_step: dict[int, Any]) -> None:
+    while len(by_step) > MAX_STEPS_APART:
+        del by_step[min(by_step)]

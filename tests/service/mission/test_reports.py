@@ -215,7 +215,7 @@ def test_a_base_takes_little(edge: Edge, report: Report, tmp_path: Path) -> None
     with running(tmp_path / "m.db") as (client, engine):
         for step in range(4):
             asked(client, report(step=step, uplink="delta"))
-        (held,) = engine.missions.loaded[0].delta_reports._references.values()
+        (held,) = engine.missions.loaded[0].reports._references.values()
         assert held.columns.nbytes == 5 * 8 * 5
         asked(client, report(step=5))
-        assert not engine.missions.loaded[0].delta_reports._references
+        assert not engine.missions.loaded[0].reports._references
