@@ -18,8 +18,9 @@ The weights and their guarantee are in :mod:`service.learning.trust`; the evalua
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -53,13 +54,14 @@ class Verdict:
 class Deliberation:
     """One decision's candidates, n of them, and the LLM-free advisers' probabilities of them ``(n,)`` by name.
 
-    It is taken at once from what the mission knows then; ``evaluate`` may run in another thread.
+    It is taken at once from what the mission knows then, of which ``take_rollout`` has a copy; ``evaluate`` may run in
+    another thread.
     """
 
     candidates: CandidateSet
     prompt: Prompt
     advised: dict[str, FloatArray]
-    rollout: RolloutState
+    take_rollout: Callable[[], RolloutState]
 
     @classmethod
     def of(cls, state: AttendedState) -> Self:
@@ -67,8 +69,9 @@ class Deliberation:
         mission = state.mission
         preferences = {name: found for name, advise in ADVISERS.items() if (found := advise(state)) is not None}
         candidates = candidates_of(state).with_actions([found.action for found in preferences.values()])
-        rollout = RolloutState.of(
-            mission.belief,
+        take_rollout = partial(
+            RolloutState.of,
+            mission.belief.copy(),
             mission.scenario,
             state.step,
             state.uav_id,
@@ -84,12 +87,12 @@ class Deliberation:
                 candidates, state.state, mission.experiences.block, state.similar_experiences()
             ),
             advised={name: found.probabilities(candidates.actions) for name, found in preferences.items()},
-            rollout=rollout,
+            take_rollout=take_rollout,
         )
 
     def evaluate(self) -> Evaluation:
         """What the rollout evaluator expects of every candidate."""
-        return evaluate(self.rollout, self.candidates.actions)
+        return evaluate(self.take_rollout(), self.candidates.actions)
 
     def conclude(
         self,

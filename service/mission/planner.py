@@ -9,7 +9,7 @@ from concurrent.futures import Executor
 from importlib.util import find_spec
 
 from shared.actions import Action
-from shared.fleetplan import FleetBelief, RecedingHorizon
+from shared.fleetplan import Draft, FleetBelief, Plan, RecedingHorizon
 from shared.guidance import Guidance
 from shared.scenario import Scenario
 
@@ -57,15 +57,19 @@ class Planner:
             seconds: wall clock for the search; the best plan until then counts.
         """
         async with self._lock:
-            draft = self._horizon.draft(uavs, reserved)
-            if draft is None:
-                return
+            horizon = self._horizon.copy()
+
+            def search() -> tuple[Draft, Plan] | None:
+                draft = horizon.draft(uavs, reserved)
+                return None if draft is None else (draft, draft.search(max(seconds, 0.01)))
+
             try:
-                best = await asyncio.get_running_loop().run_in_executor(executor, draft.search, max(seconds, 0.01))
+                found = await asyncio.get_running_loop().run_in_executor(executor, search)
             except Exception:
                 log.exception("the planner failed; decisions go on without it")
                 return
-            self._horizon.adopt(draft, best)
+            if found is not None:
+                self._horizon.adopt(*found)
 
     def action(self, uav: int, reserved: Collection[int] = ()) -> Action | None:
         """The planned sensor and velocity of a UAV now.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from copy import deepcopy
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -232,6 +233,11 @@ class FleetBelief:
             return
         self.base[sensor] = max(0.0, self.queue(step, [sensor])[0] - packets)
         self.since[sensor] = step
+
+    def copy(self) -> Self:
+        """The belief as it is now, for another thread: nothing that this one learns later changes the copy."""
+        constant = (self._scenario, self._paths)
+        return deepcopy(self, {id(one): one for one in constant})
 
     def state_dict(self) -> dict[str, Any]:
         """The whole belief, as copies."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,7 @@ _NEAR_SENSORS = 16
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """The problem of one plan, copied from a belief, so that another thread may search.
+    """The problem of one plan, taken from a belief.
 
     Attributes:
         step: the plan's first step.
@@ -106,6 +107,12 @@ class RecedingHorizon:
         self._saved += _WORK
         self.plans = {uav: actions[passed:] for uav, actions in self.plans.items()}
         self.step = step
+
+    def copy(self) -> Self:
+        """The planner with a belief of its own, so that another thread may draft and search a plan."""
+        twin = copy(self)
+        twin._belief, twin.plans = self._belief.copy(), dict(self.plans)
+        return twin
 
     def draft(self, uavs: Collection[int], taken: Collection[int] = ()) -> Draft | None:
         """The problem of a plan for this step, in which these UAVs have no decision yet.
