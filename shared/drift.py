@@ -56,7 +56,7 @@ class Drift:
 
     def flown_step(self, path: Trajectory, start_m: float, still_m: float) -> float:
         """The metres flown for one commanded way."""
-        return still_m if self.none else float(self.flown(path, start_m, np.array([still_m]))[0])
+        return float(self.flown(path, start_m, np.array([still_m]))[0])
 
     def flown(self, path: Trajectory, start_m: float, still_m: FloatArray) -> FloatArray:
         """The metres flown, shape ``(n,)``, for commanded ways ``(n,)`` from a progress on."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +11,6 @@ from typing import Any, Self
 import numpy as np
 
 from shared.channel import FloatArray, IntArray, Links, link_holds, packets_per_step, path_loss_db
-from shared.radio_failures import RadioFailures
 from shared.radio_map import RadioMap
 from shared.scenario import Scenario
 
@@ -20,6 +20,15 @@ LIKELY = 0.5
 _SHARE_VISITS = 5
 # A share above this is no loss, and the least that counts.
 _WHOLE_SHARE, _LEAST_SHARE = 0.93, 0.05
+# The prior probability that a radio is dead, and the odds of a failure over a good link if it is, and if it works.
+_PRIOR = math.log(0.01 / 0.99)
+_FAILED = math.log(0.99 / 0.05)
+_SENT = math.log(0.01 / 0.95)
+# A dead radio is tried again as its odds fall back to the prior, by this much a step: after some 60 steps.
+_FORGET = 0.05
+_MOST = 4.0
+# The loss has to be this far below the threshold for a failure to be the radio's, dB.
+GOOD_LINK_DB = 0.5
 
 
 def nearly_normal_below(z: FloatArray) -> FloatArray:
@@ -75,12 +84,56 @@ class ExpectedLinks:
         return moved if self.margin is None and self.alive is None else moved * self.hold
 
 
+class RadioFailures:
+    """The log odds that each of J radios is dead, ``(J,)``, by Bayes' rule from the outcomes over good links."""
+
+    def __init__(self, sensors: int) -> None:
+        self._odds: FloatArray = np.full(sensors, _PRIOR)
+        self._step = 0
+        self.none = True
+
+    def settle(self, sensor: int, failed: bool) -> None:
+        """Take the outcome of a transmission whose link held."""
+        if self.none and not failed:
+            return
+        self.none = False
+        odds = float(self._odds[sensor]) + (_FAILED if failed else _SENT)
+        self._odds[sensor] = min(max(odds, _PRIOR), _MOST)
+
+    def advance(self, step: int) -> None:
+        """Go to a step: the evidence of earlier ones counts less."""
+        if step > self._step:
+            if not self.none:
+                self._odds = np.maximum(self._odds - _FORGET * (step - self._step), _PRIOR)
+                self.none = bool((self._odds <= _PRIOR).all())
+            self._step = step
+
+    def alive(self, which: slice | IntArray = slice(None)) -> FloatArray:
+        """The probability that each radio works, of all sensors or of those named; 1 for one that never failed."""
+        odds = self._odds[which]
+        return np.where(odds <= _PRIOR, 1.0, 1.0 / (1.0 + np.exp(odds)))
+
+    @property
+    def dead(self) -> list[int]:
+        """The sensors whose radio is more likely dead than not."""
+        return [int(sensor) for sensor in np.flatnonzero(self._odds > 0)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The odds, as a copy."""
+        return {"odds": self._odds.copy(), "step": self._step, "none": self.none}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the odds."""
+        self._odds, self._step, self.none = state["odds"], state["step"], state["none"]
+
+
 class LearnedChannel:
     """One fleet's knowledge of its links.
 
     Attributes:
         radio_map: the excess loss over the formula.
         failures: the radios that fail although their links hold.
+        share: the rate that transfers get, as a share of the formula's, 0.05..1: the median of the last visits.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -88,21 +141,12 @@ class LearnedChannel:
         self.radio_map = RadioMap(scenario.sensors)
         self.failures = RadioFailures(scenario.sensors)
         self._shares = [1.0] * _SHARE_VISITS
-
-    @property
-    def share(self) -> float:
-        """The rate that transfers get, as a share of the formula's, 0.05..1: the median of the last visits."""
-        median = sorted(self._shares)[_SHARE_VISITS // 2]
-        return 1.0 if median > _WHOLE_SHARE else median
+        self.share = 1.0
 
     @property
     def by_formula(self) -> bool:
         """Whether all that was seen agrees with the formula."""
         return self.radio_map.exact and self.failures.none and self.share == 1.0
-
-    def advance(self, step: int) -> None:
-        """Go to a later step."""
-        self.failures.advance(step)
 
     def measure(self, ids: IntArray, place: FloatArray, distance: FloatArray, gain_db: FloatArray) -> FloatArray:
         """Take the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``.
@@ -153,7 +197,11 @@ class LearnedChannel:
         if link <= 0 or (packets >= before - slack and before < self.share * link):
             # The queue was emptied: the link may move more.
             return
-        self._shares = [*self._shares[1:], min(max(packets / link, _LEAST_SHARE), 1.0)]
+        self._see([*self._shares[1:], min(max(packets / link, _LEAST_SHARE), 1.0)])
+
+    def _see(self, shares: list[float]) -> None:
+        median = sorted(shares)[_SHARE_VISITS // 2]
+        self._shares, self.share = shares, 1.0 if median > _WHOLE_SHARE else median
 
     def state_dict(self) -> dict[str, Any]:
         """The whole knowledge, as copies."""
@@ -167,4 +215,4 @@ class LearnedChannel:
         """Restore it."""
         self.radio_map.load_state_dict(state["map"])
         self.failures.load_state_dict(state["failures"])
-        self._shares = list(state["shares"])
+        self._see(list(state["shares"]))

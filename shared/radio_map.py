@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ _SAME_PLACE_M = 10.0
 _SIZE = 8
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Shadowing:
     """A kind of shadowing, as shares of the excess loss's variance that sum to 1.
 
@@ -45,7 +46,7 @@ class Shadowing:
     place: float
     range_m: float
 
-    @property
+    @cached_property
     def fading(self) -> float:
         """The share of the variance that no earlier measurement tells anything about."""
         return 1.0 - self.sensor - self.place
@@ -91,6 +92,7 @@ class RadioMap:
         noise: shape ``(J, N)``, the factor of the fading's variance of each measurement, at least 1.
         count: shape ``(J,)``, measurements kept.
         heard: measurements so far, of all sensors.
+        exact: whether every measurement so far agrees with the formula.
     """
 
     def __init__(self, sensors: int) -> None:
@@ -104,16 +106,11 @@ class RadioMap:
         self.heard = 0
         self.kind = KINDS[0]
         self._compared = _COMPARE_FIRST
-        self._exact = True
+        self.exact = True
         # By sensor, K^-1, K^-1 r and K^-1 1. None until a gain differs from the formula.
         self._inverse: FloatArray | None = None
         self._measured: FloatArray = np.zeros((sensors, kept))
         self._ones: FloatArray = np.zeros((sensors, kept))
-
-    @property
-    def exact(self) -> bool:
-        """Whether every measurement so far agrees with the formula."""
-        return self._exact
 
     @property
     def offset_db(self) -> float:
@@ -123,7 +120,7 @@ class RadioMap:
     @property
     def deviation_db(self) -> float:
         """``sigma``, dB: the standard deviation of the excess loss of a link that was never measured."""
-        if self._exact:
+        if self.exact:
             return 0.0 if self.heard else _PRIOR_DB
         offset = self.offset_db
         squares = (self.excess - offset) * (self._measured - offset * self._ones)
@@ -132,7 +129,7 @@ class RadioMap:
 
     def measured_db(self) -> dict[int, float]:
         """The mean excess loss of each measured sensor, dB, over the measurements kept; empty if all are exact."""
-        if self._exact:
+        if self.exact:
             return {}
         used = np.arange(self.excess.shape[1]) < self.count[:, None]
         means = (self.excess * used).sum(axis=1) / np.maximum(self.count, 1)
@@ -156,10 +153,10 @@ class RadioMap:
         self.heard += len(ids)
         here = np.asarray(place, dtype=np.float64)
         noise: FloatArray | float = 1.0
-        if self._exact and np.abs(excess).max() > _EXACT_DB:
-            self._exact = False
+        if self.exact and np.abs(excess).max() > _EXACT_DB:
+            self.exact = False
             self._factor(np.arange(len(self.count)))
-        if not self._exact:
+        if not self.exact:
             mean, deviation = self.predict(here[None], ids)
             off = np.abs(excess - mean[0]) / np.maximum(deviation[0], _HUBER_LEAST_DB)
             noise = np.square(np.maximum(off / _HUBER, 1.0))
@@ -170,7 +167,7 @@ class RadioMap:
         self._taken[ids, slot] = self.heard
         self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
         self.count[ids] += ~full
-        if self._exact:
+        if self.exact:
             return excess
         if self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
@@ -260,7 +257,7 @@ class RadioMap:
             "heard": self.heard,
             "kind": KINDS.index(self.kind),
             "compared": self._compared,
-            "exact": self._exact,
+            "exact": self.exact,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -269,6 +266,6 @@ class RadioMap:
             setattr(self, name, state[name])
         self._taken = state["taken"]
         self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
-        self._exact = state["exact"]
-        if not self._exact:
+        self.exact = state["exact"]
+        if not self.exact:
             self._factor(np.arange(len(self.count)))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray
-from shared.features import filled
+from shared.features import beacon_columns
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.measured import Measured
 from shared.scenario import Scenario
@@ -101,13 +101,13 @@ class Records:
 def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
     """Add a UAV's full report to the sensors' records and to the belief; returns what its gains show."""
     ids = np.asarray(uav.sensors.id)
-    seen = filled(uav.sensors.last_seen, NEVER).astype(np.int64)
-    queue = filled(uav.sensors.queue)
+    queue, battery, gain, beacon = beacon_columns(uav.sensors)
+    seen = beacon.astype(np.int64)
     belief.advance(step)
     belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
     places = np.array((uav.sensors.x, uav.sensors.y), dtype=np.float64).T
-    belief.hear(ids, places, seen, queue, filled(uav.sensors.battery))
+    belief.hear(ids, places, seen, queue, battery)
     fresh = seen == step
-    measured = belief.measure(uav.uav_id, ids[fresh], filled(uav.sensors.channel_gain)[fresh])
+    measured = belief.measure(uav.uav_id, ids[fresh], gain[fresh])
     records.hear(ids, seen, queue)
     return measured

@@ -113,9 +113,12 @@ class Polyline:
         return float(self._reached[nearest] + math.dist(foot[nearest], start[nearest])), float(gaps[nearest])
 
 
+@lru_cache(maxsize=64)
 def trajectories(scenario: Scenario) -> tuple[Trajectory, ...]:
     """One trajectory a UAV: the scenario's routes if it has any, else its circles."""
-    return _polylines(scenario.routes) if scenario.routes else _circles(scenario.lap_centres, scenario.lap_radius_m)
+    if scenario.routes:
+        return tuple(Polyline(route) for route in scenario.routes)
+    return tuple(Circle(centre, scenario.lap_radius_m) for centre in scenario.lap_centres)
 
 
 def progress_of(
@@ -133,13 +136,3 @@ def progress_of(
         return reported_m
     progress, gap = trajectory.locate(position)
     return progress if gap <= tolerance_m else None
-
-
-@lru_cache(maxsize=64)
-def _circles(centres: tuple[Point, ...], radius_m: float) -> tuple[Trajectory, ...]:
-    return tuple(Circle(centre, radius_m) for centre in centres)
-
-
-@lru_cache(maxsize=64)
-def _polylines(routes: tuple[tuple[Point, ...], ...]) -> tuple[Trajectory, ...]:
-    return tuple(Polyline(route) for route in routes)

@@ -18,8 +18,7 @@ from service.mission.decisions import Pending
 from service.mission.mission import Mission
 from service.prompting.row_formats import cells
 from shared.actions import Action
-from shared.features import State, augment
-from shared.reach import Reach
+from shared.features import Reach, State, augment
 from shared.wire import Candidate, UavState
 
 

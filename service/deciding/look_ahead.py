@@ -8,8 +8,7 @@ import numpy as np
 
 from service.guidance.step_guidance import StepGuidance
 from shared.actions import Action
-from shared.features import State
-from shared.reach import Reach
+from shared.features import Reach, State
 
 
 def look_ahead(state: State, reach: Reach, reserved: Collection[int], guidance: StepGuidance | None = None) -> Action:

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from shared.actions import Action
 from shared.channel import FloatArray
+from shared.features import VELOCITY_BONUS
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.arrivals import Arrivals
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
 from shared.learned_channel import nearly_normal_below
-from shared.reach import VELOCITY_BONUS
 from shared.scenario import Scenario
 from shared.urgency import urgency
 

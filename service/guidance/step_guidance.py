@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray
-from shared.features import State
+from shared.features import Reach, State
 from shared.guidance import Guidance
-from shared.reach import Reach
 from shared.scenario import Scenario
 
 

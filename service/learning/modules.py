@@ -19,8 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from service.config.cores import usable_cores
-from shared.features import FEATURES
-from shared.reach import LEVEL_FEATURES
+from shared.features import FEATURES, LEVEL_FEATURES
 from shared.wire import Features
 
 Array = NDArray[np.float32]

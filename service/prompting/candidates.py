@@ -18,8 +18,7 @@ import numpy as np
 
 from service.prompting.row_formats import cells
 from shared.actions import Action
-from shared.features import State
-from shared.reach import Reach
+from shared.features import Reach, State
 
 # OpenAI and vLLM return the probabilities of at most 20 tokens.
 _MOST_LABELS = 20

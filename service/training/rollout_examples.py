@@ -19,8 +19,7 @@ from service.mission.mission import Mission
 from service.training.recorded_states import recorded_states
 from service.training.reward import Reward, Speed
 from shared.actions import Action
-from shared.features import State
-from shared.reach import Reach, distances_between, places_ahead
+from shared.features import Reach, State, distances_between, places_ahead
 from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
 from shared.wire import Belief, Features, MissionSpec

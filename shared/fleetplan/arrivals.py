@@ -12,7 +12,7 @@ from shared.channel import FloatArray, IntArray
 from shared.scenario import Scenario
 
 # Sensors, by index.
-Which = slice | list[int]
+Which = slice | list[int] | IntArray
 # A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
 _ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
 # The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least dispersion that
@@ -33,6 +33,7 @@ class Arrivals:
 
     Attributes:
         arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
+        dispersion: the variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more.
         recent: shape ``(J,)``, packets a step in the last interval, which ended in step ``recent_at``, -1 for none.
     """
 
@@ -46,16 +47,11 @@ class Arrivals:
         self.recent: FloatArray = np.zeros(count)
         self.recent_at: IntArray = np.full(count, -1)
         self._surprise, self._intervals = 0.0, 0
+        self.dispersion = 1.0
 
     def rate(self, which: Which = slice(None)) -> FloatArray:
         """Expected packets a step, shape ``(J,)``, or of the sensors ``which``."""
         return np.asarray(self.arrived[which] / self.watched[which])
-
-    @property
-    def dispersion(self) -> float:
-        """The variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more."""
-        found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
-        return found if found > _LEAST_DISPERSION else 1.0
 
     def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
         """Take the packets ``(n,)`` that came to sensors ``(n,)`` in so many steps, until these steps."""
@@ -65,9 +61,14 @@ class Arrivals:
         variance = np.maximum(expected + np.square(steps) * rate / self.watched[ids], 1.0)
         self._surprise += float(np.sum(np.square(came - expected) / variance))
         self._intervals += len(ids)
+        self._estimate_dispersion()
         self.recent[ids], self.recent_at[ids] = came / steps, at
         self.arrived[ids] += came
         self.watched[ids] += steps
+
+    def _estimate_dispersion(self) -> None:
+        found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
+        self.dispersion = found if found > _LEAST_DISPERSION else 1.0
 
     def burst(self, step: int | IntArray) -> FloatArray:
         """Packets above the rate that are still to come of the bursts seen, from this step or steps on, ``(J,)``."""
@@ -100,3 +101,4 @@ class Arrivals:
             for name in _NEWER_ARRAYS:
                 setattr(self, name, state[name])
             self._surprise, self._intervals = state["surprise"], state["intervals"]
+            self._estimate_dispersion()

@@ -15,8 +15,7 @@ from shared.drift import Drift
 from shared.fleetplan.arrivals import Arrivals, Which
 from shared.fleetplan.measured import NOTHING_MEASURED, Measured
 from shared.fleetplan.whereabouts import Visit, Whereabouts
-from shared.learned_channel import ExpectedLinks, LearnedChannel
-from shared.radio_failures import GOOD_LINK_DB
+from shared.learned_channel import GOOD_LINK_DB, ExpectedLinks, LearnedChannel
 from shared.scenario import Point, Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
@@ -92,7 +91,7 @@ class FleetBelief:
         known, base, since = self.heard[ids] >= 0, self.base[ids], self.since[ids]
         counted = newer & known & (beacon > since) & (queue < self._scenario.queue_capacity)
         # After a visit that moved less than believed, the packets that stayed are no arrivals.
-        expected = self.rate[ids] * np.maximum(beacon - since, 0)
+        expected = self.arrivals.rate(ids) * np.maximum(beacon - since, 0)
         stayed = (self.visited[ids] == since) & (queue - base > expected + 4.0 * np.sqrt(expected) + 2.0)
         counted &= ~stayed
         came = np.maximum(queue - base, 0.0)
@@ -191,7 +190,7 @@ class FleetBelief:
         served = {(visit.sensor, visit.step) for visit in visits if visit is not None and visit.collected}
         for uav in flying:
             self._fly(uav, served)
-        self.channel.advance(step)
+        self.channel.failures.advance(step)
 
     def _fly(self, uav: int, served: set[tuple[int, int]]) -> None:
         """Fly one UAV's decision; ``served`` has the sensors and steps of the fleet's successful visits."""
@@ -199,10 +198,10 @@ class FleetBelief:
         sensor, velocity = last.action or (0, 0)
         start = last.progress_m
         if last.progress_m is not None:
-            last.progress_m += self.drift.flown_step(
-                self._paths[uav], last.progress_m, velocity * self._scenario.step_s
-            )
-            x, y = self._paths[uav].at(last.progress_m)
+            path, still_m = self._paths[uav], velocity * self._scenario.step_s
+            drift = self.drift
+            last.progress_m += still_m if drift.none else drift.flown_step(path, last.progress_m, still_m)
+            x, y = path.at(last.progress_m)
             last.position = float(x), float(y)
         base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])
         collected = False

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from shared.channel import link_holds, packets_per_step, path_loss_db
-from shared.learned_channel import ExpectedLinks, LearnedChannel
-from shared.radio_failures import RadioFailures
+from shared.learned_channel import ExpectedLinks, LearnedChannel, RadioFailures
 from shared.scenario import SCENARIOS
 
 PAPER = SCENARIOS["paper"]

@@ -27,8 +27,8 @@ from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import channel_gain_db
+from shared.features import Reach
 from shared.learned_channel import ExpectedLinks
-from shared.reach import Reach
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome
 from tests.running import listening, serving

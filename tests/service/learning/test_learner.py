@@ -13,8 +13,7 @@ import torch
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner, descend
 from service.learning.modules import Modules, Sample
-from shared.features import FEATURES
-from shared.reach import LEVEL_FEATURES
+from shared.features import FEATURES, LEVEL_FEATURES
 from shared.wire import Features
 
 Scores = tuple[float, ...]

@@ -9,8 +9,7 @@ import pytest
 from service.deciding.attended_state import AttendedState
 from service.prompting.row_formats import columns
 from shared.channel import link_holds, packets_per_step
-from shared.features import FEATURES
-from shared.reach import LEVEL_FEATURES, distances_between, places_ahead
+from shared.features import FEATURES, LEVEL_FEATURES, distances_between, places_ahead
 from shared.scenario import SCENARIOS, Point
 from shared.trajectory import trajectories
 from shared.wire import Features, MissionSpec, PromptStyle, UavState
