@@ -15,7 +15,7 @@ from paper_template import EXPERIENCES, Newest, PaperTemplate
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.deliberation import candidates_of
+from service.deciding.deliberation import candidates_of, template_of
 from service.deciding.rollout_evaluator import RolloutState
 from service.llm.request_bodies import chat_body, label_body
 from service.mission.mission import Mission
@@ -127,7 +127,7 @@ class Scribe(LocalPilot):
         shown, nearest = view.shown(), view.similar_experiences()
         if not isinstance(mission.template, GuidedTemplate):
             return Put(mission.template.prompt(view.state, shown, mission.experiences.block, nearest), view.kept_ids)
-        offer = candidates_of(view)
+        offer = candidates_of(view, template_of(mission))
         self._note(mission, mission.template, view, offer)
         return Put(
             mission.template.choice_prompt(offer, view.state, mission.experiences.block, nearest), view.kept_ids, offer

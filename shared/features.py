@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -48,11 +48,6 @@ class Reach:
         return cls(links, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
 
     @property
-    def distance(self) -> FloatArray:
-        """Metres."""
-        return self.links.distance
-
-    @property
     def likely(self) -> NDArray[np.bool_]:
         """Whether each link is likely to hold."""
         return np.asarray(self.links.hold >= LIKELY)
@@ -87,20 +82,24 @@ class Reach:
             overflow_in / scenario.steps,
             holds[0],
             holds[1],
-            self.distance[0] / scenario.radio_radius_m / 2,
+            self.links.distance[0] / scenario.radio_radius_m / 2,
         )
         return np.asarray(np.clip(np.stack(columns, axis=1), 0.0, 1.0))
 
-    def level_features(self, row: int, urgency: float, scenario: Scenario) -> NDArray[np.float32]:
-        """The velocity scorer's inputs for one sensor in preset ``reach``, ``(V, 4)``.
+    def level_features(self, rows: Sequence[int], urgency: FloatArray, scenario: Scenario) -> NDArray[np.float32]:
+        """The velocity scorer's inputs for the sensors in n rows in preset ``reach``, ``(n, V, 4)``.
 
         They are at each level packets / W, urgent packets / W, velocity / max, and the distance in radio radii, at
         most 2.
+
+        Args:
+            urgency: U, ``(J,)``.
         """
-        packets = self.packets[:, row] / scenario.queue_capacity
-        levels = np.arange(len(packets)) / scenario.max_velocity
-        distance = np.minimum(self.distance[:, row] / scenario.radio_radius_m, 2.0)
-        return np.stack((packets, urgency * packets, levels, distance), axis=1).astype(np.float32)
+        packets = self.packets[:, rows].T / scenario.queue_capacity
+        levels = np.broadcast_to(np.arange(len(self.packets)) / scenario.max_velocity, packets.shape)
+        distance = np.minimum(self.links.distance[:, rows].T / scenario.radio_radius_m, 2.0)
+        urgent = urgency[rows][:, None] * packets
+        return np.stack((packets, urgent, levels, distance), axis=2).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,18 +179,15 @@ class State:
             stacked = np.concatenate((stacked, added[self.admissible]), axis=1)
         return np.ascontiguousarray(stacked, dtype=np.float32)
 
-    def approach(self, row: int, scenario: Scenario) -> NDArray[np.float32]:
-        """The velocity scorer's input for the sensor in that row, beside its context.
+    def approaches(self, rows: Sequence[int], scenario: Scenario) -> NDArray[np.float32]:
+        """The velocity scorer's inputs for the sensors in n rows, beside their contexts.
 
-        Preset ``paper``: the normalised distance, ``(1,)``. Preset ``reach``: :meth:`Reach.level_features`, ``(V, 4)``.
+        Preset ``paper``: the distance in radio radii, at most 2, ``(n, 1)``. Preset ``reach``:
+        :meth:`Reach.level_features`, ``(n, V, 4)``.
         """
         if self.reach is not None:
-            return self.reach.level_features(row, float(self.urgency[row]), scenario)
-        return np.array([self.normalised_distance(row, scenario)], dtype=np.float32)
-
-    def normalised_distance(self, row: int, scenario: Scenario) -> float:
-        """The distance of the sensor in that row, in radio radii, at most 2."""
-        return min(float(self.distance[row]) / scenario.radio_radius_m, 2.0)
+            return self.reach.level_features(rows, self.urgency, scenario)
+        return np.minimum(self.distance[rows] / scenario.radio_radius_m, 2.0)[:, None].astype(np.float32)
 
 
 def augment(
@@ -200,7 +196,7 @@ def augment(
     scenario: Scenario,
     *,
     visits: NDArray[np.int64],
-    rates: FloatArray,
+    rates: FloatArray | None,
     reserved: Collection[int],
     preset: Features = "paper",
     belief: FleetBelief | None = None,
@@ -216,7 +212,7 @@ def augment(
 
     Args:
         visits: step of each sensor's last visit (TVR_j), by sensor ID; a sensor never visited counts from step 0.
-        rates: observed arrival rates, packets a step, by sensor ID.
+        rates: observed arrival rates, packets a step, by sensor ID; a belief has its own.
         reserved: sensors that other UAVs have in this step.
         preset: ``reach`` also looks ahead along the UAV's trajectory.
         belief: the fleet's; without it the state has this UAV's own last beacons.
@@ -229,6 +225,7 @@ def augment(
     places = np.array((sensors.x, sensors.y), dtype=np.float64).T
     distance = np.sqrt(np.square(places - position).sum(axis=1))
     if belief is None:
+        assert rates is not None
         rate = rates[ids]
     else:
         heard = np.ones_like(heard)

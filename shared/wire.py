@@ -6,6 +6,7 @@ surveyed position (``x``, ``y``), and ``null`` in the four columns that only a b
 
 from __future__ import annotations
 
+import operator
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
@@ -48,10 +49,6 @@ Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]
 
 
-def _is_empty(column: list[float]) -> bool:
-    return not column
-
-
 class Wire(BaseModel):
     """Strict: no coercion between types, no NaN or infinity, no unknown field."""
 
@@ -82,14 +79,14 @@ class SensorColumns(Received):
         default_factory=list,
         max_length=MAX_SENSORS,
         fail_fast=True,
-        exclude_if=_is_empty,
+        exclude_if=operator.not_,
         description="m, surveyed; omitted: as sent before",
     )
     y: list[Metres] = Field(
         default_factory=list,
         max_length=MAX_SENSORS,
         fail_fast=True,
-        exclude_if=_is_empty,
+        exclude_if=operator.not_,
         description="m, surveyed; omitted: as sent before",
     )
     queue: Annotated[

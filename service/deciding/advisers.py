@@ -72,7 +72,8 @@ def _by_plan(state: AttendedState) -> Preference | None:
 
 def _by_value(state: AttendedState) -> Preference:
     """The learned values."""
-    return LearnedValues(state.best_by_value(), state.values())
+    values = state.values()
+    return LearnedValues(state.best_by_value(), values)
 
 
 def _by_look_ahead(state: AttendedState) -> Preference:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
@@ -59,7 +60,7 @@ class AttendedState:
         watch = watch or Stopwatch()
         reserved, obeyed, scenario = (
             mission.reservations.of_others(step, uav.uav_id),
-            mission.guidance.confirmed,
+            mission.guidance.orders,
             mission.scenario,
         )
         state = augment(
@@ -67,13 +68,13 @@ class AttendedState:
             step,
             scenario,
             visits=mission.records.visits,
-            rates=mission.records.rates,
+            rates=None if mission.belief_source == "fleet" else mission.records.rates,
             reserved=reserved,
             preset=mission.features,
             belief=mission.belief if mission.belief_source == "fleet" else None,
         )
         guidance = None
-        if obeyed:
+        if obeyed is not None:
             reach = state.reach_ahead(uav.uav_id, scenario)
             guidance = StepGuidance.of(obeyed, state, reach, step, mission.records.visits, scenario)
         watch.lap("augment")
@@ -120,14 +121,14 @@ class AttendedState:
 
     def similar_experiences(self) -> list[str]:
         """Past decisions most like the rows kept, for the prompt's last block, as the mission's selection has it."""
-        if not self.rows:
+        if not self.rows or self.mission.experiences.selection != "similar":
             return []
         return self.mission.experiences.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
 
     def best_by_value(self) -> Action:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]
-        level = int(self._values_of_velocities(row).argmax())
+        level = int(self._values_of_velocities([row])[0].argmax())
         if self.guidance is not None:
             level = self.guidance.nearest(row, level)
         return Action(int(self.state.ids[row]), level)
@@ -135,8 +136,8 @@ class AttendedState:
     def values(self) -> dict[int, NDArray[np.float32]]:
         """The learned values of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v, (V,)."""
         found = {}
-        for row, candidate in zip(self.rows, self.candidates, strict=True):
-            levels = self._values_of_velocities(row).numpy()
+        for values, candidate in zip(self._values_of_velocities(self.rows), self.candidates, strict=True):
+            levels = values.numpy()
             found[candidate.sensor_id] = candidate.score + levels - levels.max()
         return found
 
@@ -150,7 +151,7 @@ class AttendedState:
             sample = Sample(
                 features=self.features,
                 chosen=self.admissible.index(row),
-                approach=self.state.approach(row, self.mission.scenario),
+                approach=self.state.approaches([row], self.mission.scenario)[0],
                 velocity=velocity,
             )
         return Pending(
@@ -163,13 +164,14 @@ class AttendedState:
             sample=sample,
         )
 
-    def _values_of_velocities(self, row: int) -> Tensor:
-        """``u_jv`` of the sensor in that row, ``(V,)``; once a state, for two advisers ask."""
-        if row not in self._velocity_values:
-            context = self.contexts[self.admissible.index(row)]
-            approach = self.state.approach(row, self.mission.scenario)
-            self._velocity_values[row] = self.mission.learner.weights.velocities(context, approach)
-        return self._velocity_values[row]
+    def _values_of_velocities(self, rows: Sequence[int]) -> list[Tensor]:
+        """``u_jv`` of the sensors in these rows, ``(V,)`` each; once a state, for two advisers ask."""
+        if missing := [row for row in rows if row not in self._velocity_values]:
+            contexts = self.contexts[[self.admissible.index(row) for row in missing]]
+            approaches = self.state.approaches(missing, self.mission.scenario)
+            values = self.mission.learner.weights.velocities(contexts, approaches)
+            self._velocity_values.update(zip(missing, values, strict=True))
+        return [self._velocity_values[row] for row in rows]
 
 
 def _attend(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import Self
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -12,11 +11,6 @@ class Deadline:
     """A moment of ``time.perf_counter``, in seconds."""
 
     at: float
-
-    @classmethod
-    def after(cls, milliseconds: float, since: float) -> Self:
-        """So many milliseconds after a moment of ``time.perf_counter``."""
-        return cls(since + milliseconds / 1e3)
 
     def left(self) -> float:
         """Seconds from now, 0 once the deadline has passed."""

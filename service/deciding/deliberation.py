@@ -68,7 +68,8 @@ class Deliberation:
         """For a state of a mission of mode ``guided`` with at least one row."""
         mission = state.mission
         preferences = {name: found for name, advise in ADVISERS.items() if (found := advise(state)) is not None}
-        candidates = candidates_of(state).with_actions([found.action for found in preferences.values()])
+        template = template_of(mission)
+        candidates = candidates_of(state, template).with_actions([found.action for found in preferences.values()])
         take_rollout = partial(
             RolloutState.of,
             mission.belief.copy(),
@@ -77,10 +78,9 @@ class Deliberation:
             state.uav_id,
             seed=mission.spec.seed,
             reserved=state.reserved,
-            plans=None if mission.planner is None else mission.planner.plans(),
+            plans=None if mission.planner is None else mission.planner.actions(),
             guidance=mission.guidance.confirmed,
         )
-        template = template_of(mission)
         return cls(
             candidates=candidates,
             prompt=template.choice_prompt(
@@ -174,9 +174,9 @@ def template_of(mission: Mission) -> GuidedTemplate:
     return mission.template
 
 
-def candidates_of(state: AttendedState) -> CandidateSet:
+def candidates_of(state: AttendedState, template: GuidedTemplate) -> CandidateSet:
     """The LLM's candidates, at velocities that the operator allows; the state has at least one row."""
-    candidates = CandidateSet.of(state.state, state.reach, state.shown(), template_of(state.mission).letters)
+    candidates = CandidateSet.of(state.state, state.reach, state.shown(), template.letters)
     guidance = state.guidance
     if guidance is None:
         return candidates

@@ -141,7 +141,7 @@ class LlmQueries:
         until it is probed again; after two timeouts in a row neither.
         """
         template = template_of(mission)
-        asked = {state.uav_id: (state, candidates_of(state)) for state in states if state.rows}
+        asked = {state.uav_id: (state, candidates_of(state, template)) for state in states if state.rows}
         if not asked:
             return {}
         similar = dict.fromkeys(line for state, _ in asked.values() for line in state.similar_experiences())

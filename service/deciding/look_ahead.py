@@ -31,6 +31,6 @@ def look_ahead(state: State, reach: Reach, reserved: Collection[int], guidance: 
     if not free.any():
         free[:] = True
     worth = reach.worth if guidance is None else reach.worth + guidance.worth
-    worth = np.where(free, worth - 1e-9 * reach.distance, -np.inf)
+    worth = np.where(free, worth - 1e-9 * reach.links.distance, -np.inf)
     level, row = np.unravel_index(int(worth.argmax()), worth.shape)
     return Action(int(state.ids[row]), int(level))

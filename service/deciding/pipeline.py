@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from service.config.cores import usable_cores
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.decision_task import RESERVE_S, Choice, DecisionTask, Fallback
+from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmQueries
 from service.deciding.look_ahead import look_ahead
@@ -90,12 +90,12 @@ class Pipeline:
     def begin_plan(
         self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline
     ) -> asyncio.Task[None] | None:
-        """Begin to plan for UAVs of this step, where their mission's mode may need a plan."""
+        """Begin to plan for UAVs of this step, where their mission's mode may need a plan by this deadline."""
         share = self._modes[mission.mode].plan_share
         if mission.planner is None or share is None:
             return None
         # In mode `guided` the LLM, which comes after the plan, has as much time as the planner.
-        seconds = min(self._planner_s, deadline.earlier_by(RESERVE_S).left() * share)
+        seconds = min(self._planner_s, deadline.left() * share)
         taken = mission.reservations.of_others(step, uavs[0])
         task = asyncio.create_task(mission.planner.plan(uavs, taken, seconds, self._planning))
         self._plans.add(task)
@@ -131,8 +131,10 @@ def _without_llm(state: AttendedState) -> Action:
 
 def _enforce(mission: Mission, choice: Choice) -> Choice:
     """The choice at a velocity that the operator's guidance allows, which may have been confirmed meanwhile."""
-    levels = mission.scenario.max_velocity + 1
-    velocity = mission.guidance.confirmed.nearest(choice.action.velocity, levels)
+    orders = mission.guidance.orders
+    if orders is None:
+        return choice
+    velocity = orders.nearest(choice.action.velocity, mission.scenario.max_velocity + 1)
     return replace(choice, action=Action(choice.action.sensor_id, velocity))
 
 

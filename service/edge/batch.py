@@ -41,7 +41,7 @@ class BatchDecider:
         advice: dict[int, LlmAdvice] = {}
         query_s = self._query_s(deadline.at - watch.started, len(uavs))
         if query_s is not None and self._queries.may_ask_for_fleet(mission, len(uavs)):
-            plan = self._pipeline.begin_plan(mission, uavs, step, deadline)
+            plan = self._pipeline.begin_plan(mission, uavs, step, deadline.earlier_by(RESERVE_S))
             states = [AttendedState.of(mission, uav, step, watch) for uav in request.uavs]
             advice = await self._queries.ask_for_fleet(mission, states, Deadline(watch.started + query_s))
             watch.lap("llm")
@@ -50,9 +50,9 @@ class BatchDecider:
             own = Stopwatch() if index else watch
             now, later = time.perf_counter(), len(uavs) - index - 1
             share_s = (deadline.at - now) / (later + 1)
-            plan = plan or self._pipeline.begin_plan(mission, uavs[index:], step, Deadline(now + share_s))
+            plan = plan or self._pipeline.begin_plan(mission, uavs[index:], step, Deadline(now + share_s - RESERVE_S))
             deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
-            mine = Deadline.after(deadline_ms, own.started).earlier_by(RESERVE_S)
+            mine = Deadline(own.started + deadline_ms / 1e3 - RESERVE_S)
             # The evaluator may exceed its UAV's share, as long as enough time is left for the later UAVs.
             evaluation = max(mine, deadline.earlier_by(RESERVE_S + self._pipeline.own_s * later))
             task = DecisionTask(

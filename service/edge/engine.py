@@ -105,9 +105,7 @@ class Engine:
             NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.resolve`.
         """
         watch, deadline = self._start(request)
-        within_s = deadline.earlier_by(RESERVE_S).left()
-        mission, report = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
-
+        mission, report = await self.missions.resolve(request, may_make=may_make, key=key, deadline=deadline)
         make = partial(self._decide_one, mission, report, watch, deadline)
         return (await self._respond(mission, request, key, make, deadline))[0]
 
@@ -116,8 +114,7 @@ class Engine:
     ) -> list[DecideResponse]:
         """A fleet's decisions at one step in the order of its UAVs; arguments and errors as for :meth:`decide`."""
         watch, deadline = self._start(request)
-        within_s = deadline.earlier_by(RESERVE_S).left()
-        mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, within_s=within_s)
+        mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, deadline=deadline)
 
         async def make() -> list[Decided]:
             # Every outcome is applied before the first decision: none is lost while the UAVs wait for the LLM.
@@ -157,7 +154,8 @@ class Engine:
         clear_contextvars()
         # Every log line of the request has these fields.
         bind_contextvars(mission_id=request.mission_id, step=request.step)
-        return watch, Deadline.after(request.deadline_ms or self._settings.deadline_ms, watch.started)
+        milliseconds = request.deadline_ms or self._settings.deadline_ms
+        return watch, Deadline(watch.started + milliseconds / 1e3)
 
     async def _decide_one(
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
@@ -165,8 +163,8 @@ class Engine:
         if request.outcome is not None:
             self._feedback.apply_reported(mission, request.outcome)
         attempt = mission.observe(request, request.step)
-        plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, deadline)
         deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, deadline.earlier_by(RESERVE_S)
+        plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, mine)
         task = DecisionTask(mission, request, request.step, attempt, deadline_ms, mine, mine, watch, plan)
         return [await self.pipeline.decide_one(task)]
 

@@ -11,6 +11,8 @@ from typing import TypeVar
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.config.settings import Settings
+from service.deciding.decision_task import RESERVE_S
+from service.deciding.decision_time import Deadline
 from service.errors import Conflict, NotFound, Unavailable
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -93,7 +95,7 @@ class MissionRegistry:
         raise NotFound("decision_id", detail)
 
     async def resolve(
-        self, request: AnyRequest, *, may_make: bool, key: str | None, within_s: float
+        self, request: AnyRequest, *, may_make: bool, key: str | None, deadline: Deadline
     ) -> tuple[Mission, AnyRequest]:
         """The mission of a request that fits it, and the request in full.
 
@@ -101,8 +103,7 @@ class MissionRegistry:
 
         Args:
             key: the idempotency key; a request whose answer is remembered or in progress is returned unchanged.
-            within_s: the longest wait for the mission to load.
-            within_s: to wait, at most, for a mission that must be read back.
+            deadline: ends the wait for a mission that must be loaded.
 
         Raises:
             NotFound: there is no such mission, and none may be made.
@@ -110,7 +111,9 @@ class MissionRegistry:
             Refused: as :meth:`Reports.complete`; nothing is recorded.
         """
         mission_id = request.mission_id
-        mission = await self._find(mission_id, within_s)
+        mission = self._missions.get(mission_id)
+        if mission is None:
+            mission = await self._find(mission_id, deadline.earlier_by(RESERVE_S).left())
         if mission is not None and key is not None and mission.idempotent_answers.knows(key):
             return mission, request
         if mission is None and not may_make:
@@ -123,7 +126,8 @@ class MissionRegistry:
                 mission.reports.complete(u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)
             ]
             full = request.model_copy(update={"uavs": uavs})
-        self._add(mission)
+        if mission_id not in self._missions:
+            self._add(mission)
         return mission, full
 
     async def put(self, mission_id: str, spec: MissionSpec) -> Mission:
@@ -206,9 +210,7 @@ class MissionRegistry:
         return mission
 
     def _add(self, mission: Mission) -> None:
-        """Add the mission, unless it is there. There is no await since the look-up, so no other can have its ID."""
-        if mission.mission_id in self._missions:
-            return
+        """Add a mission. There is no await since the look-up, so no other can have its ID."""
         if len(self._missions) + len(self._stored) >= self._settings.max_missions:
             limit = self._settings.max_missions
             raise Conflict(

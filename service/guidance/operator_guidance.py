@@ -18,12 +18,13 @@ class OperatorGuidance:
 
     Attributes:
         confirmed: the guidance that planner and scores follow; empty until the operator confirms one.
+        orders: the same; None where it orders nothing.
     """
 
     def __init__(self, note: str | None, scenario: Scenario) -> None:
         self.note = note
         self.status: GuidanceState = "none" if note is None else "compiling"
-        self.confirmed: Guidance = NO_GUIDANCE
+        self._obey(NO_GUIDANCE)
         self._scenario = scenario
         self._proposed: Guidance | None = None
         self._origin: Literal["llm", "operator"] | None = None
@@ -62,11 +63,16 @@ class OperatorGuidance:
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
             )
         if answer.answer != "reject":
-            self.status, self.confirmed = "confirmed", self._proposed
+            self.status = "confirmed"
+            self._obey(self._proposed)
             return
         if self.status != "proposed":
-            self.confirmed = NO_GUIDANCE
+            self._obey(NO_GUIDANCE)
         self.status = "rejected"
+
+    def _obey(self, guidance: Guidance) -> None:
+        self.confirmed = guidance
+        self.orders = guidance or None
 
     def report(self, mission_id: str) -> GuidanceStatus:
         """The body of ``GET /missions/{id}/guidance``."""
@@ -76,7 +82,7 @@ class OperatorGuidance:
             note=self.note,
             guidance=self._proposed,
             in_words=None if self._proposed is None else self._proposed.in_words(),
-            obeyed_in_words=self.confirmed.in_words() if self.confirmed else None,
+            obeyed_in_words=None if self.orders is None else self.orders.in_words(),
             origin=self._origin,
             model=self._model,
             failure=self._failure,
@@ -99,7 +105,7 @@ class OperatorGuidance:
         # Journals of earlier versions have no note: theirs is the spec's.
         self.note = state.get("note", self.note)
         self.status = state["status"]
-        self.confirmed = Guidance.model_validate(state["obeyed"])
+        self._obey(Guidance.model_validate(state["obeyed"]))
         proposed = state["understood"]
         self._proposed = None if proposed is None else Guidance.model_validate(proposed)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]

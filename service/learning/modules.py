@@ -39,7 +39,7 @@ class Sample:
     Attributes:
         features: of the admissible sensors, ``(n, d)``.
         chosen: row of the chosen sensor.
-        approach: the velocity module's input for that sensor, see :meth:`State.approach`.
+        approach: the velocity module's input for that sensor, see :meth:`State.approaches`.
         velocity: level that was flown.
     """
 
@@ -178,13 +178,14 @@ class Weights:
         return attend(self.attention, torch.from_numpy(features))
 
     @torch.inference_mode()
-    def velocities(self, z: Tensor, approach: Array) -> Tensor:
-        """Values ``(levels,)`` of the velocities for one sensor, from its context ``(d',)``."""
+    def velocities(self, contexts: Tensor, approaches: Array) -> list[Tensor]:
+        """Values ``(levels,)`` of the velocities for each of n sensors, from their contexts ``(n, d')``."""
         if self._velocity is None:
             velocity = slice(len(AttentionWeights._fields), None)
             self._velocity = VelocityWeights(*self.layout.views(self.flat, velocity))
         values = by_distance if self.layout.preset == "paper" else by_reach
-        return values(self._velocity, z, torch.from_numpy(approach))
+        # One after another: the last bits of a product depend on its size. No value may depend on the other sensors.
+        return [values(self._velocity, *pair) for pair in zip(contexts, torch.from_numpy(approaches), strict=True)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,8 @@ def can_plan(scenario: Scenario) -> bool:
     return small and find_spec("ortools") is not None
 
 
-class Planner:
-    """One mission's plan, renewed with the reports of the UAVs. Only the event loop uses it.
+class Planner(RecedingHorizon):
+    """One mission's plan, renewed with the reports of the UAVs. Only the event loop uses it; another thread searches.
 
     Args:
         scenario: the mission's world.
@@ -35,18 +35,13 @@ class Planner:
     """
 
     def __init__(self, scenario: Scenario, belief: FleetBelief) -> None:
-        self._belief = belief
-        self._horizon = RecedingHorizon(scenario, belief)
+        super().__init__(scenario, belief)
         self._lock = asyncio.Lock()
-
-    def begin(self, step: int) -> None:
-        """A UAV is at this step; the plan drops earlier ones."""
-        self._horizon.begin(step)
 
     def follow(self, guidance: Guidance) -> None:
         """Plan by this guidance from now on; the plans made before are dropped."""
-        self._horizon.guidance = guidance
-        self._horizon.plans.clear()
+        self.guidance = guidance
+        self.plans.clear()
 
     async def plan(self, uavs: Collection[int], reserved: Collection[int], seconds: float, executor: Executor) -> None:
         """Plan for UAVs that have no decision in this step yet; the search runs in the executor.
@@ -57,7 +52,7 @@ class Planner:
             seconds: wall clock for the search; the best plan until then counts.
         """
         async with self._lock:
-            horizon = self._horizon.copy()
+            horizon = self.copy()
 
             def search() -> tuple[Draft, Plan] | None:
                 draft = horizon.draft(uavs, reserved)
@@ -69,7 +64,7 @@ class Planner:
                 log.exception("the planner failed; decisions go on without it")
                 return
             if found is not None:
-                self._horizon.adopt(*found)
+                self.adopt(*found)
 
     def action(self, uav: int, reserved: Collection[int] = ()) -> Action | None:
         """The planned sensor and velocity of a UAV now.
@@ -77,12 +72,12 @@ class Planner:
         None without a plan of this step, where nothing is in reach, or where the sensor is reserved meanwhile.
         """
         last = self._belief.uavs.get(uav)
-        actions = self._horizon.plans.get(uav)
-        if last is None or last.step != self._horizon.step or actions is None or not len(actions):
+        actions = self.plans.get(uav)
+        if last is None or last.step != self.step or actions is None or not len(actions):
             return None
         sensor, velocity = actions[0].tolist()
         return None if sensor < 0 or sensor in reserved else Action(int(sensor), int(velocity))
 
-    def plans(self) -> dict[int, list[Action]]:
+    def actions(self) -> dict[int, list[Action]]:
         """The actions of each UAV from this step on; sensor -1 where nothing is in reach."""
-        return {uav: [Action(int(s), int(v)) for s, v in plan.tolist()] for uav, plan in self._horizon.plans.items()}
+        return {uav: [Action(int(s), int(v)) for s, v in plan.tolist()] for uav, plan in self.plans.items()}

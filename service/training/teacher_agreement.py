@@ -42,4 +42,4 @@ def velocity_agreement(weights: Weights, references: Sequence[TeacherDecision]) 
 def _best_velocity(weights: Weights, taught: TeacherDecision) -> int:
     sample = taught.sample
     _, z = weights.score(sample.features)
-    return int(weights.velocities(z[sample.chosen], sample.approach).argmax())
+    return int(weights.velocities(z[sample.chosen, None], sample.approach[None])[0].argmax())

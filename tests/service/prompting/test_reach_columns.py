@@ -44,7 +44,7 @@ def test_distances_are_those_of_the_world_after_the_step(told: bool) -> None:
         arrived = PATH.at(velocity * PAPER.step_s)
         for sensor, progress in enumerate((480.0, -300.0)):
             expected = math.dist(arrived, at(progress))
-            assert view.state.reach.distance[velocity, sensor] == pytest.approx(expected)
+            assert view.state.reach.links.distance[velocity, sensor] == pytest.approx(expected)
 
 
 def test_a_route_there_and_back_is_followed_the_way_that_the_uav_says() -> None:
@@ -60,7 +60,7 @@ def test_packets_are_at_most_the_queue_and_what_the_channel_moves() -> None:
     view = seen(on_lap([at(480.0), at(0.0), at(0.0)], [60.0, 7.0, 60.0]))
     reach = view.state.reach
     assert reach is not None
-    moved = packets_per_step(reach.distance, PAPER)
+    moved = packets_per_step(reach.links.distance, PAPER)
     np.testing.assert_array_equal(reach.packets, np.minimum([60.0, 7.0, 60.0], moved))
     assert reach.packets[0, 0] == 0 < reach.packets[14, 0]
     assert reach.packets[0, 1] == 7
@@ -72,8 +72,8 @@ def test_the_best_velocity_is_the_fastest_that_still_collects_an_urgent_queue() 
     assert reach is not None
     behind, ahead, empty = reach.best.tolist()
     assert 0 <= behind < 14
-    assert link_holds(reach.distance[behind, 0], PAPER)
-    assert link_holds(reach.distance[ahead, 1], PAPER)
+    assert link_holds(reach.links.distance[behind, 0], PAPER)
+    assert link_holds(reach.links.distance[ahead, 1], PAPER)
     assert empty == 14
     assert reach.best_packets[2] == 0
 
@@ -81,7 +81,7 @@ def test_the_best_velocity_is_the_fastest_that_still_collects_an_urgent_queue() 
 def test_a_uav_off_its_trajectory_has_its_present_position_at_every_velocity() -> None:
     reach = seen(uav()).state.reach
     assert reach is not None
-    np.testing.assert_allclose(reach.distance, np.tile([0.0, 100.0, 200.0, 300.0, 400.0, 500.0], (15, 1)))
+    np.testing.assert_allclose(reach.links.distance, np.tile([0.0, 100.0, 200.0, 300.0, 400.0, 500.0], (15, 1)))
     assert (reach.best == 14).all()
 
 
@@ -110,7 +110,7 @@ def test_the_papers_five_come_first_and_everything_lies_between_zero_and_one() -
     # No beacon but the first: the rate is the scenario's mean.
     np.testing.assert_allclose(added[:, 3], (60 - reach.queue) / 5.0 / 30, rtol=1e-6)
     assert added[:, 4].tolist() == link_holds(reach.distance, PAPER).tolist()
-    assert added[:, 5].tolist() == link_holds(reach.reach.distance[14], PAPER).tolist()
+    assert added[:, 5].tolist() == link_holds(reach.reach.links.distance[14], PAPER).tolist()
     np.testing.assert_allclose(added[:, 6], reach.distance / 360 / 2, rtol=1e-6)
 
 
@@ -123,13 +123,13 @@ def test_a_sensor_that_nothing_arrives_at_never_overflows() -> None:
 
 def test_the_velocity_scorer_is_told_what_each_level_brings() -> None:
     state = seen(on_lap([at(-300.0), at(480.0)], [60.0, 45.0])).state
-    told = state.approach(1, PAPER)
+    told = state.approaches([1], PAPER)[0]
     assert told.shape == (15, LEVEL_FEATURES)
     assert state.reach is not None
     np.testing.assert_allclose(told[:, 0], state.reach.packets[:, 1] / 60, rtol=1e-6)
     np.testing.assert_allclose(told[:, 1], state.urgency[1] * state.reach.packets[:, 1] / 60, rtol=1e-6)
     np.testing.assert_allclose(told[:, 2], np.arange(15) / 14, rtol=1e-6)
-    np.testing.assert_allclose(told[:, 3], np.minimum(state.reach.distance[:, 1] / 360, 2), rtol=1e-6)
+    np.testing.assert_allclose(told[:, 3], np.minimum(state.reach.links.distance[:, 1] / 360, 2), rtol=1e-6)
 
 
 def test_the_shipped_start_slows_down_for_a_full_queue_and_hurries_past_an_empty_one() -> None:
