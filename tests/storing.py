@@ -12,7 +12,7 @@ import msgpack
 
 from service.storage.locks import FileLock
 from service.storage.operations import Change
-from service.storage.sql_statements import Statements
+from service.storage.rows import Statements
 from service.storage.sqlite_process import Database
 from service.storage.store import Store
 from service.storage.writer import Done, WriteFailed

@@ -64,8 +64,14 @@ class RequestLimits:
                 body = await self._body(scope, receive, send)
                 if body is None:
                     return
-                receive = _replay(body, receive)
-            await self.app(scope, receive, send)
+                pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+                async def replayed() -> Message:
+                    return pending.pop() if pending else await receive()
+
+                await self.app(scope, replayed, send)
+            else:
+                await self.app(scope, receive, send)
         finally:
             self._running -= 1
 
@@ -120,15 +126,6 @@ class RequestLimits:
                 raise _TooLarge
             if not message.get("more_body", False):
                 return bytes(body)
-
-
-def _replay(body: bytes, receive: Receive) -> Receive:
-    pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
-
-    async def replayed() -> Message:
-        return pending.pop() if pending else await receive()
-
-    return replayed
 
 
 def _gunzip(body: bytes, limit: int) -> bytes:

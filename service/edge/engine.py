@@ -188,7 +188,10 @@ class Engine:
             began = time.perf_counter()
             stored = await self.journal.stored(min(_STORE_S, deadline.left()))
             waited_ms = round((time.perf_counter() - began) * 1e3, 3)
-            answers = [_stored(answer, stored, waited_ms) for answer in answers]
+            for index, answer in enumerate(answers):
+                total = round(answer.latency_ms["total"] + waited_ms, 3)
+                latency = {**answer.latency_ms, "store": waited_ms, "total": total}
+                answers[index] = answer.model_copy(update={"stored": stored, "latency_ms": latency})
             return answers
         finally:
             # The event loop sends the answer first.
@@ -256,10 +259,3 @@ class Engine:
         self._traces.decided(answer)
         logs.decided(answer)
         self.live.decided(task.mission, task.uav, decided.prompt, answer)
-
-
-def _stored(answer: DecideResponse, stored: bool, waited_ms: float) -> DecideResponse:
-    """The answer with the time that it waited for the disk, and whether it is there."""
-    total = round(answer.latency_ms["total"] + waited_ms, 3)
-    latency = {**answer.latency_ms, "store": waited_ms, "total": total}
-    return answer.model_copy(update={"stored": stored, "latency_ms": latency})

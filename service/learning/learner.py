@@ -48,12 +48,13 @@ class Learner:
             FloatingPointError: the gradient is not finite. The weights, which would be lost for good, do not change.
         """
         before = self.weights.flat
-        gradient, into = _buffers.of(self._layout)
+        gradient, into = _gradient_of(self._layout)
         gradient.zero_()
         loss = descend(self._layout.arrays(before), sample, -cost, into=into)
         if not np.isfinite(gradient.numpy()).all():
             raise FloatingPointError("the gradient of a training sample is not finite")
-        self._moments = self._moments or Moments.none(len(before))
+        if self._moments is None:
+            self._moments = Moments(torch.zeros(len(before)), torch.zeros(len(before)))
         self.weights = Weights(self._layout, adam_step(before, self._moments, gradient, self._learning_rate))
         # The loss comes first: a reader that sees the new count also sees the new loss.
         self.last_loss = loss
@@ -98,11 +99,6 @@ class Moments:
     mean: Tensor
     square: Tensor
     steps: int = 0
-
-    @classmethod
-    def none(cls, size: int) -> Moments:
-        """The moments before the first step."""
-        return cls(torch.zeros(size), torch.zeros(size))
 
 
 @torch.no_grad()
@@ -166,18 +162,16 @@ def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters
     return float(off_score * off_score + off_value * off_value)
 
 
-class _GradientBuffers(threading.local):
-    """A gradient for each thread and layout; a new one for each training sample would fragment the heap."""
+def _gradient_of(layout: Layout) -> tuple[Tensor, Parameters]:
+    """This thread's flat gradient for a layout, and its views by parameter.
 
-    def __init__(self) -> None:
-        self._buffers: dict[Layout, tuple[Tensor, Parameters]] = {}
-
-    def of(self, layout: Layout) -> tuple[Tensor, Parameters]:
-        """The flat gradient, and its views by parameter."""
-        if layout not in self._buffers:
-            gradient = torch.zeros(layout.size)
-            self._buffers[layout] = gradient, layout.arrays(gradient)
-        return self._buffers[layout]
+    A new one for each training sample would fragment the heap.
+    """
+    buffers: dict[Layout, tuple[Tensor, Parameters]] = _gradients.__dict__.setdefault("by_layout", {})
+    if layout not in buffers:
+        gradient = torch.zeros(layout.size)
+        buffers[layout] = gradient, layout.arrays(gradient)
+    return buffers[layout]
 
 
-_buffers = _GradientBuffers()
+_gradients = threading.local()

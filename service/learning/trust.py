@@ -87,6 +87,7 @@ class Trust:
         most_open: most decisions with a pending outcome; older ones are dropped.
 
     Attributes:
+        weights: each adviser's weight, 0..1.
         updates: number of outcomes that changed the weights.
     """
 
@@ -94,19 +95,14 @@ class Trust:
         self._open = BoundedDict[str, Advice](most_open)
         total = sum(prior.values())
         self._prior = {name: weight / total for name, weight in prior.items()}
-        self._weights = dict(self._prior)
+        self.weights = dict(self._prior)
         self._surprise = 0.0
         self.updates = 0
 
-    @property
-    def weights(self) -> dict[str, float]:
-        """Each adviser's weight, 0..1."""
-        return dict(self._weights)
-
     def among(self, names: Mapping[str, object]) -> dict[str, float]:
         """The weights of these advisers, scaled to sum to 1."""
-        total = sum(self._weights[name] for name in names)
-        return {name: self._weights[name] / total for name in names}
+        total = sum(self.weights[name] for name in names)
+        return {name: self.weights[name] / total for name in names}
 
     def note(self, decision_id: str, advice: Advice) -> None:
         """Store the advice until the decision's outcome is known."""
@@ -135,22 +131,22 @@ class Trust:
         """
         weights = self.among(regret)
         probability = max(_LEAST_PROBABILITY, sum(weights[name] * flown[name] for name in weights))
-        advising = sum(self._weights[name] for name in regret)
+        advising = sum(self.weights[name] for name in regret)
         updated = {}
         for name, weight in weights.items():
             loss = regret[name] + min(flown[name] / probability, 1.0 / _LEAST_PROBABILITY) * surprise
             updated[name] = weight * exp(-RATE * max(-CAP, min(CAP, loss)))
         total = sum(updated.values())
         prior = sum(self._prior[name] for name in updated)
-        for name in updated:
-            own = (1.0 - _SHARE) * updated[name] / total
-            self._weights[name] = advising * (own + _SHARE * self._prior[name] / prior)
+        own = {name: (1.0 - _SHARE) * weight / total for name, weight in updated.items()}
+        shifted = {name: advising * (own[name] + _SHARE * self._prior[name] / prior) for name in own}
+        self.weights = {**self.weights, **shifted}
         self.updates += 1
 
     def state_dict(self) -> dict[str, Any]:
         """The weights, the mean surprise and the pending advice, as copies."""
         return {
-            "weights": dict(self._weights),
+            "weights": dict(self.weights),
             "surprise": self._surprise,
             "updates": self.updates,
             "open": [(name, advice.state_dict()) for name, advice in self._open.items()],
@@ -160,7 +156,7 @@ class Trust:
         """Restore a state; one of other advisers is ignored."""
         if state["weights"].keys() != self._prior.keys():
             return
-        self._weights, self._surprise, self.updates = state["weights"], state["surprise"], state["updates"]
+        self.weights, self._surprise, self.updates = state["weights"], state["surprise"], state["updates"]
         self._open.clear()
         for name, advice in state["open"]:
             self._open[name] = Advice(**advice)

@@ -197,24 +197,35 @@ class Reservations:
         attempts = self._attempts.setdefault(step, {})
         number = 1 + max(attempts.get(uav_id, 0), 0 if answered is None else answered.attempt)
         attempts[uav_id] = number
-        _forget_earliest(self._attempts)
+        if len(self._attempts) > MAX_STEPS_APART:
+            del self._attempts[min(self._attempts)]
         return number
 
     def of(self, step: int, uav_id: int) -> Reservation | None:
         """The UAV's reservation at this step."""
         return next((own for own in self._by_step.get(step, ()) if own.uav_id == uav_id), None)
 
-    def reserve(self, step: int, reservation: Reservation) -> None:
-        """Reserve a sensor in place of the UAV's earlier one at this step; the attempt is no longer open."""
-        uav_id = reservation.uav_id
+    def reserve(self, step: int, reservation: Reservation) -> Reservation | None:
+        """Reserve a sensor in place of the UAV's earlier one at this step, which is returned.
+
+        The attempt is no longer open.
+
+        Raises:
+            Conflict: a later attempt of this UAV at this step already has its answer; nothing is reserved.
+        """
+        uav_id, earlier = reservation.uav_id, self.of(step, reservation.uav_id)
+        if earlier is not None and earlier.attempt > reservation.attempt:
+            raise Conflict("step", f"a later request of UAV {uav_id} for step {step} is already answered")
         others = tuple(other for other in self._by_step.get(step, ()) if other.uav_id != uav_id)
         self._by_step[step] = (*others, reservation)
-        _forget_earliest(self._by_step)
+        if len(self._by_step) > MAX_STEPS_APART:
+            del self._by_step[min(self._by_step)]
         attempts = self._attempts.get(step, {})
         if attempts.get(uav_id) == reservation.attempt:
             del attempts[uav_id]
             if not attempts:
                 del self._attempts[step]
+        return earlier
 
     def state_dict(self) -> dict[str, Any]:
         """Reservations and open attempts, as copies."""
@@ -233,8 +244,3 @@ class Reservations:
             for step, by_uav in state["given"].items()
         }
         self._attempts = state["attempts"]
-
-
-def _forget_earliest(by_step: dict[int, Any]) -> None:
-    while len(by_step) > MAX_STEPS_APART:
-        del by_step[min(by_step)]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from service.config.settings import Settings
-from service.errors import Conflict, Refused
+from service.errors import Refused
 from service.guidance.operator_guidance import OperatorGuidance
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
@@ -142,19 +142,15 @@ class Mission:
         Raises:
             Conflict: a later attempt of this UAV at this step already has its answer; nothing is recorded.
         """
-        earlier = self.reservations.of(decision.step, decision.uav_id)
-        if earlier is not None:
-            if earlier.attempt > attempt:
-                raise Conflict(
-                    "step", f"a later request of UAV {decision.uav_id} for step {decision.step} is already answered"
-                )
-            self.records.withdraw(earlier.sensor_id, earlier.decision_id)
         reservation = Reservation(decision.uav_id, decision.sensor_id, decision.decision_id, attempt)
-        self.reservations.reserve(decision.step, reservation)
+        earlier = self.reservations.reserve(decision.step, reservation)
+        forgotten = self.pending.add(decision)
+        if earlier is not None:
+            self.records.withdraw(earlier.sensor_id, earlier.decision_id)
         self.records.presume(decision.sensor_id, decision.decision_id, decision.step)
+        for old in forgotten:
+            self.records.confirm(old.sensor_id, old.decision_id, old.step)
         self.belief.tell(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
-        for forgotten in self.pending.add(decision):
-            self.records.confirm(forgotten.sensor_id, forgotten.decision_id, forgotten.step)
         self.decisions += 1
         if advice is not None:
             self.trust_in(advice.model).note(decision.decision_id, advice.advice)

@@ -18,7 +18,7 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.group_commit import GroupCommit
 from service.storage.operations import Checkpoint, Deleted, Entry, Made
-from service.storage.serialization import pack
+from service.storage.rows import pack
 from service.storage.store import Store
 
 log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class Journal:
             if mission_log.deleted:
                 return
             mission_log.seq += 1
-            mission_log.since_checkpoint += _weight(event)
+            mission_log.since_checkpoint += 1 if mission.scenario.sensors < _SENSORS else _weight(event)
             self._commits.add(Entry(mission.mission_id, mission_log.seq, event))
 
         mission.record = record

@@ -14,7 +14,7 @@ import msgpack
 
 from service.storage import sqlite_process
 from service.storage.operations import Change
-from service.storage.sql_statements import Statements
+from service.storage.rows import Statements
 from service.storage.sqlite_process import LENGTH
 from service.storage.writer import Done, WriteFailed
 

@@ -16,9 +16,8 @@ from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.locks import AdvisoryLock, FileLock, StoreUnusable
 from service.storage.process_writer import ProcessWriter
+from service.storage.rows import Statements, decode, unpack
 from service.storage.schema import SCHEMA, checkpoints, journal, missions, terms
-from service.storage.serialization import decode, unpack
-from service.storage.sql_statements import Statements
 from service.storage.sqlite_process import BUSY_MS, PRAGMAS
 from service.storage.thread_writer import ThreadWriter
 from service.storage.writer import Writer

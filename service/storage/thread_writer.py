@@ -12,7 +12,7 @@ from queue import SimpleQueue
 import sqlalchemy as sa
 
 from service.storage.operations import Change
-from service.storage.sql_statements import Statement, Statements
+from service.storage.rows import Statement, Statements
 from service.storage.writer import Done
 
 

@@ -25,7 +25,7 @@ from service.mission.events import Settled
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
 from service.prompting.token_accounting import UnprunedState
-from service.storage.serialization import decode, encode, pack
+from service.storage.rows import decode, encode, pack
 from shared.wire import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav

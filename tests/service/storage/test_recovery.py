@@ -23,7 +23,7 @@ from service.observability.metrics import Metrics
 from service.storage.journal import Journal
 from service.storage.operations import Change, Checkpoint, Entry
 from service.storage.recovery import restore_mission
-from service.storage.serialization import pack
+from service.storage.rows import pack
 from service.storage.store import Store, StoredMission
 from service.storage.writer import Done, WriteFailed, Writer
 from shared.actions import Action

@@ -1,0 +1,170 @@
+"""The store's rows: the SQL that writes changes in one dialect, and the file format of their bytes.
+
+Events and states are MessagePack, with numpy arrays as an extension type. Reading it runs no code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Literal
+
+import msgpack
+import numpy as np
+import sqlalchemy as sa
+
+from service.learning.trust import Advice
+from service.mission.decisions import Pending
+from service.mission.events import AdviserReport, Decided, Event, Guided, Reported, Settled
+from service.mission.idempotency import Answered
+from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
+from service.storage.schema import checkpoints, journal, missions
+from shared.wire import Outcome, UavState
+
+# The extension type of an array.
+_ARRAY = 1
+# A request also carries an outcome, which is an event of its own, and its encoding, which is of no use later.
+_REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink"}
+# The fields of an outcome that change a mission's state.
+_OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}
+
+Kind = Literal["reported", "decided", "settled", "guided", "answered"]
+# SQL for the database's driver, and the rows of its parameters.
+Statement = tuple[str, list[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Compiled:
+    """SQL, and the names of its parameters if the driver wants names."""
+
+    sql: str
+    names: tuple[str, ...] | None
+
+    def of_one_row(self, *values: Any) -> Statement:
+        return self.sql, [values if self.names is None else dict(zip(self.names, values, strict=True))]
+
+
+class Statements:
+    """SQL in one dialect. Each statement is idempotent, for a writer that does not know whether it was committed.
+
+    The SQL is compiled once: making and running statements by SQLAlchemy is a large part of a commit's time.
+    """
+
+    def __init__(self, dialect: sa.Dialect) -> None:
+        self._dialect = dialect
+        # "On conflict" is not generic SQL; SQLAlchemy has imported the dialect in use already.
+        insert: Any = import_module(f"sqlalchemy.dialects.{dialect.name}").insert
+        put = insert(checkpoints)
+        newer = {"seq": put.excluded.seq, "state": put.excluded.state}
+        put = put.on_conflict_do_update(index_elements=["mission_id"], set_=newer)
+        of: sa.BindParameter[str] = sa.bindparam("of")
+        until: sa.BindParameter[int] = sa.bindparam("until")
+        self._made = self._compiled(insert(missions).on_conflict_do_nothing(), *missions.c.keys())
+        self._entry = self._compiled(insert(journal).on_conflict_do_nothing(), *journal.c.keys())
+        self._checkpoint = self._compiled(put, *checkpoints.c.keys())
+        covered = sa.delete(journal).where((journal.c.mission_id == of) & (journal.c.seq <= until))
+        self._covered = self._compiled(covered, "of", "until")
+        self._deleted = [
+            self._compiled(sa.delete(table).where(table.c.mission_id == of), "of")
+            for table in (missions, checkpoints, journal)
+        ]
+
+    def of(self, changes: Sequence[Change]) -> list[Statement]:
+        """The statements that make the changes in their order; consecutive events share one statement."""
+        statements: list[Statement] = []
+        entries: list[Any] | None = None
+        for change in changes:
+            if not isinstance(change, Entry):
+                entries = None
+                statements.extend(self._of(change))
+                continue
+            if entries is None:
+                entries = []
+                statements.append((self._entry.sql, entries))
+            values = (change.mission_id, change.seq, *encode(change.event))
+            names = self._entry.names
+            entries.append(values if names is None else dict(zip(names, values, strict=True)))
+        return statements
+
+    def _of(self, change: Made | Checkpoint | Deleted) -> list[Statement]:
+        match change:
+            case Made(mission_id, asked_for, spec):
+                return [self._made.of_one_row(mission_id, asked_for.model_dump_json(), spec.model_dump_json())]
+            case Checkpoint(mission_id, seq, state):
+                return [self._checkpoint.of_one_row(mission_id, seq, state), self._covered.of_one_row(mission_id, seq)]
+            case Deleted(mission_id):
+                return [deleted.of_one_row(mission_id) for deleted in self._deleted]
+
+    def _compiled(self, statement: sa.UpdateBase, *names: str) -> _Compiled:
+        keys = names if isinstance(statement, sa.Insert) else None
+        sql = str(statement.compile(dialect=self._dialect, column_keys=keys))
+        return _Compiled(sql, None if self._dialect.positional else names)
+
+
+def encode(event: Event) -> tuple[Kind, bytes]:
+    """An event's kind, and its body as bytes."""
+    match event:
+        case Reported(step, uav):
+            return "reported", pack([step, uav.model_dump(include=_REPORT, exclude_defaults=True)])
+        case Decided(decision, attempt, report):
+            packed = None if report is None else [report.model, report.advice.state_dict()]
+            return "decided", pack([decision.state_dict(), attempt, packed])
+        case Settled(outcome, used_for_training):
+            return "settled", pack([outcome.model_dump(include=_OUTCOME), used_for_training])
+        case Guided(state):
+            return "guided", pack(state)
+        case Answered(key, digest, answer):
+            return "answered", pack([key, digest, answer])
+
+
+def decode(kind: str, data: bytes) -> Event:
+    """The event of a kind and a body; raises ``ValueError`` for damaged or unknown ones."""
+    try:
+        body = unpack(data)
+        match kind:
+            case "reported":
+                return Reported(body[0], UavState.model_validate(body[1]))
+            case "decided":
+                report = None if body[2] is None else AdviserReport(body[2][0], Advice(**body[2][1]))
+                return Decided(Pending.of(body[0]), body[1], report)
+            case "settled":
+                return Settled(Outcome.model_validate(body[0]), body[1])
+            case "guided":
+                return Guided(body)
+            case "answered":
+                return Answered(*body)
+    except (AttributeError, IndexError, KeyError, TypeError) as damaged:
+        raise ValueError(f"damaged event {kind}: {damaged}") from damaged
+    raise ValueError(f"unknown event {kind}")
+
+
+def pack(value: Any) -> bytes:
+    """Bytes of nested dicts, lists, numbers, strings and arrays; raises ``TypeError`` for anything else."""
+    packed: bytes = msgpack.packb(value, default=_default)
+    return packed
+
+
+def unpack(data: bytes) -> Any:
+    """The value that was packed, with lists for tuples; raises ``ValueError`` for damaged bytes."""
+    try:
+        return msgpack.unpackb(data, ext_hook=_array, strict_map_key=False)
+    except (TypeError, msgpack.UnpackException) as damaged:
+        raise ValueError(f"damaged bytes: {damaged}") from damaged
+
+
+def _default(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return msgpack.ExtType(_ARRAY, msgpack.packb((value.dtype.str, value.shape, value.tobytes())))
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} cannot be stored")
+
+
+def _array(code: int, data: bytes) -> Any:
+    if code != _ARRAY:
+        raise ValueError(f"unknown extension type {code}")
+    dtype, shape, raw = msgpack.unpackb(data)
+    if np.dtype(dtype).hasobject:
+        raise ValueError(f"an array of {dtype} cannot be read")
+    return np.frombuffer(raw, dtype=dtype).reshape(shape).copy()
