@@ -89,7 +89,7 @@ class RadioFailures:
 
     def __init__(self, sensors: int) -> None:
         self._odds: FloatArray = np.full(sensors, _PRIOR)
-        self._step = 0
+        self.step = 0
         self.none = True
 
     def settle(self, sensor: int, failed: bool) -> None:
@@ -101,12 +101,11 @@ class RadioFailures:
         self._odds[sensor] = min(max(odds, _PRIOR), _MOST)
 
     def advance(self, step: int) -> None:
-        """Go to a step: the evidence of earlier ones counts less."""
-        if step > self._step:
-            if not self.none:
-                self._odds = np.maximum(self._odds - _FORGET * (step - self._step), _PRIOR)
-                self.none = bool((self._odds <= _PRIOR).all())
-            self._step = step
+        """Go to a later step: the evidence of earlier ones counts less."""
+        if not self.none:
+            self._odds = np.maximum(self._odds - _FORGET * (step - self.step), _PRIOR)
+            self.none = bool((self._odds <= _PRIOR).all())
+        self.step = step
 
     def alive(self, which: slice | IntArray = slice(None)) -> FloatArray:
         """The probability that each radio works, of all sensors or of those named; 1 for one that never failed."""
@@ -120,11 +119,11 @@ class RadioFailures:
 
     def state_dict(self) -> dict[str, Any]:
         """The odds, as a copy."""
-        return {"odds": self._odds.copy(), "step": self._step, "none": self.none}
+        return {"odds": self._odds.copy(), "step": self.step, "none": self.none}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the odds."""
-        self._odds, self._step, self.none = state["odds"], state["step"], state["none"]
+        self._odds, self.step, self.none = state["odds"], state["step"], state["none"]
 
 
 class LearnedChannel:

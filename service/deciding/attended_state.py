@@ -104,7 +104,7 @@ class AttendedState:
     @cached_property
     def reach(self) -> Reach:
         """The UAV's reach after the next step, whatever the mission's features are."""
-        return self.state.reach_ahead(self.uav_id, self.mission.scenario)
+        return self.state.reach or self.state.reach_ahead(self.uav_id, self.mission.scenario)
 
     @property
     def kept_ids(self) -> list[int]:

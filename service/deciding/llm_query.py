@@ -7,7 +7,6 @@ import logging
 import math
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -76,13 +75,14 @@ class LlmAdvice:
 class _Answer:
     """A query's answer: the probabilities of each UAV's labels, or the reason why there are none.
 
-    ``model`` is the LLM that answered, or would have.
+    ``model`` is the LLM that answered, or would have; ``to_calibrate`` says that its bias can be measured and is not.
     """
 
     completion: Completion | None
     by_label: list[dict[str, float]] | None
     reason: Reason | None
     calibrated: bool
+    to_calibrate: bool
     model: str | None
 
 
@@ -120,11 +120,10 @@ class LlmQueries:
         if not mission.prompt_fits:
             return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
         answer = await self._query(mission, prompt.static, prompt.user, [list(candidates.labels)], deadline)
-        probabilities = None
-        if answer.by_label is not None:
+        if answer.to_calibrate:
             template = template_of(mission)
-            self._labels.calibrate(answer.model, prompt.static, template.content_free, [template.labels])
-            probabilities = candidates.by_action(answer.by_label[0])
+            self._labels.calibrate(answer.model, prompt.static, template.content_free(), [template.labels])
+        probabilities = None if answer.by_label is None else candidates.by_action(answer.by_label[0])
         return LlmAdvice(prompt, probabilities, answer.reason, answer.completion, answer.calibrated, answer.model)
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
@@ -156,8 +155,8 @@ class LlmQueries:
         self._note_lateness(len(asked), answer.reason)
         if answer.reason is not None and answer.reason != "llm_timeout":
             return {}
-        if answer.by_label is not None:
-            texts = partial(template.content_free, list(asked))
+        if answer.to_calibrate:
+            texts = template.content_free(list(asked))
             self._labels.calibrate(answer.model, static, texts, [template.labels] * len(asked))
         advice = {}
         for index, (uav, (_, candidates)) in enumerate(asked.items()):
@@ -186,9 +185,10 @@ class LlmQueries:
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()
         if completion is None:
-            return _Answer(None, None, reason, calibrated=False, model=self._llm.model)
-        calibrated = self._labels.bias(completion, static, len(labels)) is not None
-        return _Answer(completion, by_label, reason, calibrated, completion.model)
+            return _Answer(None, None, reason, calibrated=False, to_calibrate=False, model=self._llm.model)
+        known = bool(completion.positions) and self._labels.bias(completion.model, static, len(labels)) is not None
+        unknown = by_label is not None and bool(completion.positions) and not known
+        return _Answer(completion, by_label, reason, calibrated=known, to_calibrate=unknown, model=completion.model)
 
     async def _within(self, query: Coroutine[Any, Any, Completion], deadline: Deadline) -> Completion:
         if len(self._waiting) >= self._limit:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from service.llm.answers import Completion, NoDecision, check_labels
 from service.llm.server_pool import ServerPool
@@ -83,33 +83,31 @@ class LabelReader:
         self._attempts: dict[_Question, int] = {}
         self._task: asyncio.Task[None] | None = None
 
-    def bias(self, completion: Completion, static: str, lists: int = 1) -> list[dict[str, float]] | None:
-        """The bias of the model that answered, by list; None until it is measured, and without token probabilities."""
-        return self._bias.get((completion.model, static, lists)) if completion.positions else None
+    def bias(self, model: str | None, static: str, lists: int = 1) -> list[dict[str, float]] | None:
+        """A model's bias under a static block, by list; None until it is measured."""
+        return self._bias.get((model, static, lists))
 
     def read(self, completion: Completion, static: str, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
         """The labels' probabilities by list, calibrated once the bias is known; raises :class:`NoDecision`."""
         measured = probabilities(completion, lists)
-        bias = self.bias(completion, static, len(lists))
+        bias = self.bias(completion.model, static, len(lists)) if completion.positions else None
         if bias is None:
             return measured
         return [calibrated(*pair) for pair in zip(measured, bias, strict=True)]
 
-    def calibrate(
-        self, model: str | None, static: str, texts: Callable[[], Sequence[str]], lists: Sequence[Sequence[str]]
-    ) -> None:
-        """Measure a model's bias in the background, unless it is known, under way, or impossible to measure.
+    def calibrate(self, model: str | None, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
+        """Measure the bias of a model that gives probabilities in the background, unless it is known or under way.
 
         Args:
-            texts: returns content-free user messages.
+            texts: content-free user messages.
             lists: every label that a request under this static block can offer, by list.
         """
         key = (model, static, len(lists))
         busy = self._task is not None and not self._task.done()
-        if busy or key in self._bias or not self._llm.logprobs or self._attempts.get(key, 0) >= _ATTEMPTS:
+        if busy or key in self._bias or self._attempts.get(key, 0) >= _ATTEMPTS:
             return
         self._attempts[key] = self._attempts.get(key, 0) + 1
-        self._task = asyncio.create_task(self._measure(key, texts(), lists), name="calibration")
+        self._task = asyncio.create_task(self._measure(key, texts, lists), name="calibration")
 
     async def close(self) -> None:
         """Cancel the measurement."""

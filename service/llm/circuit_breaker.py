@@ -15,18 +15,25 @@ _PAUSE_S, _LONGEST_PAUSE_S = 5.0, 60.0
 
 
 class CircuitBreaker:
-    """Counts the failures of one LLM."""
+    """Counts the failures of one LLM.
+
+    Attributes:
+        troubled: whether there was a failure since the last answer.
+    """
 
     def __init__(self) -> None:
         self._failures = 0
         self._openings = 0
+        self.troubled = False
 
     def answered(self) -> None:
         """Count an answer."""
         self._failures = self._openings = 0
+        self.troubled = False
 
     def failed(self) -> bool:
         """Count a failure; returns whether it opens the breaker."""
+        self.troubled = True
         self._failures += 1
         if self._failures < (1 if self._openings else _FAILURES):
             return False
@@ -49,23 +56,22 @@ class SilenceCounter:
 
     Args:
         failure_s: seconds of silence that are one failure.
+
+    Attributes:
+        answered_at: when the last call was answered, seconds of any steady clock.
     """
 
     def __init__(self, failure_s: float) -> None:
         self._failure_s = failure_s
         self._silent_s = 0.0
-        self._answered_at = self._counted_until = -math.inf
-
-    def answered(self, now: float) -> None:
-        """A call was answered at ``now``, seconds of any steady clock."""
-        self._answered_at, self._silent_s = now, 0.0
-
-    def answered_since(self, begun: float) -> bool:
-        """Whether a call was answered after ``begun``."""
-        return self._answered_at > begun
+        self.answered_at = self._counted_until = -math.inf
 
     def cancelled(self, begun: float, now: float) -> bool:
         """Count a call that was cancelled while it waited; returns whether the silence is a failure now."""
+        if self.answered_at > begun:
+            return False
+        if self.answered_at > self._counted_until:
+            self._silent_s = 0.0
         self._silent_s += now - max(begun, self._counted_until)
         self._counted_until = now
         if self._silent_s < self._failure_s:

@@ -200,14 +200,15 @@ class LlmServer:
             self._failed(error.reason)
             raise
         except asyncio.CancelledError as cancelled:
-            if silence is None or EARLIER_CALL_ANSWERED in cancelled.args or silence.answered_since(begun):
+            if silence is None or EARLIER_CALL_ANSWERED in cancelled.args:
                 raise
             if silence.cancelled(begun, time.monotonic()):
                 self._failed("llm_timeout")
             raise
         else:
-            self._breaker.answered()
-            self._silence.answered(time.monotonic())
+            if self._breaker.troubled:
+                self._breaker.answered()
+            self._silence.answered_at = time.monotonic()
             return answer
         finally:
             self._decisions -= 1

@@ -49,11 +49,6 @@ class ServerPool:
         return self.active.model
 
     @property
-    def logprobs(self) -> bool:
-        """Whether the active server gives the probabilities of tokens."""
-        return self.active.logprobs
-
-    @property
     def max_uavs_per_call(self) -> int:
         """Number of UAVs that one call of the active server may decide for."""
         return self.active.max_uavs_per_call

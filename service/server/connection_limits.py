@@ -68,7 +68,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         self._unfinished = 0 if self._completed else self._unfinished + len(data)
         if self._unfinished > _MOST_BYTES and not self.transport.is_closing():
             self._refuse()
-        if self._answering:
+        if self.cycle is not None and not self.cycle.response_complete:
             self._stop_timer()
         elif self._timer is None:
             # uvicorn's own timer ends with the first byte of the next request.
@@ -101,13 +101,9 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         else:
             super().send_400_response(msg)
 
-    @property
-    def _answering(self) -> bool:
-        return self.cycle is not None and not self.cycle.response_complete
-
     def _refuse(self) -> None:
         # While another answer is due or has begun, the connection is closed without a 431.
-        if not self._answering:
+        if self.cycle is None or self.cycle.response_complete:
             self.transport.write(_refusal(self.server_state.default_headers))
         self.transport.close()
 

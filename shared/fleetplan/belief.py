@@ -190,7 +190,8 @@ class FleetBelief:
         served = {(visit.sensor, visit.step) for visit in visits if visit is not None and visit.collected}
         for uav in flying:
             self._fly(uav, served)
-        self.channel.failures.advance(step)
+        if step > self.channel.failures.step:
+            self.channel.failures.advance(step)
 
     def _fly(self, uav: int, served: set[tuple[int, int]]) -> None:
         """Fly one UAV's decision; ``served`` has the sensors and steps of the fleet's successful visits."""
