@@ -25,7 +25,7 @@ from service.observability.metrics import Metrics
 from service.observability.tracing import Traced, Traces, provider_from_environment
 from service.prompting.token_accounting import TokenCounter
 from service.prompting.warm_up import warm_up
-from service.server.security_headers import SecurityHeaders
+from service.server.middleware import SecurityHeaders
 from service.storage.store import Store
 
 

@@ -1,8 +1,12 @@
-"""Advisers of mode ``guided`` that need no LLM: each prefers some sensor-velocity pairs to others."""
+"""Advisers of mode ``guided`` that need no LLM: each prefers some sensor-velocity pairs to others.
+
+One of them is the LLM-free policy, :func:`look_ahead`: in every mode it is what the edge answers when the LLM is late,
+wrong or down and there is no plan.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,10 +15,11 @@ from numpy.typing import NDArray
 from scipy.special import softmax
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.look_ahead import look_ahead
+from service.guidance.step_guidance import StepGuidance
 from service.learning.trust import PLANNER
 from shared.actions import Action
 from shared.channel import FloatArray
+from shared.features import Reach, State
 
 # In units of the value regression's target, minus the cost.
 _VALUE_TEMPERATURE = 0.05
@@ -79,6 +84,31 @@ def _by_value(state: AttendedState) -> Preference:
 def _by_look_ahead(state: AttendedState) -> Preference:
     """The LLM-free policy's action."""
     return OneAction(look_ahead(state.state, state.reach, state.reserved, state.guidance))
+
+
+def look_ahead(state: State, reach: Reach, reserved: Collection[int], guidance: StepGuidance | None = None) -> Action:
+    """One step of look-ahead over every velocity and every sensor heard, free and with a battery.
+
+    Maximises ``U_j min(q_j, packets movable from the new position) + 0.5 v``; a sensor out of reach from there is
+    worth nothing, so that the UAV flies on where there is little to collect. A UAV that is not on its scenario's
+    trajectory flies an unknown one: then the most urgent sensor in radio range now, at full speed. Among equals,
+    the nearest.
+
+    Args:
+        reach: of this state, as :meth:`State.reach_ahead` has it.
+        reserved: sensors that other UAVs have in this step.
+        guidance: adds to the worth; a velocity that it forbids is never flown.
+
+    Returns:
+        sensor ID and velocity in m/s. A reserved sensor only where every sensor is reserved.
+    """
+    free = ~np.isin(state.ids, list(reserved))
+    if not free.any():
+        free[:] = True
+    worth = reach.worth if guidance is None else reach.worth + guidance.worth
+    worth = np.where(free, worth - 1e-9 * reach.links.distance, -np.inf)
+    level, row = np.unravel_index(int(worth.argmax()), worth.shape)
+    return Action(int(state.ids[row]), int(level))
 
 
 # By their names in the trust, the response and the metrics, in the order of the response.

@@ -93,7 +93,7 @@ class LlmQueries:
         self._llm = llm
         self._limit = limit
         self._metrics = metrics
-        self._labels = LabelReader(llm)
+        self._labels = LabelReader(llm.ask_labels)
         self._late = 0
         self._waiting: set[asyncio.Timeout] = set()
         self._closing = False

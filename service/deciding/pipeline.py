@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 from service.config.cores import usable_cores
 from service.config.settings import Settings
+from service.deciding.advisers import look_ahead
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmQueries
-from service.deciding.look_ahead import look_ahead
 from service.deciding.modes import Guided, Llm, Mode, Policy, Value
 from service.mission.events import AdviserReport
 from service.mission.mission import Mission

@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 
 from shared.actions import Action
 from shared.channel import FloatArray
-from shared.features import VELOCITY_BONUS
+from shared.features import VELOCITY_BONUS, urgency
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.arrivals import Arrivals
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
 from shared.learned_channel import nearly_normal_below
 from shared.scenario import Scenario
-from shared.urgency import urgency
 
 # Steps. Losses after the horizon do not count, because the positions where look-ahead leaves the UAVs are arbitrary.
 # The planner's horizon has four more steps without visits. With these the evaluator rated a planner's action 1.3
@@ -331,7 +330,7 @@ class _RolloutBatch:
         return np.asarray((over * self._weights).sum(axis=1) + late)
 
     def _look_ahead(self, uav: int, served: NDArray[np.bool_]) -> None:
-        """One step of look-ahead, as in :func:`service.deciding.look_ahead.look_ahead`."""
+        """One step of look-ahead, as in :func:`service.deciding.advisers.look_ahead`."""
         if not len(self._columns):
             return
         ahead = self._ahead[uav][self._flown[uav]]

@@ -11,9 +11,9 @@ import numpy as np
 from service.mission.mission import Mission
 from shared.bounded import BoundedDict
 from shared.channel import FloatArray
+from shared.features import overflow_probability
 from shared.fleetplan import FleetBelief
 from shared.scenario import Scenario
-from shared.urgency import overflow_probability
 from shared.wire import UavState
 
 # Missions that are watched, and the steps that are remembered of each.

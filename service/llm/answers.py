@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from shared.actions import Action
@@ -97,15 +97,3 @@ def _two_integers(text: str) -> tuple[int, int]:
         if len(answer) == 2 and all(type(value) is int for value in values):
             return values[0], values[1]
     raise NoDecision("answer_format", repr(text[:80]))
-
-
-def check_labels(text: str, lists: Sequence[Collection[str]]) -> list[str]:
-    """The label that a text names for each list, one a line.
-
-    Raises:
-        NoDecision: the text names more or fewer labels, or one that its list does not have.
-    """
-    labels = text.split()
-    if len(labels) != len(lists) or any(label not in offered for label, offered in zip(labels, lists, strict=True)):
-        raise NoDecision("answer_format", repr(text[:80]))
-    return labels

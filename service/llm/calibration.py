@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
-from service.llm.answers import Completion, NoDecision, check_labels
-from service.llm.server_pool import ServerPool
+from service.llm.answers import Completion, NoDecision
 from shared.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
@@ -29,6 +28,8 @@ _TINY = 1e-12
 _MOST_BIASES = 64
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
+# Asks the LLM: a static block, a user message, and the lists of labels.
+Ask = Callable[[str, str, Sequence[Sequence[str]]], Awaitable[Completion]]
 # The model, the static block, and the number of lists of labels.
 _Question = tuple[str | None, str, int]
 
@@ -64,6 +65,18 @@ def _filled(found: Mapping[str, float], labels: Collection[str]) -> dict[str, fl
     return _normalised({label: found.get(label) or least for label in labels})
 
 
+def check_labels(text: str, lists: Sequence[Collection[str]]) -> list[str]:
+    """The label that a text names for each list, one a line.
+
+    Raises:
+        NoDecision: the text names more or fewer labels, or one that its list does not have.
+    """
+    labels = text.split()
+    if len(labels) != len(lists) or any(label not in offered for label, offered in zip(labels, lists, strict=True)):
+        raise NoDecision("answer_format", repr(text[:80]))
+    return labels
+
+
 def calibrated(measured: Mapping[str, float], bias: Mapping[str, float]) -> dict[str, float]:
     """``p(a) / b(a)``, renormalised; the bias is normalised over the offered labels first."""
     offered = _normalised({label: bias[label] for label in measured})
@@ -77,8 +90,8 @@ class LabelReader:
     A request has one or several lists of labels; its answer names one label of each list.
     """
 
-    def __init__(self, llm: ServerPool) -> None:
-        self._llm = llm
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
         self._bias = BoundedDict[_Question, list[dict[str, float]]](_MOST_BIASES)
         self._attempts: dict[_Question, int] = {}
         self._task: asyncio.Task[None] | None = None
@@ -118,7 +131,7 @@ class LabelReader:
     async def _measure(self, key: _Question, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
             async with asyncio.timeout(_TIMEOUT_S):
-                answers = [await self._llm.ask_labels(key[1], text, lists) for text in texts]
+                answers = [await self._ask(key[1], text, lists) for text in texts]
             measured = [probabilities(answer, lists) for answer in answers]
         except (NoDecision, TimeoutError) as error:
             log.warning("label bias not measured: %s", error)

@@ -6,7 +6,8 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from service.llm.answers import NoDecision, NotUnderstood, check_labels
+from service.llm.answers import NoDecision, NotUnderstood
+from service.llm.calibration import check_labels
 from service.llm.request_bodies import Constraint, chat_body, label_body
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from starlette.applications import Starlette
 
 from service.observability import logs
 from service.server.connection_limits import BoundedHttpProtocol
-from service.server.startup_gate import StartupGate
+from service.server.middleware import StartupGate
 
 # At shutdown, the longest time from an accepted connection to the first bytes of its request.
 _ARRIVING_S = 0.25

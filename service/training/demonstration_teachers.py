@@ -9,7 +9,7 @@ from itertools import groupby
 import numpy as np
 
 from service.config.settings import Settings
-from service.deciding.look_ahead import look_ahead
+from service.deciding.advisers import look_ahead
 from service.mission.mission import Mission
 from service.prompting.demonstrations import Demonstration
 from service.training.recorded_states import recorded_states

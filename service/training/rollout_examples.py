@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from service.config.settings import Settings
+from service.deciding.advisers import look_ahead
 from service.deciding.attended_state import AttendedState
-from service.deciding.look_ahead import look_ahead
 from service.learning.modules import Sample
 from service.mission.mission import Mission
 from service.training.recorded_states import recorded_states

@@ -21,7 +21,7 @@ def look_ahead(problem: FleetProblem) -> IntArray:
 
     Step by step and in the order of their indices, every UAV takes the sensor and the velocity of greatest
     ``U_j min(q_j, packets movable from the new position) + 0.5 v``, with the urgency
-    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.urgency`, with a normal of the same mean for its Poisson.
+    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.features`, with a normal of the same mean for its Poisson.
     No two UAVs take a sensor in the same step. Batteries are assumed to last. A sensor's urgent packets have the weight
     of its lost ones, and for a sensor in reach the price of being overdue counts too.
     """

@@ -2,8 +2,7 @@ import numpy as np
 
 from shared.actions import Action
 from shared.channel import channel_gain_db
-from shared.features import FEATURES
-from shared.urgency import urgency
+from shared.features import FEATURES, urgency
 from tests.service.making import PAPER, attended, mission, uav
 
 

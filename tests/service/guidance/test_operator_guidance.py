@@ -12,8 +12,8 @@ from fastapi.responses import Response
 from numpy.typing import NDArray
 
 from service.config.settings import Settings
+from service.deciding.advisers import look_ahead
 from service.deciding.deliberation import Deliberation
-from service.deciding.look_ahead import look_ahead
 from service.deciding.rollout_evaluator import RolloutState, evaluate
 from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.commands.demonstrate import main
-from service.deciding.look_ahead import look_ahead
+from service.deciding.advisers import look_ahead
 from service.errors import Refused
 from service.prompting.demonstrations import packaged
 from service.training.demonstration_teachers import TEACHERS, farthest_first, point, solutions

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from service.deciding.look_ahead import look_ahead
+from service.deciding.advisers import look_ahead
 from shared.channel import link_holds
 from shared.features import State
 from shared.trajectory import trajectories

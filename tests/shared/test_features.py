@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import pdtrc
 
+from shared.features import above_by_sum, overflow_probability, urgency
 from shared.scenario import SCENARIOS, Scenario
-from shared.urgency import above_by_sum, overflow_probability, urgency
 
 PAPER = SCENARIOS["paper"]
 

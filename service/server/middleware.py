@@ -1,4 +1,4 @@
-"""The application while the edge loads: it answers ``GET /healthz``, and every other request waits.
+"""What the server puts around the application: security headers, and the wait while the edge loads.
 
 It imports nothing that takes long, torch above all.
 """
@@ -11,11 +11,37 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.datastructures import MutableHeaders
 from starlette.responses import JSONResponse
-from starlette.types import Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.server.security_headers import SecurityHeaders
 from shared.wire import Problem
+
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+    "X-Frame-Options": "DENY",
+}
+
+
+class SecurityHeaders:
+    """Pure ASGI middleware: a browser does not cache answers, frame them, or guess another content type."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    # A plain function that returns the application's coroutine: a request resumes one coroutine less.
+    def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        return self.app(scope, receive, send_with_headers if scope["type"] == "http" else send)
+
 
 # The same answer as that of service.api.routes: the process lives.
 _ALIVE = SecurityHeaders(JSONResponse({"status": "ok"}))

@@ -17,7 +17,7 @@ from starlette.types import Receive, Scope, Send
 
 from service.api.app import create_app
 from service.config.settings import Settings
-from service.server.startup_gate import StartupGate
+from service.server.middleware import StartupGate
 from tests.running import serving
 from tests.waiting import PATIENCE_S, Gate, until
 
@@ -113,7 +113,7 @@ def test_nothing_slow_is_imported_before_the_first_answer() -> None:
             sys.executable,
             "-c",
             "import sys, uvicorn, service.commands.serve, service.config.settings\n"
-            "import service.observability.logs, service.server.startup_gate\n"
+            "import service.observability.logs, service.server.middleware\n"
             f"print([name for name in {slow} if name in sys.modules])",
         ],
         capture_output=True,
