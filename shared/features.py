@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
@@ -197,14 +197,16 @@ class State:
         if self.reach is not None:
             return self.reach
         ahead = places_ahead(uav_id, self.position, self.progress_m, scenario, self.drift)
-        links = _links(self.channel, ahead, distances_between(ahead, self.places), self.ids, scenario)
+        links = self.links(ahead, distances_between(ahead, self.places), slice(None), scenario)
         return Reach.of(links, np.where(self.able, self.queue, 0.0), self.urgency)
 
     def links(
-        self, places: FloatArray, distance: FloatArray, rows: NDArray[np.int64], scenario: Scenario
+        self, places: FloatArray, distance: FloatArray, rows: NDArray[np.int64] | slice, scenario: Scenario
     ) -> ExpectedLinks:
         """The expected links from the UAV's places ``(P, 2)`` to the sensors in n rows, at distances ``(P, n)``."""
-        return _links(self.channel, places, distance, self.ids[rows], scenario)
+        if self.channel is None:
+            return ExpectedLinks.by_formula(distance, scenario)
+        return self.channel.links(places, distance, self.ids[rows])
 
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """Attention's input for the n admissible sensors, ``(n, d)``, each number 0..1.
@@ -271,58 +273,39 @@ def augment(
     sensors = uav.sensors
     ids = np.asarray(sensors.id, dtype=np.int64)
     queue, battery, gain, beacon = beacon_columns(sensors)
-    heard, fresh = beacon >= 0, beacon == step
+    heard = beacon >= 0
     position = (uav.position[0], uav.position[1])
     places = np.array((sensors.x, sensors.y), dtype=np.float64).T
     distance = np.sqrt(np.square(places - position).sum(axis=1))
     if belief is None:
         assert rates is not None
-        rate = rates[ids]
+        rate, expected = rates[ids], channel_gain_db(distance, scenario)
     else:
+        expected = belief.channel.gain_db(np.asarray(position), distance, ids)
         heard = np.ones_like(heard)
         coming = belief.arrivals.coming(step, scenario.overflow_horizon_steps)
         queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], coming[ids]
     overflow = overflow_probability(queue, rate, scenario)
     urgencies = urgency_of(queue, overflow, scenario)
-    given_away = np.zeros(scenario.sensors, dtype=np.bool_)
-    given_away[list(reserved)] = True
-    channel = None if belief is None else belief.channel
-    if channel is None:
-        expected = channel_gain_db(distance, scenario)
-    else:
-        expected = channel.gain_db(np.asarray(position), distance, ids)
-    reach, drift = None, None if belief is None else belief.drift
-    if preset == "reach":
-        ahead = places_ahead(uav.uav_id, position, uav.progress_m, scenario, drift)
-        links = _links(channel, ahead, distances_between(ahead, places), ids, scenario)
-        reach = Reach.of(links, np.where(heard & (battery > 0), queue, 0.0), urgencies)
-    return State(
+    state = State(
         position=position,
         progress_m=uav.progress_m,
         places=places,
         ids=ids,
         heard=heard,
-        admissible=heard & (battery > 0) & ~given_away[ids],
+        admissible=heard & (battery > 0) & ~np.isin(ids, list(reserved)),
         queue=queue,
         battery=battery,
-        gain=np.where(fresh, gain, expected),
+        gain=np.where(beacon == step, gain, expected),
         rate=rate,
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
         overflow=overflow,
         urgency=urgencies,
         distance=distance,
-        channel=channel,
-        drift=drift,
-        reach=reach,
+        channel=None if belief is None else belief.channel,
+        drift=None if belief is None else belief.drift,
     )
-
-
-def _links(
-    channel: LearnedChannel | None, places: FloatArray, distance: FloatArray, ids: NDArray[np.int64], scenario: Scenario
-) -> ExpectedLinks:
-    if channel is None:
-        return ExpectedLinks.by_formula(distance, scenario)
-    return channel.links(places, distance, ids)
+    return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
 
 
 def beacon_columns(sensors: SensorColumns) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from shared.channel import FloatArray, IntArray, Links, link_holds, packets_per_step, path_loss_db
 from shared.radio_map import RadioMap
-from shared.scenario import Scenario
+from shared.scenario import Point, Scenario
 
 # A link that holds with at least this probability counts as one.
 LIKELY = 0.5
@@ -177,12 +177,31 @@ class LearnedChannel:
         alive = None if self.failures.none else self.failures.alive(slice(None) if ids is None else ids)
         return ExpectedLinks(distance, packets, world, margin, alive)
 
+    def packets(self, position: Point, place: FloatArray, sensor: int, *, held: bool) -> int:
+        """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.
+
+        0 too for a sensor of unknown position.
+        """
+        metres = np.hypot(*(position - place))
+        # Most sensors are out of radio range, and computing one transfer takes as long as computing many.
+        if not metres <= self._scenario.radio_radius_m:
+            return 0
+        links = self.links(np.array([position]), np.array([[metres]]), np.array([sensor]))
+        return int((links.packets if held else links.likely)[0, 0])
+
     def gain_db(self, place: FloatArray, distance: FloatArray, ids: IntArray) -> FloatArray:
         """The expected gains ``(n,)``, dB, at a UAV's place ``(2,)``."""
         loss = path_loss_db(distance, self._scenario)
         if self.radio_map.exact:
             return -loss
         return np.asarray(-(loss + self.radio_map.predict(place[None], ids)[0][0]))
+
+    def transmitted(self, sensor: int, failed: bool, link: Links) -> bool:
+        """Take the outcome of a transmission over this link; returns whether the sensor's radio failed."""
+        good = bool(link.loss_db < self._scenario.path_loss_limit_db - GOOD_LINK_DB)
+        if good:
+            self.failures.settle(sensor, failed)
+        return good and failed
 
     def moved(self, packets: float, before: float, link: int, slack: float) -> None:
         """Learn the rate share from a visit.

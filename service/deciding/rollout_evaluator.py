@@ -11,7 +11,7 @@ model, which is the edge's belief, the best candidate is therefore expected to l
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,30 +107,19 @@ class RolloutState:
         guidance: Guidance = NO_GUIDANCE,
     ) -> RolloutState:
         """The state before this UAV's decision at this step; ``plans`` are the fleet's from this step on."""
-        left = scenario.steps - step
-        # A fleet may fly on past the scenario's last step.
-        horizon = min(_HORIZON, left) if left > 0 else _HORIZON
+        horizon = _horizon(scenario, step)
         # Any subset of UAVs will do, because the UAVs' distances change within the horizon.
         others = [other for other in belief.present(step) if other != uav][: _MAX_UAVS - 1]
         flown = np.arange(horizon * scenario.max_velocity + 1) * scenario.step_s
         expected = {i: belief.links(i, flown) for i in (uav, *others)}
         links = {i: found.packets.astype(np.float64) for i, found in expected.items()}
         margins = {i: found.margin for i, found in expected.items() if found.margin is not None}
-        reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links.values()], axis=0))
-        sensors = _most_urgent(belief, scenario, step, guidance, reached)
+        sensors = _most_urgent(belief, scenario, step, guidance, links.values())
         decided = belief.decided(step)
-        # Nothing can be collected from a sensor with a flat battery, so its losses do not distinguish candidates.
-        queue = np.where(belief.battery > 0, belief.base, 0.0)
-        age = np.maximum(step - belief.since, 0)
-        unknown = belief.base_variance > 0
-        visited = belief.visited.copy()
-        for other in set(decided) & set(others):
-            sensor, velocity = decided[other]
-            link = int(expected[other].likely[velocity, sensor])
-            queue[sensor] = max(0.0, float(belief.queue(step)[sensor] - link))
-            age[sensor], unknown[sensor] = 0, False
-            if link > 0:
-                visited[sensor] = step
+        flying = [(decided[other], expected[other].likely) for other in set(decided) & set(others)]
+        moved = [(sensor, int(likely[velocity, sensor])) for (sensor, velocity), likely in flying]
+        queue, age, unknown, visited = _after(belief, step, moved)
+        burst = belief.arrivals.burst(step)[sensors] * Arrivals.burst_over(np.arange(horizon + 1)[:, None])
         return cls(
             scenario=scenario,
             uav=uav,
@@ -138,14 +127,12 @@ class RolloutState:
             seed=(seed, step, uav),
             sensors=sensors,
             queue=queue[sensors],
-            unknown=unknown[sensors] & (belief.battery[sensors] > 0),
+            unknown=unknown[sensors],
             age=age[sensors],
             arrived=belief.arrivals.arrived[sensors],
             watched=belief.arrivals.watched[sensors],
             dispersion=belief.arrivals.dispersion,
-            bursts=np.diff(
-                belief.arrivals.burst(step)[sensors] * Arrivals.burst_over(np.arange(horizon + 1)[:, None]), axis=0
-            ),
+            bursts=np.diff(burst, axis=0),
             links={i: table[:, sensors] for i, table in links.items()},
             margins={i: table[:, sensors] for i, table in margins.items()},
             alive=belief.channel.failures.alive(sensors),
@@ -158,11 +145,39 @@ class RolloutState:
         )
 
 
+def _horizon(scenario: Scenario, step: int) -> int:
+    left = scenario.steps - step
+    # A fleet may fly on past the scenario's last step.
+    return min(_HORIZON, left) if left > 0 else _HORIZON
+
+
+def _after(
+    belief: FleetBelief, step: int, moved: Sequence[tuple[int, int]]
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
+    """Queues, their ages, whether they are unknown, and last visits, ``(J,)`` each, after the step's decisions.
+
+    Args:
+        moved: the sensors that other UAVs have in this step, with the packets that they move.
+    """
+    # Nothing can be collected from a sensor with a flat battery, so its losses do not distinguish candidates.
+    queue = np.where(belief.battery > 0, belief.base, 0.0)
+    age = np.maximum(step - belief.since, 0)
+    unknown = (belief.base_variance > 0) & (belief.battery > 0)
+    visited = belief.visited.copy()
+    for sensor, link in moved:
+        queue[sensor] = max(0.0, float(belief.queue(step)[sensor] - link))
+        age[sensor], unknown[sensor] = 0, False
+        if link > 0:
+            visited[sensor] = step
+    return queue, age, unknown, visited
+
+
 def _most_urgent(
-    belief: FleetBelief, scenario: Scenario, step: int, guidance: Guidance, reached: NDArray[np.int64]
+    belief: FleetBelief, scenario: Scenario, step: int, guidance: Guidance, links: Iterable[FloatArray]
 ) -> NDArray[np.int64]:
-    """The sensors in reach that overflow soonest, after those with a visit interval in the guidance."""
-    room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.rate, 1e-9)
+    """The sensors in reach by these links that overflow soonest, after those with a visit interval in the guidance."""
+    reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links], axis=0))
+    room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.arrivals.rate(), 1e-9)
     room = np.where(np.isfinite(guidance.every(scenario.sensors)), -np.inf, room)
     return np.sort(reached[np.argsort(room[reached], kind="stable")[:_MAX_SENSORS]])
 

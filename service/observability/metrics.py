@@ -39,6 +39,22 @@ class Metrics:
             registry=r,
             buckets=_OVERHEAD_BUCKETS,
         )
+        self._add_llm()
+        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens saved by attention and masks", registry=r)
+        self._add_outcomes()
+        self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
+        self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
+        self.missions = Gauge("aicvds_missions", "Missions in memory or in the store", registry=r)
+        self.store_seconds = Histogram(
+            "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
+        )
+        self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
+        # Looking up a child by its labels takes as long as counting; there are few children.
+        self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
+        self._tokens = cache(self.llm_tokens.labels)
+
+    def _add_llm(self) -> None:
+        r = self.registry
         self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
         self.llm_breaker_opened = Counter(
             "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened", registry=r
@@ -56,7 +72,10 @@ class Metrics:
             "Decisions of mode guided that could not wait for the rollout evaluator",
             registry=r,
         )
-        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens saved by attention and masks", registry=r)
+
+    def _add_outcomes(self) -> None:
+        """What outcomes and reports show."""
+        r = self.registry
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
         self.costs_clipped = Counter(
             "aicvds_costs_clipped", "Outcomes whose cost exceeded the most that a step can cost", registry=r
@@ -80,16 +99,6 @@ class Metrics:
         self.radio_failures = Counter(
             "aicvds_radio_failures", "Transmissions that failed although their links held", registry=r
         )
-        self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
-        self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)
-        self.missions = Gauge("aicvds_missions", "Missions in memory or in the store", registry=r)
-        self.store_seconds = Histogram(
-            "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
-        )
-        self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
-        # Looking up a child by its labels takes as long as counting; there are few children.
-        self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
-        self._tokens = cache(self.llm_tokens.labels)
 
     def record_llm(self, statuses: Mapping[str, int], breakers_open: int) -> None:
         """Set the states of the LLM servers.

@@ -15,8 +15,8 @@ from shared.drift import Drift
 from shared.fleetplan.arrivals import Arrivals, Which
 from shared.fleetplan.measured import NOTHING_MEASURED, Measured
 from shared.fleetplan.whereabouts import Visit, Whereabouts
-from shared.learned_channel import GOOD_LINK_DB, ExpectedLinks, LearnedChannel
-from shared.scenario import Point, Scenario
+from shared.learned_channel import ExpectedLinks, LearnedChannel
+from shared.scenario import Scenario
 from shared.trajectory import Trajectory, progress_of, trajectories
 
 # A distance out of every reach.
@@ -40,9 +40,7 @@ class FleetBelief:
         battery: shape ``(J,)``, joules.
         visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
         uavs: by index, the UAVs that were ever located.
-        arrivals: learned from the beacons' queues.
-        channel: learned from gains and outcomes.
-        drift: learned from the UAVs' progress.
+        arrivals, channel, drift: learned from queues, from gains and outcomes, and from the UAVs' progress.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -60,11 +58,6 @@ class FleetBelief:
         self.arrivals = Arrivals(scenario)
         self.channel = LearnedChannel(scenario)
         self.drift = Drift()
-
-    @property
-    def rate(self) -> FloatArray:
-        """Expected packets a step, shape ``(J,)``."""
-        return self.arrivals.rate()
 
     @property
     def newest(self) -> int | None:
@@ -147,17 +140,15 @@ class FleetBelief:
         if self.battery[visit.sensor] < link.packet_j:
             return False
         failed = bool(visit.failed)
-        good = bool(link.loss_db < self._scenario.path_loss_limit_db - GOOD_LINK_DB)
-        if good:
-            self.channel.failures.settle(visit.sensor, failed)
+        radio_failed = self.channel.transmitted(visit.sensor, failed, link)
         if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
             # The queue was known before and after: it tells what the link moved.
             soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(1)
-            rate = float((self.rate + soon)[visit.sensor])
+            rate = float((self.arrivals.rate() + soon)[visit.sensor])
             moved = visit.base + rate - float(self.base[visit.sensor])
             slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
             self.channel.moved(moved, visit.base, int(link.packets), slack)
-        return good and failed
+        return radio_failed
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
         """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
@@ -181,7 +172,8 @@ class FleetBelief:
             self.base[visit.sensor], self.since[visit.sensor] = visit.base, visit.since
             self.visited[visit.sensor] = visit.visited
         elif not failed and not visit.collected and untouched:
-            self.collect(visit.sensor, self._movable(last.position, visit.sensor, held=True), step)
+            place = self.places[visit.sensor]
+            self.collect(visit.sensor, self.channel.packets(last.position, place, visit.sensor, held=True), step)
 
     def advance(self, step: int) -> None:
         """Fly the decisions of the steps before this one: move the UAVs, and subtract the packets they collected."""
@@ -198,33 +190,21 @@ class FleetBelief:
         last = self.uavs[uav]
         sensor, velocity = last.action or (0, 0)
         start = last.progress_m
-        if last.progress_m is not None:
+        if start is not None:
             path, still_m = self._paths[uav], velocity * self._scenario.step_s
-            drift = self.drift
-            last.progress_m += still_m if drift.none else drift.flown_step(path, last.progress_m, still_m)
+            last.progress_m = start + (still_m if self.drift.none else self.drift.flown_step(path, start, still_m))
             x, y = path.at(last.progress_m)
             last.position = float(x), float(y)
         base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])
         collected = False
         if (sensor, last.step) not in served and not last.failed:
-            packets = self._movable(last.position, sensor, held=last.failed is False)
+            held = last.failed is False
+            packets = self.channel.packets(last.position, self.places[sensor], sensor, held=held)
             if collected := packets > 0:
                 served.add((sensor, last.step))
                 self.collect(sensor, packets, last.step)
         last.visit = Visit(last.step, sensor, base, since, visited, collected, last.failed, velocity, start)
         last.step, last.action, last.failed = last.step + 1, None, None
-
-    def _movable(self, position: Point, sensor: int, *, held: bool) -> int:
-        """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.
-
-        0 too for a sensor of unknown position.
-        """
-        metres = np.hypot(*(position - self.places[sensor]))
-        # Most sensors are out of radio range, and computing one transfer takes as long as computing many.
-        if not metres <= self._scenario.radio_radius_m:
-            return 0
-        links = self.channel.links(np.array([position]), np.array([[metres]]), np.array([sensor]))
-        return int((links.packets if held else links.likely)[0, 0])
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
         """Subtract the packets that a UAV collects in a step, unless something newer is known of the queue."""
@@ -279,23 +259,16 @@ class FleetBelief:
 
     def links(self, uav: int, metres: ArrayLike) -> ExpectedLinks:
         """The links to the UAV after it has flown ``metres`` ``(n,)`` on, ``(n, J)``."""
-        return self.channel.links(self._ahead(uav, metres), self.distances(uav, metres))
+        ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
+        return self.channel.links(ahead, self.distances(uav, metres))
 
     def distances(self, uav: int, metres: ArrayLike, which: Which = slice(None)) -> FloatArray:
         """Horizontal distances, metres, ``(n, J)``, after the UAV has flown ``metres`` ``(n,)`` on.
 
         ``which`` selects the sensors, by default all. A sensor of unknown position is far away.
         """
-        ahead = self._ahead(uav, metres)
+        ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
         offset = ahead[:, None, :] - self.places[which]
         metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
         metres_off[np.isnan(metres_off)] = FAR_M
         return metres_off
-
-    def _ahead(self, uav: int, metres: ArrayLike) -> FloatArray:
-        """The UAV's places, ``(n, 2)``, after it has flown ``metres`` ``(n,)`` on."""
-        flown = np.asarray(metres, dtype=np.float64)
-        last = self.uavs[uav]
-        if last.progress_m is None:
-            return np.broadcast_to(np.asarray(last.position), (len(flown), 2))
-        return self._paths[uav].at(last.progress_m + self.drift.flown(self._paths[uav], last.progress_m, flown))

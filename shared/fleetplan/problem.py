@@ -94,6 +94,13 @@ class FleetProblem:
             raise ValueError(f"queue has {self.queue.max()} packets, the capacity is {self.scenario.queue_capacity}")
         if self.allowed is not None and not self.allowed.any():
             raise ValueError("allowed has no velocity")
+        self._check_links(count)
+        for uav, actions in self.fixed.items():
+            if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
+                shape = actions.shape
+                raise ValueError(f"fixed[{uav}] has shape {shape}, must be (at most {self.horizon}, 2) of a UAV")
+
+    def _check_links(self, count: int) -> None:
         sums = self.horizon * self.scenario.max_velocity + 1
         for uav, table in enumerate(self.links or ()):
             if (
@@ -113,10 +120,6 @@ class FleetProblem:
             raise ValueError(f"chances has shapes {[c.shape for c in self.chances]}, must have those of links")
         if not all(((chance >= 0) & (chance <= 1)).all() for chance in self.chances or ()):
             raise ValueError("chances must be probabilities, 0..1")
-        for uav, actions in self.fixed.items():
-            if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
-                shape = actions.shape
-                raise ValueError(f"fixed[{uav}] has shape {shape}, must be (at most {self.horizon}, 2) of a UAV")
 
     @property
     def horizon(self) -> int:

@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shared.channel import FloatArray
+from shared.drift import Drift
 from shared.scenario import Point
+from shared.trajectory import Trajectory
 
 
 @dataclass(slots=True)
@@ -44,6 +50,13 @@ class Whereabouts:
     failed: bool | None = None
     visit: Visit | None = None
     taught: int = -1
+
+    def ahead(self, path: Trajectory, drift: Drift, metres: ArrayLike) -> FloatArray:
+        """The UAV's places, ``(n, 2)``, after it has flown ``metres`` ``(n,)`` on along its trajectory."""
+        flown = np.asarray(metres, dtype=np.float64)
+        if self.progress_m is None:
+            return np.broadcast_to(np.asarray(self.position), (len(flown), 2))
+        return path.at(self.progress_m + drift.flown(path, self.progress_m, flown))
 
     def state(self) -> list[Any]:
         """All of it, as plain values."""
