@@ -1,4 +1,7 @@
-"""Short flights are decision by decision what commit 601e8f2 flew, on board and over a real edge without an LLM."""
+"""Short flights are decision by decision what commit 601e8f2 flew, on board and over a real edge without an LLM.
+
+Mode `value` flies by the shipped weights: its flights are those of the weights trained on nine scenarios.
+"""
 
 import json
 from pathlib import Path

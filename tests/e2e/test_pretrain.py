@@ -42,7 +42,7 @@ def held_out(flown: list[RolloutStep], features: Features = "paper") -> list[Exa
 @pytest.mark.parametrize(
     ("teacher", "features", "k", "least"),
     [
-        # Its start was trained on look-ahead alone, before there were references.
+        # Its start was trained on look-ahead alone.
         ("look_ahead", "paper", 5, 0.85),
         ("look_ahead", "paper", 3, 0.75),
         ("planner", "reach", 5, 0.95),
