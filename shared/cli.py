@@ -19,6 +19,7 @@ _SUMMARIES = {
     "bound": "the fewest packets that a fleet could have lost in one world, all arrivals known",
     "train": "train the learned baselines, MADQN and MAPPO",
     "explore": "record exploring UAVs on training worlds, for pretrain",
+    "distill": "train the embedded LLM's adapter on what explore recorded",
     "pretrain": "train the attention and velocity modules' start on what explore recorded",
     "demonstrate": "choose worked examples for the prompt from what explore recorded",
     "replay": "decide a logged mission again with another model, prompt, k or mode",

@@ -301,6 +301,9 @@ class FeedbackResponse(Wire):
     result: Literal["applied", "duplicate"]
 
 
+PromptFormat = Literal["csv", "json", "markdown", "compact"]
+
+
 class PromptStyle(Received):
     """The prompt's form of the sensors: JSON is one object a line, Markdown a table with its header.
 
@@ -309,7 +312,11 @@ class PromptStyle(Received):
     the static block.
     """
 
-    format: Literal["csv", "json", "markdown"] = "csv"
+    format: PromptFormat | None = Field(
+        None,
+        description="`compact` is one digit a number, for an LLM with the adapter of `aicvds distill`; default: "
+        "`compact` where the edge's LLM has one, else `csv`",
+    )
     order: Literal["score", "shuffled"] = Field("score", description="of the rows; `score`: best first")
     experiences: int | None = Field(
         None, ge=0, le=100, description="number before half of them are dropped; default: the service's"

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
-from shared.wire import Features
+from shared.wire import Features, PromptFormat
 
 # Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an
 # experience in each format.
 _STATIC_TOKENS = 400
-_ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56}
+_ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56, "compact": 12}
 # Of the two further columns of feature preset `reach`.
 _REACH_TOKENS = 16
 
 
 def prompt_tokens(
-    row_format: Literal["csv", "json", "markdown"],
+    row_format: PromptFormat,
     rows: int,
     experiences: int,
     features: Features = "paper",

@@ -14,6 +14,9 @@ from service.config.prompt_budget import prompt_tokens
 from shared.faults import suggestion
 from shared.wire import Mode, Selection
 
+# The adapter that this package ships, if it ships one.
+SHIPPED_ADAPTER = Path(__file__).parents[1] / "checkpoints" / "adapter.gguf"
+
 
 def _default_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "aicvds"
@@ -55,6 +58,9 @@ class Settings(BaseSettings):
     hedge_ms: int = Field(0, ge=0, le=60_000)
     # Model file of the embedded llama.cpp. Unset: the one of `aicvds model fetch`.
     llm_gguf: Path | None = None
+    # LoRA adapter of the embedded LLM, a GGUF file of `aicvds distill`. Unset: the package's own, if it has one. `off`:
+    # none. `served`: the server of AICVDS_LLM_URL applies it. Missions then have the prompt that it was trained on.
+    llm_adapter: str | None = None
     # Threads of the embedded llama.cpp. 0: cores - 1. With as many threads as cores, llama.cpp's spinning workers need
     # a hundred times as long for a token when anything else runs.
     llm_threads: int = Field(0, ge=0, le=256)
@@ -157,6 +163,21 @@ class Settings(BaseSettings):
             self.model_copy(update={"llm_url": url, "llm_model": model, "llm_api_key": SecretStr(one) if one else None})
             for url, model, one in zip(urls, models, keys, strict=True)
         ]
+
+    @property
+    def embedded_adapter(self) -> Path | None:
+        """The adapter file of the embedded LLM; None where that has none, and where the LLM is a server's."""
+        if self.llm_url is not None or self.llm_adapter in ("off", "served"):
+            return None
+        if self.llm_adapter is not None:
+            return Path(self.llm_adapter)
+        # The package's adapter belongs to the package's model.
+        return SHIPPED_ADAPTER if self.llm_gguf is None and SHIPPED_ADAPTER.is_file() else None
+
+    @property
+    def adapted(self) -> bool:
+        """Whether the LLM has an adapter, and so understands the compact prompt."""
+        return self.llm_adapter == "served" or self.embedded_adapter is not None
 
     @property
     def embedded_threads(self) -> int:

@@ -30,7 +30,7 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.mission.mission import Mission
-from service.prompting.candidates import CandidateSet
+from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
@@ -176,7 +176,9 @@ def template_of(mission: Mission) -> GuidedTemplate:
 
 def candidates_of(state: AttendedState, template: GuidedTemplate) -> CandidateSet:
     """The LLM's candidates, at velocities that the operator allows; the state has at least one row."""
-    candidates = CandidateSet.of(state.state, state.reach, state.shown(), template.letters)
+    mission = state.mission
+    view = Viewpoint(mission.belief, state.uav_id, state.step, learned=mission.belief_source == "fleet")
+    candidates = template.candidates(state.state, state.reach, state.shown(), view)
     guidance = state.guidance
     if guidance is None:
         return candidates

@@ -10,10 +10,11 @@ from typing import Any, ClassVar, Protocol
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
-from service.deciding.deliberation import Deliberation
+from service.deciding.deliberation import Deliberation, candidates_of, template_of
 from service.deciding.llm_query import LlmQueries
 from service.deciding.verifier import verify
 from service.llm.answers import Completion, NoDecision, check_answer
+from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 
@@ -22,10 +23,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A prompt, whether an LLM gets it or not; in mode ``guided`` with the deliberation that it belongs to."""
+    """A prompt, whether an LLM gets it or not.
+
+    Attributes:
+        deliberation: of mode ``guided``, which the prompt belongs to.
+        candidates: of mode ``llm`` with the compact prompt.
+    """
 
     prompt: Prompt
     deliberation: Deliberation | None = None
+    candidates: CandidateSet | None = None
 
 
 class Mode(Protocol):
@@ -104,6 +111,37 @@ class Llm(Policy):
             log.debug("mission %s: %s: %s", state.mission.mission_id, error.reason, error)
             return Fallback(error.reason, completion, completion.model if completion else None)
         return Choice(answer, None, completion, completion.model)
+
+
+class LlmByLetter(Policy):
+    """Mode ``llm`` with the compact prompt: the likeliest letter is the decision, once it has passed every check."""
+
+    def __init__(self, queries: LlmQueries) -> None:
+        self._queries = queries
+
+    def question(self, state: AttendedState, task: DecisionTask) -> Question:
+        """The candidates' prompt."""
+        if not state.rows:
+            return super().question(state, task)
+        template = template_of(state.mission)
+        candidates = candidates_of(state, template)
+        return Question(template.choice_prompt(candidates, state.state, []), candidates=candidates)
+
+    async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
+        """The likeliest candidate."""
+        if question.candidates is None:
+            return Fallback("no_candidate")
+        advice = await self._queries.ask(state.mission, question.candidates, question.prompt, task.deadline)
+        task.watch.lap("llm")
+        probabilities = advice.over(question.candidates.actions)
+        if probabilities is None:
+            return Fallback(advice.reason or "answer_format", advice.completion, advice.model)
+        answer = question.candidates.actions[int(probabilities.argmax())]
+        try:
+            verify(state, answer)
+        except NoDecision as error:
+            return Fallback(error.reason, advice.completion, advice.model)
+        return Choice(answer, None, advice.completion, advice.model)
 
 
 class Guided(Policy):

@@ -15,7 +15,7 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmQueries
-from service.deciding.modes import Guided, Llm, Mode, Policy, Value
+from service.deciding.modes import Guided, Llm, LlmByLetter, Mode, Policy, Value
 from service.mission.events import AdviserReport
 from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
@@ -60,16 +60,18 @@ class Pipeline:
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._evaluating = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="evaluator")
         self._plans: set[asyncio.Task[None]] = set()
-        self._modes: dict[ModeName, Mode] = {
-            "guided": Guided(queries, self._evaluating),
-            "llm": Llm(queries),
-            "value": Value(),
-            "policy": Policy(),
+        guided, value, policy = Guided(queries, self._evaluating), Value(), Policy()
+        # By the mission's mode, and whether it has the compact prompt.
+        self._modes: dict[tuple[ModeName, bool], Mode] = {
+            ("llm", False): Llm(queries),
+            ("llm", True): LlmByLetter(queries),
         }
+        for compact in (False, True):
+            self._modes |= {("guided", compact): guided, ("value", compact): value, ("policy", compact): policy}
 
     async def decide_one(self, task: DecisionTask) -> Decided:
         """Decide for one UAV, and record the decision in its mission; raises as :meth:`Mission.commit`."""
-        mode = self._modes[task.mission.mode]
+        mode = self._modes[task.mission.mode, task.mission.spec.prompt.format == "compact"]
         if mode.plan_first:
             await _await_plan(task)
         state = AttendedState.of(task.mission, task.uav, task.step, task.watch)
@@ -91,7 +93,7 @@ class Pipeline:
         self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline
     ) -> asyncio.Task[None] | None:
         """Begin to plan for UAVs of this step, where their mission's mode may need a plan by this deadline."""
-        share = self._modes[mission.mode].plan_share
+        share = self._modes[mission.mode, mission.spec.prompt.format == "compact"].plan_share
         if mission.planner is None or share is None:
             return None
         # In mode `guided` the LLM, which comes after the plan, has as much time as the planner.

@@ -23,6 +23,8 @@ class EmbeddedServer:
     The server requires a random key, so that other users of the machine cannot spend its time.
 
     Args:
+        adapter: a LoRA adapter that is applied to every request. The model's name then ends in ``+`` and the
+            adapter's.
         context: tokens, which the slots share evenly.
         slots: requests served at once, each with its own prefix cache. With one slot, the static block and the
             experiences are one prefix for the whole fleet.
@@ -31,7 +33,7 @@ class EmbeddedServer:
         LoadFailed: llama.cpp could not load the file.
     """
 
-    def __init__(self, gguf: Path, *, threads: int, context: int, slots: int = 1) -> None:
+    def __init__(self, gguf: Path, *, threads: int, context: int, slots: int = 1, adapter: Path | None = None) -> None:
         params = xllamacpp.CommonParams()
         params.model.path = str(gguf)
         params.cpuparams.n_threads = threads
@@ -43,14 +45,17 @@ class EmbeddedServer:
         params.cache_ram_mib = _PROMPT_CACHE_MIB
         params.verbosity = _ONLY_ERRORS
         params.ui = False
+        if adapter is not None:
+            params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(adapter), 1.0)]
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
         try:
             self._server: xllamacpp.Server | None = xllamacpp.Server(params)
         except RuntimeError as error:
-            raise LoadFailed(f"llama.cpp cannot load {gguf.name}: {error}") from error
+            files = gguf.name if adapter is None else f"{gguf.name} with {adapter.name}"
+            raise LoadFailed(f"llama.cpp cannot load {files}: {error}") from error
         self.base_url = f"{self._server.listening_address}/v1"
-        self.model = gguf.stem
+        self.model = gguf.stem if adapter is None else f"{gguf.stem}+{adapter.stem}"
 
     def close(self) -> None:
         """Stop the server and free the model; blocks until its threads have ended."""

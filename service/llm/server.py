@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
+from service.llm.adapter import AdapterUnusable, check_adapter
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.embedded import EmbeddedServer, LoadFailed
@@ -257,7 +258,7 @@ class LlmServer:
                 self._status = _Status("ready")
                 log.info("LLM ready: %s at %s, constraint %s", self.model, client.base_url, self.constraint)
                 return
-            except (ModelMissing, LoadFailed) as error:
+            except (ModelMissing, AdapterUnusable, LoadFailed) as error:
                 self._status = _Status("unavailable", str(error))
                 log.error("no embedded LLM: %s", error)
                 return
@@ -276,9 +277,15 @@ class LlmServer:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
             self._client = http_client(settings.llm_url, api_key=key)
         elif self._client is None:
-            gguf = embedded_model(settings)
+            gguf, adapter = embedded_model(settings), settings.embedded_adapter
+            if adapter is not None:
+                check_adapter(adapter)
             self._embedded = await asyncio.to_thread(
-                EmbeddedServer, gguf, threads=settings.embedded_threads, context=settings.llm_context
+                EmbeddedServer,
+                gguf,
+                threads=settings.embedded_threads,
+                context=settings.llm_context,
+                adapter=adapter,
             )
             self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model

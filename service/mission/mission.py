@@ -73,9 +73,11 @@ class Mission:
         self.uses_attention = spec.uses_attention
         weights = initial_weights(spec.init, self.features, self.scenario.max_velocity + 1, spec.seed)
         self.template = template_for(spec, self.scenario, weights)
-        self.prompt_fit = PromptFit(spec, self.scenario, self.template.demonstrations, settings.llm_context)
+        self.prompt_fit = PromptFit(
+            spec, self.scenario, self.template.demonstrations, settings.llm_context, settings.adapted
+        )
         self.prompt_fits = not spec.uses_llm or self.prompt_fit.fits()
-        if not self.prompt_fits and not restored:
+        if spec.uses_llm and not restored:
             self.prompt_fit.check()
         self.experiences = Experiences(spec.prompt.experiences, spec.prompt.selection, self.scenario.uavs)
         self.decisions = 0

@@ -8,6 +8,7 @@ from service.config.prompt_budget import prompt_tokens
 from service.errors import Refused
 from service.learning.modules import Weights
 from service.mission.resolved_spec import ResolvedSpec
+from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.demonstrations import solved
 from service.prompting.experiences import NEAREST
 from service.prompting.guided_prompt import GuidedTemplate
@@ -23,8 +24,10 @@ def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Te
     """
     experiences, note = spec.prompt.experiences, spec.note
     ranked = spec.uses_attention and spec.prompt.order == "score"
+    rows = spec.top_k if spec.uses_attention else scenario.sensors
+    if spec.prompt.format == "compact":
+        return CompactTemplate(scenario, rows=rows, note=note)
     if spec.mode == "guided":
-        rows = spec.top_k if spec.uses_attention else scenario.sensors
         return GuidedTemplate(scenario, rows=rows, experiences=experiences, ranked=ranked, note=note)
     examples = solved(spec, spec.features, scenario, weights, spec.top_k if spec.uses_attention else None)
     return Template(
@@ -45,22 +48,33 @@ class PromptFit:
     Attributes:
         demonstrations: the text of the template's worked examples.
         context: tokens of the LLM's context.
+        adapted: whether the LLM has the adapter that the compact prompt needs.
     """
 
     spec: ResolvedSpec
     scenario: Scenario
     demonstrations: str
     context: int
+    adapted: bool
 
     def fits(self, uavs: int = 1) -> bool:
-        """Whether the context is large enough for a prompt about so many UAVs at once."""
-        return self._needed(uavs) <= self.context
+        """Whether the LLM understands the prompt, and its context is large enough for one about so many UAVs."""
+        understood = self.adapted if self._compact else True
+        return understood and self._needed(uavs) <= self.context and (uavs == 1 or not self._compact)
 
     def check(self) -> None:
-        """Raises ``Refused`` where the context is too small for a prompt about one UAV."""
+        """Raises ``Refused`` where the LLM has no use for a prompt about one UAV."""
+        style = self.spec.prompt
+        if self._compact and not self.adapted:
+            raise Refused(
+                "prompt.format",
+                "compact needs an LLM with an adapter: leave AICVDS_LLM_ADAPTER unset for the embedded LLM's, "
+                "or set it to `served` where your LLM server applies it",
+            )
+        if self._compact and (style.experiences or style.demonstrations):
+            raise Refused("prompt", "the compact prompt has no experiences and no demonstrations: set them to 0")
         if self.fits():
             return
-        style = self.spec.prompt
         shown, lower = f"{style.experiences} experiences", "prompt.experiences"
         if style.demonstrations:
             shown += f", {style.demonstrations} demonstrations"
@@ -78,6 +92,10 @@ class PromptFit:
         needed = prompt_tokens(style.format, self._rows * uavs, lines, self.spec.features, self.demonstrations)
         # A tokenizer makes at most one token of each byte.
         return needed + len(note_block(self.spec.note).encode())
+
+    @property
+    def _compact(self) -> bool:
+        return self.spec.prompt.format == "compact"
 
     @property
     def _rows(self) -> int:

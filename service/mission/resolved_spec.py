@@ -7,12 +7,15 @@ from typing import Literal, Self
 from pydantic import Field
 
 from service.config.settings import Settings
-from shared.wire import Belief, Features, MissionSpec, Mode, PromptStyle, Selection
+from shared.wire import Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
+
+_LLM_MODES = ("llm", "guided")
 
 
 class ResolvedPromptStyle(PromptStyle):
     """A prompt's style in which nothing is left open."""
 
+    format: PromptFormat
     experiences: int = Field(ge=0)
     selection: Selection
 
@@ -32,11 +35,17 @@ class ResolvedSpec(MissionSpec):
     def of(cls, spec: MissionSpec, settings: Settings) -> Self:
         """The spec, with the service's settings and the defaults of its mode for what it leaves open."""
         mode = spec.mode or settings.mode
-        # Mode `llm` is the paper's method as the paper has it, unless the spec says otherwise.
-        as_published = mode == "llm"
+        adapted = settings.adapted and mode in _LLM_MODES
+        row_format = spec.prompt.format or ("compact" if adapted else "csv")
+        compact = row_format == "compact"
+        # Mode `llm` is the paper's method as the paper has it, unless the spec or the adapter says otherwise.
+        as_published = mode == "llm" and not compact
         experiences = spec.prompt.experiences
+        if experiences is None:
+            experiences = 0 if compact else settings.experiences
         prompt = {
-            "experiences": settings.experiences if experiences is None else experiences,
+            "format": row_format,
+            "experiences": experiences,
             "selection": spec.prompt.selection or settings.selection,
         }
         resolved = {
@@ -53,7 +62,7 @@ class ResolvedSpec(MissionSpec):
     @property
     def uses_llm(self) -> bool:
         """Whether an LLM has a part in the decisions."""
-        return self.mode in ("llm", "guided")
+        return self.mode in _LLM_MODES
 
     @property
     def uses_attention(self) -> bool:

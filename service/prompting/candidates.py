@@ -12,13 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from string import ascii_uppercase
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
-from service.prompting.row_formats import cells
 from shared.actions import Action
 from shared.features import Reach, State
+from shared.fleetplan import FleetBelief
 
 # OpenAI and vLLM return the probabilities of at most 20 tokens.
 _MOST_LABELS = 20
@@ -56,6 +56,33 @@ class Letters:
 
 
 @dataclass(frozen=True, slots=True)
+class Viewpoint:
+    """The UAV that a prompt is for, the step, and its fleet's belief.
+
+    Attributes:
+        learned: whether links follow what the fleet has learned of its channel; else they follow the formula.
+    """
+
+    belief: FleetBelief
+    uav_id: int
+    step: int
+    learned: bool = True
+
+
+class RowWriter(Protocol):
+    """Writes one row of the prompt."""
+
+    def __call__(self, letter: str, row: int, options: Sequence[int]) -> str:
+        """The text of a state's row.
+
+        Args:
+            letter: the row's first choice letter.
+            options: its velocity options, slowest first.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
 class CandidateSet:
     """The actions to choose from.
 
@@ -70,21 +97,17 @@ class CandidateSet:
     rows: str
 
     @classmethod
-    def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters) -> Self:
+    def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters, write: RowWriter) -> Self:
         """The candidates for these rows of a state, in this order, as far as there are letters for them."""
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
         text = []
-        lettered = shown[: letters.rows]
-        for number, (row, texts) in enumerate(zip(lettered, cells(state, lettered), strict=True)):
+        for number, row in enumerate(shown[: letters.rows]):
             options = velocity_options(reach, row, letters.velocities)
             own = letters.of_row(number)
             for letter, velocity in zip(own, options, strict=True):
                 labels[letter] = actions.setdefault(Action(int(state.ids[row]), velocity), len(actions))
-            # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
-            slowest, fastest = options[0], options[-1]
-            span = f"{slowest}-{fastest}" if 0 < slowest < fastest else str(fastest)
-            text.append(f"{own[0]}{texts['queue']},{texts['age']},{span}\n")
+            text.append(write(own[0], row, options))
         return cls(list(actions), labels, "".join(text))
 
     def with_velocities(self, velocity: Callable[[int, int], int]) -> CandidateSet:

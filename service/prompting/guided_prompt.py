@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from service.prompting.candidates import CandidateSet, Letters
+from service.prompting.candidates import CandidateSet, Letters, Viewpoint
 from service.prompting.prompt import Prompt, Template, note_block
-from service.prompting.row_formats import FORMATS, Cells
+from service.prompting.row_formats import FORMATS, Cells, cells
 from service.prompting.token_accounting import UnprunedState
-from shared.features import State
+from shared.features import Reach, State
 from shared.scenario import Scenario
 
 _STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
@@ -85,6 +85,18 @@ class GuidedTemplate(Template):
     def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
         """A line such as ``52,3>7:0``, with the cost in tenths."""
         return f"{seen['queue']},{seen['age']}>{velocity}:{min(99, round(10 * cost))}\n"
+
+    def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
+        """The candidates for these rows of a state, in this order."""
+        texts = dict(zip(shown, cells(state, shown), strict=True))
+
+        def row(letter: str, row: int, options: Sequence[int]) -> str:
+            # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
+            slowest, fastest = options[0], options[-1]
+            span = f"{slowest}-{fastest}" if 0 < slowest < fastest else str(fastest)
+            return f"{letter}{texts[row]['queue']},{texts[row]['age']},{span}\n"
+
+        return CandidateSet.of(state, reach, shown, self.letters, row)
 
     def choice_prompt(
         self, candidates: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()

@@ -87,7 +87,7 @@ class Template:
         demonstrations: Sequence[Solved] = (),
         note: str | None = None,
     ) -> None:
-        self._format = FORMATS[(style or PromptStyle()).format]
+        self._format = FORMATS[(style and style.format) or "csv"]
         self._columns = columns(features)
         self.demonstrations = "".join(map(self._demonstration, demonstrations))
         examples = f"{_EXAMPLES}\n\n{self.demonstrations}" if demonstrations else ""

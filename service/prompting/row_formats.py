@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.features import State
-from shared.wire import Features
+from shared.wire import Features, PromptFormat
 
 # The text of each column, by name: a whole number or UNKNOWN.
 Cells = Mapping[str, str]
@@ -172,7 +172,7 @@ class Markdown(Format):
         return _piped((*_without_id(cells).values(), answer, cost))
 
 
-FORMATS: dict[Literal["csv", "json", "markdown"], Format] = {"csv": Csv(), "json": Json(), "markdown": Markdown()}
+FORMATS: dict[PromptFormat, Format] = {"csv": Csv(), "json": Json(), "markdown": Markdown()}
 
 
 def _meanings(features: Features) -> dict[str, str]:

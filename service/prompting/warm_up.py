@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from service.config.settings import Settings
 from service.llm.request_bodies import WarmUp
+from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Template
 from shared.scenario import SCENARIOS
@@ -12,6 +13,9 @@ from shared.scenario import SCENARIOS
 def warm_up(settings: Settings) -> WarmUp:
     """The request in the service's mode; it fills the server's prefix cache."""
     paper = SCENARIOS["paper"]
+    if settings.adapted:
+        compact = CompactTemplate(paper, rows=settings.top_k)
+        return WarmUp(compact.static, "U999999A99999999", compact.labels)
     if settings.mode == "guided":
         guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
         return WarmUp(guided.static, guided.content_free()[0], guided.labels)

@@ -149,7 +149,7 @@ def test_a_mission_takes_a_presets_name_or_a_whole_scenario() -> None:
 def test_a_mission_is_the_papers_unless_told_otherwise() -> None:
     spec = MissionSpec()
     assert (spec.attention, spec.features, spec.belief) == ("on", None, None)
-    assert spec.prompt == PromptStyle(format="csv", order="score", experiences=None)
+    assert spec.prompt == PromptStyle(format=None, order="score", experiences=None)
 
 
 def test_a_mission_with_its_own_prompt_survives_json() -> None:

@@ -1,0 +1,47 @@
+"""``aicvds distill``: a LoRA adapter of the embedded LLM, trained on recorded rollouts."""
+
+from __future__ import annotations
+
+import sys
+
+import tyro
+from rich.console import Console
+
+from service.distilling.options import Distill
+
+
+def main(argv: list[str]) -> int:
+    """Train and write; returns the exit code."""
+    args = tyro.cli(Distill, prog="aicvds distill", args=argv)
+    console = Console()
+    try:
+        _check(args)
+        # This import loads torch and transformers, which takes seconds; `--help` and usage errors answer without it.
+        from service.distilling.distill import distill
+
+        distill(args, console)
+    except (ValueError, OSError) as error:
+        print(f"aicvds distill: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as missing:
+        print(f"aicvds distill: {missing.name} is not installed: pip install 'aic-vds[distill]'", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("aicvds distill: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        return 130
+    console.print(f"Wrote {args.out / 'adapter.gguf'}", soft_wrap=True)
+    return 0
+
+
+def _check(args: Distill) -> None:
+    if not args.rollouts:
+        raise ValueError("name at least one file of `aicvds explore`")
+    for name in ("steps", "batch", "rank", "workers"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name} {getattr(args, name)} is not at least 1")
+    if not 1 <= args.rank <= 64:
+        raise ValueError(f"--rank {args.rank} is not between 1 and 64")
+    if not args.learning_rate > 0:
+        raise ValueError(f"--learning-rate {args.learning_rate:g} is not above 0")
+    if args.threads < 0:
+        raise ValueError(f"--threads {args.threads} is below 0")

@@ -1,0 +1,214 @@
+"""LoRA training of the embedded model on prompt examples: cross-entropy of the labels against the teacher's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from service.distilling.examples import PromptExample
+from service.distilling.gguf_adapter import write_gguf_adapter
+from service.distilling.options import Distill
+
+_MATRICES = ["q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj"]
+_LETTERS = "ABCDEFGHIJKLMNOPQRST"
+_WARM_UP_STEPS = 30
+_MOST_GRADIENT = 1.0
+_EVALUATION_BATCH = 64
+_CHECKPOINT_STEPS = 50
+
+
+class Student:
+    """The embedded model with a LoRA adapter; its own weights, dequantised, stay as they are.
+
+    Args:
+        static: the prompts' static block.
+        begin: a folder of an earlier adapter.
+    """
+
+    def __init__(self, gguf: Path, static: str, rank: int, device: str, begin: Path | None = None) -> None:
+        # Their imports take seconds.
+        from peft import LoraConfig, PeftModel, get_peft_model
+        from transformers import AutoModelForCausalLM, AutoTokenizer, GgufConfig
+
+        self._tokenizer: Any = AutoTokenizer.from_pretrained(gguf.parent, gguf_file=gguf.name)
+        base = AutoModelForCausalLM.from_pretrained(
+            gguf.parent,
+            gguf_file=gguf.name,
+            dtype=torch.bfloat16,
+            quantization_config=GgufConfig(dequantize=True),
+        )
+        base.config.use_cache = False
+        if begin is None:
+            config = LoraConfig(r=rank, lora_alpha=2 * rank, target_modules=_MATRICES, bias="none")
+            self.model: Any = get_peft_model(base, config)
+        else:
+            self.model = PeftModel.from_pretrained(base, begin, is_trainable=True)
+        self.model.to(device)
+        self._device = torch.device(device)
+        self._letters = torch.tensor(self._tokenizer.convert_tokens_to_ids(list(_LETTERS)), device=self._device)
+        self._before, self._after = self._frame(static)
+
+    def label_logits(self, texts: Sequence[str]) -> Tensor:
+        """The logits of the twenty letters after each user message, ``(B, 20)``."""
+        middles = self._tokenizer(list(texts), add_special_tokens=False).input_ids
+        ids = [self._before + middle + self._after for middle in middles]
+        longest = max(map(len, ids))
+        tokens, mask = torch.zeros(2, len(ids), longest, dtype=torch.long)
+        for row, own in enumerate(ids):
+            # On the left, so that the answer's position is the last of every row.
+            tokens[row, longest - len(own) :] = torch.tensor(own)
+            mask[row, longest - len(own) :] = 1
+        with torch.autocast(self._device.type, dtype=torch.bfloat16):
+            hidden = self.model.base_model.model.model(
+                input_ids=tokens.to(self._device),
+                # Without padding the attention needs no mask.
+                attention_mask=None if bool(mask.all()) else mask.to(self._device),
+                position_ids=(mask.cumsum(1) - 1).clamp(min=0).to(self._device),
+            ).last_hidden_state[:, -1]
+            logits = hidden @ self.model.get_output_embeddings().weight[self._letters].T
+        return torch.as_tensor(logits.float())
+
+    def write_gguf(self, path: Path) -> None:
+        """Write the adapter for llama.cpp."""
+        config = self.model.config
+        weights = {
+            name.replace(".default", ""): weight.detach().float().cpu().numpy()
+            for name, weight in self.model.named_parameters()
+            if "lora_" in name
+        }
+        write_gguf_adapter(
+            path,
+            weights,
+            alpha=self.model.peft_config["default"].lora_alpha,
+            heads=config.num_attention_heads,
+            kv_heads=config.num_key_value_heads,
+        )
+
+    def _frame(self, static: str) -> tuple[list[int], list[int]]:
+        """The tokens of the chat before and after the user message."""
+        mark = "0"
+        whole = self._tokenizer.apply_chat_template(
+            [{"role": "system", "content": static}, {"role": "user", "content": mark}],
+            tokenize=False,
+            add_generation_prompt=True,
+        )
+        head, _, tail = whole.rpartition(mark)
+        return tuple(self._tokenizer(text, add_special_tokens=False).input_ids for text in (head, tail))
+
+
+def targets_of(examples: Sequence[PromptExample]) -> tuple[Tensor, Tensor]:
+    """Target probabilities ``(B, 20)``, and which letters are offered ``(B, 20)``."""
+    target, offered = torch.zeros(len(examples), len(_LETTERS)), torch.zeros(len(examples), len(_LETTERS)).bool()
+    for row, example in enumerate(examples):
+        columns = [_LETTERS.index(letter) for letter in example.labels]
+        target[row, columns] = torch.tensor(example.target, dtype=torch.float32)
+        offered[row, columns] = True
+    return target, offered
+
+
+def loss_of(logits: Tensor, target: Tensor, offered: Tensor) -> Tensor:
+    """``-sum_a t(a) ln p(a)`` over the offered letters, the mean of the batch."""
+    masked = logits.masked_fill(~offered, -1e4)
+    return -(target * torch.log_softmax(masked, dim=1)).sum(dim=1).mean()
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How a student decides beside the teacher, over held-out decisions.
+
+    Attributes:
+        sensor: share of decisions whose likeliest letter is of the teacher's sensor, where that is shown.
+        target: mean target probability of the likeliest letter's action.
+        loss: mean cross-entropy.
+    """
+
+    decisions: int
+    sensor: float
+    target: float
+    loss: float
+
+
+@torch.no_grad()
+def agreement(student: Student, examples: Sequence[PromptExample]) -> Agreement:
+    """The agreement over these examples; there is at least one."""
+    student.model.eval()
+    same, shown, share, loss = 0, 0, 0.0, 0.0
+    for start in range(0, len(examples), _EVALUATION_BATCH):
+        some = examples[start : start + _EVALUATION_BATCH]
+        logits = student.label_logits([example.text for example in some]).cpu()
+        target, offered = targets_of(some)
+        loss += float(loss_of(logits, target, offered)) * len(some)
+        best = logits.masked_fill(~offered, -1e4).argmax(dim=1)
+        for example, letter in zip(some, best.tolist(), strict=True):
+            place = example.labels.index(_LETTERS[letter])
+            share += float(example.target[place])
+            if example.reference >= 0:
+                shown += 1
+                same += example.sensors[place] == example.sensors[example.reference]
+    student.model.train()
+    return Agreement(len(examples), same / max(shown, 1), share / len(examples), loss / len(examples))
+
+
+def train(
+    student: Student, examples: Sequence[PromptExample], args: Distill, checkpoint: Path
+) -> Generator[float, None, None]:
+    """Train, and yield each step's loss; goes on from the checkpoint, which is written every fifty steps."""
+    weights = [p for p in student.model.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(weights, lr=args.learning_rate, weight_decay=0.0)
+    first = 0
+    if checkpoint.is_file():
+        found = torch.load(checkpoint, weights_only=True)
+        first = found["step"]
+        optimizer.load_state_dict(found["optimizer"])
+        with torch.no_grad():
+            for own, kept in zip(weights, found["weights"], strict=True):
+                own.copy_(kept)
+    student.model.train()
+    for step in range(first, args.steps):
+        for group in optimizer.param_groups:
+            group["lr"] = args.learning_rate * _schedule(step, args.steps)
+        some = [examples[i] for i in _batch(len(examples), args, step)]
+        target, offered = targets_of(some)
+        logits = student.label_logits([example.text for example in some])
+        loss = loss_of(logits, target.to(logits.device), offered.to(logits.device))
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(weights, _MOST_GRADIENT)
+        optimizer.step()
+        if (step + 1) % _CHECKPOINT_STEPS == 0 or step + 1 == args.steps:
+            half = checkpoint.with_suffix(".part")
+            kept = {
+                "step": step + 1,
+                "optimizer": optimizer.state_dict(),
+                "weights": [weight.detach().cpu() for weight in weights],
+            }
+            torch.save(kept, half)
+            half.replace(checkpoint)
+        yield float(loss.detach())
+
+
+def _batch(count: int, args: Distill, step: int) -> list[int]:
+    """The examples of a step: each pass over all of them has its own order, drawn from the seed."""
+    first = step * args.batch
+    places = range(first, first + args.batch)
+    orders: dict[int, list[int]] = {}
+    for place in places:
+        turn = place // count
+        if turn not in orders:
+            generator = torch.Generator().manual_seed(args.seed * 1_000_003 + turn)
+            orders[turn] = torch.randperm(count, generator=generator).tolist()
+    return [orders[place // count][place % count] for place in places]
+
+
+def _schedule(step: int, steps: int) -> float:
+    """The share of the learning rate: linear warm-up, then a cosine to a tenth."""
+    if step < _WARM_UP_STEPS:
+        return (step + 1) / _WARM_UP_STEPS
+    done = (step - _WARM_UP_STEPS) / max(1, steps - _WARM_UP_STEPS)
+    return 0.1 + 0.45 * (1.0 + math.cos(math.pi * done))

@@ -1,0 +1,96 @@
+"""``aicvds distill``: examples, training, evaluation, and the adapter's files."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+
+from service.config.cores import usable_cores
+from service.config.settings import Settings
+from service.distilling.adapter_training import Agreement, Student, agreement, train
+from service.distilling.examples import PromptExample
+from service.distilling.examples_file import examples_of
+from service.distilling.options import Distill
+from service.llm.adapter import PROMPT_VERSION
+from service.llm.model_file import embedded_model
+from service.prompting.compact_prompt import STATIC
+
+# Held-out decisions of each scenario that are evaluated.
+_EVALUATED = 300
+
+
+def distill(args: Distill, console: Console) -> None:
+    """Train an adapter and write its files; raises ``OSError`` and ``ValueError`` for bad input."""
+    device = args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    torch.set_num_threads(args.threads or usable_cores())
+    torch.manual_seed(args.seed)
+    gguf = embedded_model(Settings())
+    training: list[PromptExample] = []
+    held_out: dict[str, list[PromptExample]] = {}
+    for name, train_part, held in examples_of(args.rollouts, args.out, args.workers):
+        console.print(f"{name}: {len(train_part)} decisions, {len(held)} held out", highlight=False)
+        training += train_part
+        held_out.setdefault(name, []).extend(held)
+    student = Student(gguf, STATIC, args.rank, device, args.begin)
+    _train(student, training, args, console)
+    found = {name: agreement(student, _some(held)) for name, held in held_out.items() if held}
+    _report(found, console)
+    _write(student, found, gguf, len(training), args)
+
+
+def _train(student: Student, training: list[PromptExample], args: Distill, console: Console) -> None:
+    with Progress(console=console) as progress:
+        task = progress.add_task("Training", total=args.steps)
+        recent: list[float] = []
+        left = args.steps
+        for loss in train(student, training, args, args.out / "checkpoint.pt"):
+            recent = [*recent[-49:], loss]
+            progress.update(task, advance=1, description=f"Training, loss {sum(recent) / len(recent):.3f}")
+            left -= 1
+        progress.update(task, advance=left)
+
+
+def _some(held: list[PromptExample]) -> list[PromptExample]:
+    return random.Random(0).sample(held, min(_EVALUATED, len(held)))
+
+
+def _report(found: dict[str, Agreement], console: Console) -> None:
+    for name, one in found.items():
+        console.print(
+            f"{name}: the teacher's sensor in {one.sensor:.0%} of {one.decisions} held-out decisions, "
+            f"loss {one.loss:.3f}",
+            highlight=False,
+        )
+
+
+def _write(student: Student, found: dict[str, Agreement], gguf: Path, examples: int, args: Distill) -> None:
+    student.model.save_pretrained(args.out / "peft")
+    target = args.out / "adapter.gguf"
+    student.write_gguf(target)
+    card = {
+        "prompt_version": PROMPT_VERSION,
+        "base": gguf.name,
+        "base_sha256": _sha256(gguf),
+        "adapter_sha256": _sha256(target),
+        "rollouts": sorted(source.name for source in args.rollouts),
+        "examples": examples,
+        "steps": args.steps,
+        "batch": args.batch,
+        "rank": args.rank,
+        "learning_rate": args.learning_rate,
+        "seed": args.seed,
+        "held_out": {name: asdict(one) for name, one in sorted(found.items())},
+    }
+    (args.out / "card.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

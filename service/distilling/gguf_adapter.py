@@ -1,0 +1,75 @@
+"""A LoRA adapter as a GGUF file, which llama.cpp applies to the embedded model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import gguf
+import numpy as np
+from numpy.typing import NDArray
+
+from service.llm.adapter import PROMPT_VERSION, VERSION_KEY
+
+# The model's matrices: transformers' names, and llama.cpp's.
+_NAMES = {
+    "self_attn.q_proj": "attn_q",
+    "self_attn.k_proj": "attn_k",
+    "self_attn.v_proj": "attn_v",
+    "self_attn.o_proj": "attn_output",
+    "mlp.gate_proj": "ffn_gate",
+    "mlp.up_proj": "ffn_up",
+    "mlp.down_proj": "ffn_down",
+}
+_HALVES = {"lora_A": "lora_a", "lora_B": "lora_b"}
+
+
+def write_gguf_adapter(
+    path: Path, weights: Mapping[str, NDArray[np.float32]], *, alpha: float, heads: int, kv_heads: int
+) -> None:
+    """Write a LoRA adapter for a model of llama.cpp's architecture ``llama``.
+
+    llama.cpp orders the rows of the query and key matrices otherwise than transformers, because of its rotary
+    embedding: within a head, the second half's row i comes after the first half's row i. So the rows of these matrices'
+    B are permuted.
+
+    Args:
+        weights: by peft's name, such as ``base_model.model.model.layers.0.mlp.up_proj.lora_A.weight``: A ``(r, in)``
+            and B ``(out, r)``.
+        alpha: the adapter adds ``alpha / r B A`` to each matrix.
+        heads, kv_heads: the model's attention heads.
+
+    Raises:
+        ValueError: a weight's name is unknown.
+    """
+    writer = gguf.GGUFWriter(path, "llama")
+    writer.add_string("general.type", "adapter")
+    writer.add_string("adapter.type", "lora")
+    writer.add_float32("adapter.lora.alpha", alpha)
+    writer.add_uint32(VERSION_KEY, PROMPT_VERSION)
+    for name, values in weights.items():
+        target, half = _target(name)
+        if half == "lora_b" and target.endswith(("attn_q.weight", "attn_k.weight")):
+            values = _permuted(values, heads if "attn_q" in target else kv_heads)
+        writer.add_tensor(f"{target}.{half}", np.ascontiguousarray(values.astype(np.float16)))
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_tensors_to_file()
+    writer.close()
+
+
+def _target(name: str) -> tuple[str, str]:
+    """llama.cpp's name of the matrix, and the half of the adapter."""
+    _, _, within = name.partition("layers.")
+    layer, _, rest = within.partition(".")
+    for theirs, ours in _NAMES.items():
+        for part, half in _HALVES.items():
+            if rest.startswith(f"{theirs}.{part}"):
+                return f"blk.{layer}.{ours}.weight", half
+    raise ValueError(f"{name} is no adapter weight of a model of architecture llama")
+
+
+def _permuted(rows: NDArray[np.float32], heads: int) -> NDArray[np.float32]:
+    shape = rows.shape
+    halves = rows.reshape(heads, 2, shape[0] // heads // 2, *shape[1:])
+    return np.asarray(halves.swapaxes(1, 2).reshape(shape))

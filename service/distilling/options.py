@@ -1,0 +1,50 @@
+"""The options of ``aicvds distill``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import arg
+
+
+@dataclass(frozen=True)
+class Distill:
+    """Train a LoRA adapter: the embedded LLM learns the compact prompt and the teachers' decisions.
+
+    Record first, a file for each scenario:  aicvds explore --scenario shadowed --out runs/shadowed.jsonl.gz
+
+    Then:  aicvds distill runs/*.jsonl.gz --out runs/adapter
+
+    The rows of a prompt and their letters are shuffled. The target of a decision is the teacher's action, with 0.6 of
+    the probability, and every candidate by its expected loss, with the rest. Every eleventh mission of a file is held
+    out. Training goes on where it was interrupted: the folder has its examples and its last checkpoint. On 2 cores a
+    thousand steps take about an hour, on a GPU a minute or two.
+
+    The folder gets adapter.gguf for llama.cpp (AICVDS_LLM_ADAPTER), peft/ for vLLM, and card.json with the result.
+    """
+
+    rollouts: Annotated[tyro.conf.Positional[tuple[Path, ...]], arg(metavar="FILE")]
+    """What `aicvds explore` wrote, with a teacher."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """Folder of the examples, the checkpoint and the adapter."""
+    begin: Annotated[Path | None, arg(metavar="FOLDER")] = None
+    """A peft/ folder of an earlier run to go on from, with new rollouts; by default the adapter begins at zero."""
+    steps: int = 3000
+    """Steps of Adam."""
+    batch: int = 16
+    """Decisions a step."""
+    rank: int = 8
+    """Rank of the adapter's matrices: 8 makes a file of 5 MB."""
+    learning_rate: float = 1e-3
+    """Adam's step size after 30 steps; it falls to a tenth along a cosine."""
+    seed: int = 0
+    """Of the initial weights and the order of the decisions."""
+    workers: int = 1
+    """Processes that make the examples of one file each."""
+    threads: int = 0
+    """Threads of the training on a CPU; 0: all cores."""
+    device: str = "auto"
+    """A device of torch; auto: a GPU where there is one."""

@@ -1,0 +1,143 @@
+"""The compact prompt: one digit for each number, for an LLM with the adapter that was trained on it.
+
+The user message is one line of letters and digits, which the embedded model reads as one token each:
+
+    U 9 3 4 2 1 5   A 7 3 5 9 2 8 4 6   E 9 1 6 9 3 0 4 4   ...      (without the spaces)
+
+``U`` begins the UAV's own six digits, and a row's first choice letter its sensor's eight. :func:`fleet_digits` and
+:func:`row_digits` define them. An adapter names the version of this prompt that it was trained on:
+:data:`service.llm.adapter.PROMPT_VERSION` changes whenever a text here does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from service.prompting.candidates import CandidateSet, Viewpoint
+from service.prompting.guided_prompt import GuidedTemplate
+from service.prompting.prompt import note_block
+from service.prompting.row_formats import Cells
+from shared.channel import FloatArray
+from shared.features import Reach, State
+from shared.learned_channel import LIKELY, ExpectedLinks
+from shared.scenario import Scenario
+
+STATIC = "{note}Collect packets. Answer with one letter."
+
+
+# The outlook's steps, and the pace of every UAV in them as a share of full speed.
+_STEPS = 9
+_PACE = 0.6
+# The steps of the outlook whose urgency the prompt shows, from 0.
+_SHOWN_STEPS = [0, 1, 3, 7]
+# The sum of urgencies that the digit 9 stands for.
+_MOST_URGENCY = 3.0
+_NINE = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What the fleet's next steps bring at a steady pace, J sensors.
+
+    Attributes:
+        own: shape ``(J,)``, the steps of the next nine in which the UAV is likely to reach each sensor.
+        others: shape ``(J,)``, the same of the other UAVs, added up.
+        ahead: shape ``(9, J)``, whether the UAV reaches each sensor in each of these steps.
+    """
+
+    own: NDArray[np.int64]
+    others: NDArray[np.int64]
+    ahead: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, view: Viewpoint, scenario: Scenario) -> Self:
+        """From the fleet's belief."""
+        metres = _PACE * scenario.max_velocity * scenario.step_s * np.arange(1.0, _STEPS + 1.0)
+        fleet = {view.uav_id, *view.belief.present(view.step)}
+        reached = {uav: _reached(view, uav, metres, scenario) for uav in fleet}
+        own = reached.pop(view.uav_id)
+        others = np.sum([steps.sum(axis=0) for steps in reached.values()], axis=0, dtype=np.int64)
+        return cls(own.sum(axis=0), np.broadcast_to(others, own.shape[1:]), own)
+
+
+def _reached(view: Viewpoint, uav: int, metres: FloatArray, scenario: Scenario) -> NDArray[np.bool_]:
+    belief = view.belief
+    if view.learned:
+        links = belief.links(uav, metres)
+    else:
+        links = ExpectedLinks.by_formula(belief.distances(uav, metres), scenario)
+    return np.asarray((links.packets > 0) & (links.hold >= LIKELY))
+
+
+def digits(values: ArrayLike) -> NDArray[np.int64]:
+    """Numbers as digits: rounded, at least 0 and at most 9."""
+    return np.clip(np.rint(np.asarray(values, dtype=np.float64)), 0, _NINE).astype(np.int64)
+
+
+def fleet_digits(state: State, outlook: Outlook, step: int, scenario: Scenario) -> str:
+    """The UAV's six digits.
+
+    They are the steps left, at most 9; the mean fill of the sensors' queues, 9 for W; and the urgency of the sensors
+    that the UAV reaches after 1, 2, 4 and 8 steps, 9 for a sum of 3.
+    """
+    fill = state.queue.mean() / scenario.queue_capacity
+    urgency = outlook.ahead[_SHOWN_STEPS][:, state.ids] @ state.urgency
+    shown = digits([scenario.steps - step, _NINE * fill, *(_NINE / _MOST_URGENCY * urgency)])
+    return "".join(map(str, shown.tolist()))
+
+
+def row_digits(state: State, reach: Reach, outlook: Outlook, scenario: Scenario) -> NDArray[np.int64]:
+    """Each sensor's six digits, ``(J, 6)``.
+
+    They are the queue, ``9 sqrt(q / W)``; the steps until it overflows; the packets that the UAV can collect at the
+    velocity of most worth, ``9 sqrt(m / W)``; the probability that the link holds there, 9 for certain; the steps of
+    the next nine in which this UAV reaches the sensor; and the same of the other UAVs, added up.
+    """
+    capacity, rows = scenario.queue_capacity, np.arange(len(state.ids))
+    room = capacity - state.queue
+    left = np.divide(room, state.rate, out=np.full_like(room, _NINE), where=state.rate > 0)
+    columns = (
+        _NINE * np.sqrt(state.queue / capacity),
+        np.floor(left),
+        _NINE * np.sqrt(reach.best_packets / capacity),
+        _NINE * reach.links.hold[reach.best, rows],
+        outlook.own[state.ids],
+        outlook.others[state.ids],
+    )
+    return np.stack([digits(column) for column in columns], axis=1)
+
+
+class CompactTemplate(GuidedTemplate):
+    """The template of the compact prompt; its rows are shuffled, and its letters carry no rank."""
+
+    def __init__(self, scenario: Scenario, *, rows: int, note: str | None = None) -> None:
+        super().__init__(scenario, rows=rows, experiences=0, ranked=False, note=note)
+        self._scenario = scenario
+        self.static = STATIC.format(note=note_block(note))
+
+    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
+        """Nothing: this version of the prompt has no experiences."""
+        return ""
+
+    def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
+        """The candidates for these rows of a state, with the whole user message as their text."""
+        scenario = self._scenario
+        outlook = Outlook.of(view, scenario)
+        numbers = row_digits(state, reach, outlook, scenario)
+        level = _NINE / scenario.max_velocity
+
+        def row(letter: str, row: int, options: Sequence[int]) -> str:
+            span = digits([level * options[0], level * options[-1]])
+            return letter + "".join(map(str, (*numbers[row].tolist(), *span.tolist())))
+
+        chosen = CandidateSet.of(state, reach, shown, self.letters, row)
+        return replace(chosen, rows=f"U{fleet_digits(state, outlook, view.step, scenario)}{chosen.rows}")
+
+    def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
+        """None: the adapter is trained with shuffled rows, so it has no bias towards letters to be measured."""
+        return []

@@ -1,0 +1,182 @@
+"""`aicvds distill` on the real embedded model: small, resumed, written as GGUF, and served by llama.cpp."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from service.commands.distill import main
+from service.config.settings import Settings
+from service.distilling.adapter_training import Student, loss_of, targets_of, train
+from service.distilling.distill import distill
+from service.distilling.examples import PromptExample, prompt_examples
+from service.distilling.examples_file import examples_of
+from service.distilling.options import Distill
+from service.llm.adapter import PROMPT_VERSION, check_adapter
+from service.llm.embedded import EmbeddedServer
+from service.llm.model_file import embedded_model
+from service.llm.request_bodies import label_body
+from service.prompting.compact_prompt import STATIC
+from shared.rollouts import Header, read_rollouts, write_rollouts
+from shared.scenario import SCENARIOS
+from simulator.flying.exploration import explore
+from tests.waiting import PATIENCE_S
+
+SHORT = SCENARIOS["paper"].model_copy(update={"steps": 5})
+
+
+@pytest.fixture(scope="module")
+def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("rollouts") / "paper.jsonl.gz"
+    steps = [step for mission in range(60_000, 60_003) for step in explore(SHORT, mission, "planner")]
+    write_rollouts(file, Header(scenario=SHORT, missions=3, behaviour="test"), steps)
+    return file
+
+
+@pytest.fixture(scope="module")
+def distilled(rollouts: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "adapter"
+    distill(Distill(rollouts=(rollouts,), out=out, steps=3, batch=4, rank=2), Console(quiet=True))
+    return out
+
+
+def test_a_target_prefers_the_teachers_action_and_shares_the_rest_by_regret(rollouts: Path) -> None:
+    header, steps = read_rollouts(rollouts)
+    missions = list(prompt_examples(header, steps))
+    assert [len(mission) for mission in missions] == [SHORT.steps * SHORT.uavs] * 3
+    for example in (example for mission in missions for example in mission):
+        assert example.target.sum() == pytest.approx(1.0)
+        assert len(example.labels) == len(example.sensors) == len(example.target)
+        if example.reference >= 0:
+            own = np.array(example.sensors) == example.sensors[example.reference]
+            assert example.target[own].sum() >= 0.6
+            assert example.target[example.reference] == example.target.max()
+
+
+def test_rows_are_shuffled(rollouts: Path) -> None:
+    header, steps = read_rollouts(rollouts)
+    places = {example.reference // 4 for mission in prompt_examples(header, steps) for example in mission}
+    assert {0, 1, 2, 3, 4} <= places
+
+
+def test_the_examples_are_kept_and_every_eleventh_mission_is_held_out(rollouts: Path, tmp_path: Path) -> None:
+    [(name, training, held)] = examples_of([rollouts], tmp_path, 1)
+    assert (name, len(training), len(held)) == ("paper", 30, 15)
+    [kept] = tmp_path.glob("examples-*.json.gz")
+    written = kept.stat().st_mtime_ns
+    [(_, again, _)] = examples_of([rollouts], tmp_path, 1)
+    assert kept.stat().st_mtime_ns == written
+    assert [example.text for example in again] == [example.text for example in training]
+    assert np.allclose(again[3].target, training[3].target)
+
+
+def test_a_file_without_a_teacher_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "untaught.jsonl.gz"
+    write_rollouts(file, Header(scenario=SHORT, missions=2, behaviour="test"), explore(SHORT, 60_000))
+    assert main([str(file), "--out", str(tmp_path / "out")]) == 2
+    assert "has no decision with a teacher" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--steps", "0"], "--steps 0 is not at least 1"),
+        (["--rank", "65"], "--rank 65 is not between 1 and 64"),
+        (["--learning-rate", "0"], "--learning-rate 0 is not above 0"),
+        (["--threads", "-1"], "--threads -1 is below 0"),
+    ],
+)
+def test_bad_options_are_named(
+    options: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rollouts.jsonl.gz", "--out", str(tmp_path), *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "none.jsonl.gz"), "--out", str(tmp_path / "out")]) == 2
+    assert "none.jsonl.gz" in capsys.readouterr().err
+
+
+def test_the_loss_counts_only_offered_letters() -> None:
+    example = PromptExample("U", "ABEF", np.array([0.5, 0.5, 0.0, 0.0]), (1, 1, 2, 2), 0)
+    target, offered = targets_of([example])
+    logits = torch.zeros(1, 20)
+    logits[0, 2] = 50.0
+    assert float(loss_of(logits, target, offered)) == pytest.approx(np.log(4.0), abs=1e-5)
+
+
+@pytest.mark.long
+def test_it_writes_an_adapter_for_llama_cpp_one_for_vllm_and_a_card(distilled: Path) -> None:
+    check_adapter(distilled / "adapter.gguf")
+    assert (distilled / "peft" / "adapter_model.safetensors").is_file()
+    card = json.loads((distilled / "card.json").read_text(encoding="utf-8"))
+    assert (card["prompt_version"], card["steps"], card["examples"]) == (PROMPT_VERSION, 3, 30)
+    assert 0.0 <= card["held_out"]["paper"]["sensor"] <= 1.0
+
+
+@pytest.mark.long
+def test_llama_cpp_gives_the_trained_probabilities(distilled: Path, rollouts: Path) -> None:
+    header, steps = read_rollouts(rollouts)
+    example = next(prompt_examples(header, steps))[7]
+    gguf = embedded_model(Settings())
+    student = Student(gguf, STATIC, 2, "cpu", distilled / "peft")
+    # Three steps change little: a larger B shows that every matrix arrives at its place.
+    large = {}
+    with torch.no_grad():
+        for name, weight in student.model.named_parameters():
+            if "lora_B" in name:
+                weight += 0.05 * torch.randn_like(weight)
+                large[name] = weight
+        trained = torch.softmax(student.label_logits([example.text]), dim=1)[0].numpy()
+    adapter = distilled.parent / "large.gguf"
+    student.write_gguf(adapter)
+    base, adapted = (answered(gguf, one, example.text) for one in (None, adapter))
+    assert np.abs(adapted - trained).max() < 0.05
+    assert np.abs(base - trained).max() > 0.1
+    assert len(large) == 30 * 7
+
+
+def answered(gguf: Path, adapter: Path | None, text: str) -> np.ndarray:
+    """llama.cpp's probabilities of the twenty letters."""
+    letters = list("ABCDEFGHIJKLMNOPQRST")
+    server = EmbeddedServer(gguf, threads=1, context=512, adapter=adapter)
+    try:
+        body = label_body(None, STATIC, text, "grammar", [letters])
+        headers = {"Authorization": f"Bearer {server.api_key}"}
+        answer = httpx.post(f"{server.base_url}/chat/completions", json=body, headers=headers, timeout=PATIENCE_S)
+        [position] = answer.json()["choices"][0]["logprobs"]["content"]
+        found = {one["token"]: one["prob"] for one in position["top_probs"]}
+    finally:
+        server.close()
+    return np.array([found.get(letter, 0.0) for letter in letters])
+
+
+@pytest.mark.long
+def test_an_interrupted_training_goes_on_to_the_same_weights(
+    rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.distilling.adapter_training._CHECKPOINT_STEPS", 2)
+    args = Distill(rollouts=(rollouts,), out=tmp_path, steps=4, batch=2, rank=1)
+    [(_, examples, _)] = examples_of([rollouts], tmp_path, 1)
+
+    def student() -> Student:
+        torch.manual_seed(0)
+        return Student(embedded_model(Settings()), STATIC, args.rank, "cpu")
+
+    whole = list(train(student(), examples, args, tmp_path / "whole.pt"))
+    assert len(whole) == 4
+    begun = train(student(), examples, args, tmp_path / "half.pt")
+    for _ in range(3):
+        next(begun)
+    begun.close()
+    rest = list(train(student(), examples, args, tmp_path / "half.pt"))
+    assert rest == pytest.approx(whole[2:])
+    one, other = (torch.load(tmp_path / f"{name}.pt", weights_only=True)["weights"] for name in ("whole", "half"))
+    assert all(torch.allclose(a, b) for a, b in zip(one, other, strict=True))

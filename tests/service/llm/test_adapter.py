@@ -1,0 +1,44 @@
+"""The check that an adapter was trained on the prompt that this edge writes."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from service.llm.adapter import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+
+
+def metadata(version: int, kind: int = 4) -> bytes:
+    return b"GGUF" + bytes(20) + VERSION_KEY.encode() + struct.pack("<II", kind, version) + bytes(64)
+
+
+def test_an_adapter_of_this_version_passes(tmp_path: Path) -> None:
+    file = tmp_path / "adapter.gguf"
+    file.write_bytes(metadata(PROMPT_VERSION))
+    check_adapter(file)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (metadata(PROMPT_VERSION + 1), f"version {PROMPT_VERSION + 1} of the prompt, and this edge writes"),
+        (metadata(PROMPT_VERSION, kind=5), "of the prompt"),
+        (metadata(PROMPT_VERSION)[:60][: 24 + len(VERSION_KEY) + 3], "no adapter of aicvds distill"),
+        (b"GGUF" + bytes(100), "no adapter of aicvds distill"),
+        (metadata(PROMPT_VERSION)[1:], "no adapter of aicvds distill"),
+        (b"", "no adapter of aicvds distill"),
+    ],
+)
+def test_any_other_file_is_refused_with_the_remedy(tmp_path: Path, content: bytes, said: str) -> None:
+    file = tmp_path / "adapter.gguf"
+    file.write_bytes(content)
+    with pytest.raises(AdapterUnusable, match=said) as refused:
+        check_adapter(file)
+    assert "AICVDS_LLM_ADAPTER=off" in str(refused.value)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(AdapterUnusable, match="cannot be read"):
+        check_adapter(tmp_path / "adapter.gguf")
