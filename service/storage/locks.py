@@ -102,6 +102,9 @@ class AdvisoryLock:
         try:
             with connection.begin():
                 newest = connection.scalar(sa.select(sa.func.max(self._terms.c.term)))
+                if newest != self._term:
+                    # PostgreSQL takes a moment to notice that a connection has ended, and keeps its lock until then.
+                    connection.scalar(sa.select(sa.func.pg_advisory_unlock(_ADVISORY_LOCK)))
             if newest != self._term:
                 raise StoreUnusable("another edge has had it since: end this one, its missions are out of date")
         except BaseException:

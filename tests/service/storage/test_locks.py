@@ -40,11 +40,11 @@ def test_a_file_known_by_a_link_is_the_same_store(tmp_path: Path) -> None:
 
 
 def _break_holds(url: str) -> None:
-    """As a network that fails does: PostgreSQL ends the connection that has the lock."""
+    """As a network that fails does: PostgreSQL ends the connection that has the lock. The lock is free on return."""
     root = create_engine(url.replace("postgresql://", "postgresql+psycopg://"), isolation_level="AUTOCOMMIT")
     holders = "SELECT pid FROM pg_locks WHERE locktype = 'advisory'"
     with root.connect() as db:
-        db.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({holders}) AS holders"))
+        db.execute(text(f"SELECT pg_terminate_backend(pid, 60000) FROM ({holders}) AS holders"))
     root.dispose()
 
 
