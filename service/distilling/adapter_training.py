@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from service.distilling.gguf_adapter import write_gguf_adapter
 from service.distilling.options import Distill
 
 _MATRICES = ["q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj"]
+_BASE = "HuggingFaceTB/SmolLM2-135M-Instruct"
 _LETTERS = "ABCDEFGHIJKLMNOPQRST"
 _WARM_UP_STEPS = 30
 _MOST_GRADIENT = 1.0
@@ -44,11 +46,14 @@ class Student:
             quantization_config=GgufConfig(dequantize=True),
         )
         base.config.use_cache = False
-        if begin is None:
-            config = LoraConfig(r=rank, lora_alpha=2 * rank, target_modules=_MATRICES, bias="none")
-            self.model: Any = get_peft_model(base, config)
-        else:
-            self.model = PeftModel.from_pretrained(base, begin, is_trainable=True)
+        with warnings.catch_warnings():
+            # peft 0.21 reads an attribute that transformers 5.23 has renamed.
+            warnings.filterwarnings("ignore", "`is_gradient_checkpointing` is deprecated", FutureWarning)
+            if begin is None:
+                config = LoraConfig(r=rank, lora_alpha=2 * rank, target_modules=_MATRICES, bias="none")
+                self.model: Any = get_peft_model(base, config)
+            else:
+                self.model = PeftModel.from_pretrained(base, begin, is_trainable=True)
         self.model.to(device)
         self._device = torch.device(device)
         self._letters = torch.tensor(self._tokenizer.convert_tokens_to_ids(list(_LETTERS)), device=self._device)
@@ -73,6 +78,11 @@ class Student:
             ).last_hidden_state[:, -1]
             logits = hidden @ self.model.get_output_embeddings().weight[self._letters].T
         return torch.as_tensor(logits.float())
+
+    def write_peft(self, folder: Path) -> None:
+        """Write the adapter in Hugging Face's format, which names the model that the GGUF file was made of."""
+        self.model.peft_config["default"].base_model_name_or_path = _BASE
+        self.model.save_pretrained(folder, save_embedding_layers=False)
 
     def write_gguf(self, path: Path) -> None:
         """Write the adapter for llama.cpp."""

@@ -71,7 +71,7 @@ def _report(found: dict[str, Agreement], console: Console) -> None:
 
 
 def _write(student: Student, found: dict[str, Agreement], gguf: Path, examples: int, args: Distill) -> None:
-    student.model.save_pretrained(args.out / "peft")
+    student.write_peft(args.out / "peft")
     target = args.out / "adapter.gguf"
     student.write_gguf(target)
     card = {

@@ -129,17 +129,18 @@ def test_llama_cpp_gives_the_trained_probabilities(distilled: Path, rollouts: Pa
     student = Student(gguf, STATIC, 2, "cpu", distilled / "peft")
     # Three steps change little: a larger B shows that every matrix arrives at its place.
     large = {}
+    torch.manual_seed(0)
     with torch.no_grad():
         for name, weight in student.model.named_parameters():
             if "lora_B" in name:
-                weight += 0.05 * torch.randn_like(weight)
+                weight += 0.5 * torch.randn_like(weight)
                 large[name] = weight
         trained = torch.softmax(student.label_logits([example.text]), dim=1)[0].numpy()
     adapter = distilled.parent / "large.gguf"
     student.write_gguf(adapter)
     base, adapted = (answered(gguf, one, example.text) for one in (None, adapter))
+    assert np.abs(base - trained).max() > 0.15
     assert np.abs(adapted - trained).max() < 0.05
-    assert np.abs(base - trained).max() > 0.1
     assert len(large) == 30 * 7
 
 
