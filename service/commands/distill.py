@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
 def _check(args: Distill) -> None:
     if not args.rollouts:
         raise ValueError("name at least one file of `aicvds explore`")
-    for name in ("steps", "batch", "rank", "workers"):
+    for name in ("steps", "batch", "workers"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name} {getattr(args, name)} is not at least 1")
     if not 1 <= args.rank <= 64:

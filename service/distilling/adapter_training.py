@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import warnings
 from collections.abc import Generator, Sequence
@@ -168,12 +169,18 @@ def agreement(student: Student, examples: Sequence[PromptExample]) -> Agreement:
 def train(
     student: Student, examples: Sequence[PromptExample], args: Distill, checkpoint: Path
 ) -> Generator[float, None, None]:
-    """Train, and yield each step's loss; goes on from the checkpoint, which is written every fifty steps."""
+    """Train, and yield each step's loss; goes on from the checkpoint, which is written every fifty steps.
+
+    Raises:
+        ValueError: the checkpoint is of another run.
+    """
     weights = [p for p in student.model.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(weights, lr=args.learning_rate, weight_decay=0.0)
     first = 0
     if checkpoint.is_file():
         found = torch.load(checkpoint, weights_only=True)
+        if found["run"] != _run(examples, args):
+            raise ValueError(f"{checkpoint} is of a run with other recordings or options: give --out another folder")
         first = found["step"]
         optimizer.load_state_dict(found["optimizer"])
         with torch.no_grad():
@@ -194,6 +201,7 @@ def train(
         if (step + 1) % _CHECKPOINT_STEPS == 0 or step + 1 == args.steps:
             half = checkpoint.with_suffix(".part")
             kept = {
+                "run": _run(examples, args),
                 "step": step + 1,
                 "optimizer": optimizer.state_dict(),
                 "weights": [weight.detach().cpu() for weight in weights],
@@ -203,16 +211,22 @@ def train(
         yield float(loss.detach())
 
 
+def _run(examples: Sequence[PromptExample], args: Distill) -> str:
+    """What determines a run's weights, as text."""
+    texts = hashlib.sha256("\n".join(example.text for example in examples).encode()).hexdigest()
+    return f"{texts} {args.begin} {args.steps} {args.batch} {args.rank} {args.learning_rate} {args.seed}"
+
+
 def _batch(count: int, args: Distill, step: int) -> list[int]:
     """The examples of a step: each pass over all of them has its own order, drawn from the seed."""
     first = step * args.batch
     places = range(first, first + args.batch)
     orders: dict[int, list[int]] = {}
     for place in places:
-        turn = place // count
-        if turn not in orders:
-            generator = torch.Generator().manual_seed(args.seed * 1_000_003 + turn)
-            orders[turn] = torch.randperm(count, generator=generator).tolist()
+        one_pass = place // count
+        if one_pass not in orders:
+            generator = torch.Generator().manual_seed(args.seed * 1_000_003 + one_pass)
+            orders[one_pass] = torch.randperm(count, generator=generator).tolist()
     return [orders[place // count][place % count] for place in places]
 
 

@@ -3,6 +3,7 @@ import numpy as np
 from shared.actions import Action
 from shared.channel import channel_gain_db
 from shared.features import FEATURES, urgency
+from shared.wire import MissionSpec
 from tests.service.making import PAPER, attended, mission, uav
 
 
@@ -46,3 +47,13 @@ def test_top_k_is_the_missions() -> None:
     assert len(view.rows) == 2
     scores, _ = mission().learner.weights.score(view.state.features(PAPER))
     assert view.kept_ids == np.argsort(-scores.numpy())[:2].tolist()
+
+
+def test_the_shipped_start_prefers_a_full_queue_among_sensors_visited_alike() -> None:
+    x, y = PAPER.lap_centres[0]
+    report = uav(position=(x + PAPER.lap_radius_m, y), x=[x + PAPER.lap_radius_m + 40.0 * i for i in range(6)])
+    m = mission(MissionSpec(features="reach"))
+    m.observe(report, 0)
+    view = attended(m, report)
+    assert view.state.queue.argmax() == 5
+    assert view.kept_ids[0] == 5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -181,3 +182,5 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
     assert rest == pytest.approx(whole[2:])
     one, other = (torch.load(tmp_path / f"{name}.pt", weights_only=True)["weights"] for name in ("whole", "half"))
     assert all(torch.allclose(a, b) for a, b in zip(one, other, strict=True))
+    with pytest.raises(ValueError, match="give --out another folder"):
+        next(train(student(), examples, replace(args, seed=1), tmp_path / "half.pt"))
