@@ -98,7 +98,7 @@ class Calls:
         if not self.on:
             return
         if event == "return" and frame.f_code is _SEND.__code__:
-            # What comes after the answer's last byte is not on its way.
+            # The way ends with the answer's last byte.
             self.on = not frame.f_locals["self"].response_complete
         if event != "call":
             return

@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from service.distilling.options import Distill
+from service.llm.model_file import ModelMissing
 
 
 def main(argv: list[str]) -> int:
@@ -20,7 +21,7 @@ def main(argv: list[str]) -> int:
         from service.distilling.distill import distill
 
         distill(args, console)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ModelMissing) as error:
         print(f"aicvds distill: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as missing:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import random
 from dataclasses import asdict
@@ -19,7 +18,7 @@ from service.distilling.examples import PromptExample
 from service.distilling.examples_file import examples_of
 from service.distilling.options import Distill
 from service.llm.adapter import PROMPT_VERSION
-from service.llm.model_file import embedded_model
+from service.llm.model_file import embedded_model, sha256
 from service.prompting.compact_prompt import STATIC
 
 # Held-out decisions of each scenario that are evaluated.
@@ -27,7 +26,12 @@ _EVALUATED = 300
 
 
 def distill(args: Distill, console: Console) -> None:
-    """Train an adapter and write its files; raises ``OSError`` and ``ValueError`` for bad input."""
+    """Train an adapter and write its files.
+
+    Raises:
+        OSError, ValueError: a file cannot be read, or has nothing to train on.
+        ModelMissing: the embedded model's file does not exist.
+    """
     device = args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     torch.set_num_threads(args.threads or usable_cores())
     torch.manual_seed(args.seed)
@@ -77,8 +81,8 @@ def _write(student: Student, found: dict[str, Agreement], gguf: Path, examples: 
     card = {
         "prompt_version": PROMPT_VERSION,
         "base": gguf.name,
-        "base_sha256": _sha256(gguf),
-        "adapter_sha256": _sha256(target),
+        "base_sha256": sha256(gguf),
+        "adapter_sha256": sha256(target),
         "rollouts": sorted(source.name for source in args.rollouts),
         "examples": examples,
         "steps": args.steps,
@@ -89,8 +93,3 @@ def _write(student: Student, found: dict[str, Agreement], gguf: Path, examples: 
         "held_out": {name: asdict(one) for name, one in sorted(found.items())},
     }
     (args.out / "card.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -10,11 +10,10 @@ import numpy as np
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.deliberation import candidates_of
+from service.deciding.deliberation import candidates_of, template_of
 from service.deciding.rollout_evaluator import RolloutState, evaluate
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
-from service.prompting.compact_prompt import CompactTemplate
 from service.training.recorded_states import recorded_states
 from shared.actions import Action
 from shared.channel import FloatArray
@@ -45,33 +44,36 @@ class PromptExample:
 
 def prompt_examples(header: Header, steps: Iterable[RolloutStep]) -> Iterator[list[PromptExample]]:
     """Each mission's examples, in the states that the edge would have had."""
-    settings = Settings(mode="guided", store="none")
+    settings = Settings(mode="guided", store="none", llm_adapter="served")
     for mission_id, group in groupby(steps, key=lambda step: step.request.mission_id):
         logged = list(group)
         seed = int(mission_id.rpartition("-")[2])
         spec = MissionSpec.model_validate(
-            {"scenario": header.scenario, "planner": "off", "prompt": {"order": "shuffled"}, "seed": seed}
+            {
+                "scenario": header.scenario,
+                "planner": "off",
+                "prompt": {"format": "compact", "order": "shuffled"},
+                "seed": seed,
+            }
         )
         mission = Mission(mission_id, spec, settings)
-        template = CompactTemplate(mission.scenario, rows=mission.top_k)
-        mission.template = template
         yield [
-            _example(state, template, step.reference)
+            _example(state, step.reference)
             for step, state in recorded_states(mission, logged)
             if step.reference is not None and len(state.rows) > 1
         ]
 
 
-def _example(state: AttendedState, template: CompactTemplate, reference: Reference) -> PromptExample:
-    candidates = candidates_of(state, template)
+def _example(state: AttendedState, reference: Reference) -> PromptExample:
     mission = state.mission
+    candidates = candidates_of(state, template_of(mission))
     rollout = RolloutState.of(
         mission.belief, mission.scenario, state.step, state.uav_id, seed=mission.spec.seed, reserved=state.reserved
     )
     lost = evaluate(rollout, candidates.actions).lost
     labels = "".join(candidates.labels)
     index = np.array([candidates.labels[label] for label in labels])
-    chosen = nearest_label(candidates, labels, Action(reference.sensor_id, reference.velocity))
+    chosen = _nearest_label(candidates, labels, Action(reference.sensor_id, reference.velocity))
     return PromptExample(
         text=candidates.rows,
         labels=labels,
@@ -94,7 +96,7 @@ def _target(lost: FloatArray, index: np.ndarray, chosen: int) -> FloatArray:
     return np.asarray(target)
 
 
-def nearest_label(candidates: CandidateSet, labels: Sequence[str], action: Action) -> int:
+def _nearest_label(candidates: CandidateSet, labels: Sequence[str], action: Action) -> int:
     """The place of the label with the action's sensor and the nearest velocity; -1 without the sensor."""
     own = [
         i

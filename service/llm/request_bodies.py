@@ -76,10 +76,11 @@ def label_body(
     """The request body for one label of each list, with the likeliest tokens' probabilities if ``logprobs``.
 
     By default llama.cpp gives its probabilities from before the grammar. After sampling at temperature 0 all but one
-    are 0. So it samples at temperature 1 without cutting any token off: the text is a draw, and the probabilities are
-    exactly the model's among the labels. The probabilities of a later label depend on the labels drawn before it. So
-    several labels are drawn at a low temperature, nearly always the likeliest, which :meth:`TokenPosition.untempered`
-    undoes.
+    are 0. So it samples at temperature 1 without cutting any token off: the text is a draw. llama.cpp applies the
+    grammar only after a first draw that violates it. The probabilities are among the labels then, and among all tokens
+    otherwise, so the caller renormalises them. The probabilities of a later label depend on the labels drawn before it.
+    So several labels are drawn at a low temperature, nearly always the likeliest, which
+    :meth:`TokenPosition.untempered` undoes.
     """
     body: dict[str, Any] = {
         "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],

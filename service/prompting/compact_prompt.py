@@ -29,7 +29,6 @@ from shared.scenario import Scenario
 
 STATIC = "{note}Collect packets. Answer with one letter."
 
-
 # The outlook's steps, and the pace of every UAV in them as a share of full speed.
 _STEPS = 9
 _PACE = 0.6
@@ -131,11 +130,11 @@ class CompactTemplate(GuidedTemplate):
         numbers = row_digits(state, reach, outlook, scenario)
         level = _NINE / scenario.max_velocity
 
-        def row(letter: str, row: int, options: Sequence[int]) -> str:
+        def write(letter: str, row: int, options: Sequence[int]) -> str:
             span = digits([level * options[0], level * options[-1]])
             return letter + "".join(map(str, (*numbers[row].tolist(), *span.tolist())))
 
-        chosen = CandidateSet.of(state, reach, shown, self.letters, row)
+        chosen = CandidateSet.of(state, reach, shown, self.letters, write)
         return replace(chosen, rows=f"U{fleet_digits(state, outlook, view.step, scenario)}{chosen.rows}")
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:

@@ -88,15 +88,16 @@ class GuidedTemplate(Template):
 
     def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
         """The candidates for these rows of a state, in this order."""
-        texts = dict(zip(shown, cells(state, shown), strict=True))
+        lettered = shown[: self.letters.rows]
+        texts = dict(zip(lettered, cells(state, lettered), strict=True))
 
-        def row(letter: str, row: int, options: Sequence[int]) -> str:
+        def write(letter: str, row: int, options: Sequence[int]) -> str:
             # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
             slowest, fastest = options[0], options[-1]
             span = f"{slowest}-{fastest}" if 0 < slowest < fastest else str(fastest)
             return f"{letter}{texts[row]['queue']},{texts[row]['age']},{span}\n"
 
-        return CandidateSet.of(state, reach, shown, self.letters, row)
+        return CandidateSet.of(state, reach, lettered, self.letters, write)
 
     def choice_prompt(
         self, candidates: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()

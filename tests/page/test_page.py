@@ -365,7 +365,6 @@ def test_alarms_name_the_sensors(visit: Open, edge: str, report: Report) -> None
 
 def test_alarms_name_bad_links_and_dead_radios(visit: Open, edge: str, report: Report) -> None:
     outcome = None
-    # Five sensors are heard, and each radio fails some times before it counts as dead.
     for step in range(20, 60):
         body = report(mission_id="shadowed", step=step)
         body["sensors"] |= {"last_seen": [step] * 5, "channel_gain": [-90.0, -90.0, -90.0, -108.0, -90.0]}
@@ -374,8 +373,7 @@ def test_alarms_name_bad_links_and_dead_radios(visit: Open, edge: str, report: R
         outcome = {"decision_id": answer.json()["decision_id"], "cost": 1.0, "failed": True}
         if httpx.get(f"{edge}/missions/shadowed", timeout=PATIENCE_S).json()["learned"]["failed_radios"]:
             break
-    page = visit(f"{edge}/?mission=shadowed")
-    alarms = page.locator("#alarm-list")
+    alarms = visit(f"{edge}/?mission=shadowed").locator("#alarm-list")
     expect(alarms).to_contain_text(re.compile(r"Radio probably dead: S\d"))
     expect(alarms).to_contain_text(re.compile(r"Links worse than modelled: .*S\d \(\d+ dB\)"))
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from dataclasses import replace
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 import torch
@@ -20,6 +20,9 @@ from service.distilling.examples import PromptExample, prompt_examples
 from service.distilling.examples_file import examples_of
 from service.distilling.options import Distill
 from service.llm.adapter import PROMPT_VERSION, check_adapter
+from service.llm.answers import Completion
+from service.llm.calibration import probabilities
+from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import embedded_model
 from service.llm.request_bodies import label_body
@@ -105,6 +108,14 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.Captur
     assert "none.jsonl.gz" in capsys.readouterr().err
 
 
+def test_without_the_embedded_model_the_remedy_is_named(
+    rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("AICVDS_CACHE_DIR", str(tmp_path))
+    assert main([str(rollouts), "--out", str(tmp_path / "out")]) == 2
+    assert "aicvds model fetch" in capsys.readouterr().err
+
+
 def test_the_loss_counts_only_offered_letters() -> None:
     example = PromptExample("U", "ABEF", np.array([0.5, 0.5, 0.0, 0.0]), (1, 1, 2, 2), 0)
     target, offered = targets_of([example])
@@ -139,25 +150,32 @@ def test_llama_cpp_gives_the_trained_probabilities(distilled: Path, rollouts: Pa
         trained = torch.softmax(student.label_logits([example.text]), dim=1)[0].numpy()
     adapter = distilled.parent / "large.gguf"
     student.write_gguf(adapter)
-    base, adapted = (answered(gguf, one, example.text) for one in (None, adapter))
+    # llama.cpp's first draw decides whether its probabilities are among the labels or among all tokens.
+    base, adapted = answered(gguf, None, example.text, 1), answered(gguf, adapter, example.text, 8)
     assert np.abs(base - trained).max() > 0.15
     assert np.abs(adapted - trained).max() < 0.05
     assert len(large) == 30 * 7
 
 
-def answered(gguf: Path, adapter: Path | None, text: str) -> np.ndarray:
-    """llama.cpp's probabilities of the twenty letters."""
+def answered(gguf: Path, adapter: Path | None, text: str, times: int) -> np.ndarray:
+    """llama.cpp's probabilities of the twenty letters, read as the edge reads them, ``(times, 20)``."""
     letters = list("ABCDEFGHIJKLMNOPQRST")
     server = EmbeddedServer(gguf, threads=1, context=512, adapter=adapter)
-    try:
+
+    async def ask() -> list[Completion]:
+        client = LLMClient(server.base_url, api_key=server.api_key, trust_env=False)
         body = label_body(None, STATIC, text, "grammar", [letters])
-        headers = {"Authorization": f"Bearer {server.api_key}"}
-        answer = httpx.post(f"{server.base_url}/chat/completions", json=body, headers=headers, timeout=PATIENCE_S)
-        [position] = answer.json()["choices"][0]["logprobs"]["content"]
-        found = {one["token"]: one["prob"] for one in position["top_probs"]}
+        try:
+            return [await client.complete(body) for _ in range(times)]
+        finally:
+            await client.close()
+
+    try:
+        answers = asyncio.run(asyncio.wait_for(ask(), PATIENCE_S))
     finally:
         server.close()
-    return np.array([found.get(letter, 0.0) for letter in letters])
+    found = [probabilities(answer, [letters])[0] for answer in answers]
+    return np.array([[by_label[letter] for letter in letters] for by_label in found])
 
 
 @pytest.mark.long

@@ -162,7 +162,7 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
     clock = Clock()
     monkeypatch.setattr("service.deciding.decision_time.time", clock)
     monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
-    # What is left of the deadline is real time, which eight evaluations on a busy machine would exceed.
+    # The rest of the deadline passes in real time, and eight evaluations are slow on a busy machine.
     monkeypatch.setattr("service.deciding.rollout_evaluator._FUTURES", 1)
     chorus = Chorus(hangs_on="UAV")
     with serving(chorus.app) as url, chorus.gate:
