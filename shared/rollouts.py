@@ -46,10 +46,12 @@ class RolloutStep(Wire):
 
 
 def write_rollouts(path: Path, header: Header, steps: Iterable[RolloutStep]) -> None:
-    """Write gzipped JSON lines, the header first."""
-    with gzip.open(path, "wt", encoding="utf-8", compresslevel=3) as file:
+    """Write gzipped JSON lines, the header first; until the last step is written the name ends with ``.part``."""
+    half = path.with_name(f"{path.name}.part")
+    with gzip.open(half, "wt", encoding="utf-8", compresslevel=3) as file:
         file.write(header.model_dump_json() + "\n")
         file.writelines(step.model_dump_json() + "\n" for step in steps)
+    half.replace(path)
 
 
 def read_rollouts(path: Path) -> tuple[Header, Iterator[RolloutStep]]:

@@ -23,6 +23,8 @@ from service.prompting.compact_prompt import STATIC
 
 # Held-out decisions of each scenario that are evaluated.
 _EVALUATED = 300
+# Steps whose mean loss is shown; a log has a line as often.
+_RECENT = 50
 
 
 def distill(args: Distill, console: Console) -> None:
@@ -55,9 +57,12 @@ def _train(student: Student, training: list[PromptExample], args: Distill, conso
         recent: list[float] = []
         left = args.steps
         for loss in train(student, training, args, args.out / "checkpoint.pt"):
-            recent = [*recent[-49:], loss]
-            progress.update(task, advance=1, description=f"Training, loss {sum(recent) / len(recent):.3f}")
+            recent = [*recent[1 - _RECENT :], loss]
+            said = f"Training, loss {sum(recent) / len(recent):.3f}"
+            progress.update(task, advance=1, description=said)
             left -= 1
+            if left % _RECENT == 0 and not console.is_terminal:
+                console.print(f"{args.steps - left} steps: {said}", highlight=False)
         progress.update(task, advance=left)
 
 

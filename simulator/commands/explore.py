@@ -17,6 +17,7 @@ from tyro.conf import arg
 
 from shared.rollouts import Header, RolloutStep, write_rollouts
 from shared.scenario import Scenario, scenario_named
+from simulator.errors import EdgeError
 from simulator.flying.exploration import explore
 
 # The world and the planner take seconds to import; `--help` and bad use answer without them.
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
 TeacherOption = Literal["both", "planner", "clairvoyant"]
 _BEHAVIOUR = "taught: mostly the reference's; untaught: half EOF or WQCS, half a random sensor; a random velocity"
+
+# Seconds in which an edge loads its LLM.
+_READY_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,9 @@ class Explore:
     Further worlds have no teacher, and every step deviates. The same command writes the same decisions, whatever the
     number of workers. `--first` adds further worlds in a file of their own; `aicvds pretrain` takes several files, of
     several scenarios.
+
+    With `--edge` the UAVs fly that edge's decisions, and the teacher's action in each state is recorded beside them.
+    So an LLM learns from the states that its own decisions bring about (DAgger, Ross et al. 2011).
     """
 
     out: Annotated[Path, arg(metavar="FILE")]
@@ -60,6 +67,8 @@ class Explore:
     """The worlds' scenario."""
     first: Annotated[int, arg(metavar="N")] = 0
     """Number of the first world: its seed is 1,000,000 more."""
+    edge: Annotated[str | None, arg(metavar="URL")] = None
+    """An edge whose decisions are flown, in the edge's own mode, such as http://127.0.0.1:8000."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes that fly the worlds, 1 to 64."""
 
@@ -77,9 +86,12 @@ def main(argv: list[str]) -> int:
         if not 1 <= args.workers <= 64:
             raise ValueError(f"--workers {args.workers} is not between 1 and 64")
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        header = Header(scenario=scenario, missions=args.missions + args.untaught, behaviour=_BEHAVIOUR)
+        if args.edge is not None:
+            _await_edge(args.edge)
+        behaviour = _BEHAVIOUR if args.edge is None else "an edge's decisions"
+        header = Header(scenario=scenario, missions=args.missions + args.untaught, behaviour=behaviour)
         write_rollouts(args.out, header, _explored(scenario, args))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, EdgeError) as error:
         print(f"aicvds explore: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as missing:
@@ -90,11 +102,19 @@ def main(argv: list[str]) -> int:
     return 0
 
 
+def _await_edge(url: str) -> None:
+    """Wait until the edge and its LLM are loaded; raises :class:`EdgeError`."""
+    from simulator.client import EdgeClient
+
+    with EdgeClient(url) as client:
+        client.wait_ready(_READY_S)
+
+
 def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
     taught = range(args.first, args.first + args.missions)
     teachers = [teacher_of(args.teacher, mission) for mission in taught] + [None] * args.untaught
     worlds = list(enumerate(teachers, start=args.first))
-    fly = partial(_mission, scenario)
+    fly = partial(_mission, scenario, args.edge)
     tracked = partial(track, description="Exploring", total=len(worlds), console=Console(stderr=True))
     if args.workers == 1:
         for steps in tracked(map(fly, worlds)):
@@ -105,9 +125,9 @@ def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
             yield from steps
 
 
-def _mission(scenario: Scenario, numbered: tuple[int, TeacherName | None]) -> list[RolloutStep]:
+def _mission(scenario: Scenario, edge: str | None, numbered: tuple[int, TeacherName | None]) -> list[RolloutStep]:
     mission, teacher = numbered
-    return list(explore(scenario, mission, teacher))
+    return list(explore(scenario, mission, teacher, edge))
 
 
 def teacher_of(option: TeacherOption, mission: int) -> TeacherName:

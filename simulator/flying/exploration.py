@@ -1,67 +1,83 @@
-"""Training missions: exploring UAVs fly a world, beside a teacher or without one."""
+"""Training missions: UAVs explore a world, or fly an edge's decisions, beside a teacher or without one."""
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING, Protocol, Self
 
 import numpy as np
 
 from shared.rollouts import Reference, RolloutStep
 from shared.scenario import Scenario
+from simulator.errors import EdgeError
 from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 # The world and the planner take seconds to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:
+    from simulator.flying.pilots import Choice
     from simulator.flying.teachers import Action, Teacher, TeacherName
     from simulator.world import Observation
 
+# The longest deadline: a fallback of the edge teaches the LLM nothing.
+_DEADLINE_MS = 60_000
+_TIMEOUT_S = 65.0
 
-def explore(scenario: Scenario, mission: int, teacher: TeacherName | None = None) -> Iterator[RolloutStep]:
+
+def explore(
+    scenario: Scenario, mission: int, teacher: TeacherName | None = None, edge: str | None = None
+) -> Iterator[RolloutStep]:
     """One mission's decisions in order of step and UAV, in training world number ``mission``.
 
+    Args:
+        edge: URL of the edge whose decisions the UAVs fly; by default they explore.
+
     Raises:
+        EdgeError: the edge gives no decision.
         ModuleNotFoundError: there is a teacher and OR-Tools is not installed (extra ``planner``).
     """
     from simulator.client.observation_report import decide_request
     from simulator.flying.teachers import TEACHERS
     from simulator.world import PipelineWorld
 
-    rng = np.random.default_rng([FIRST_TRAINING_SEED, mission])
     world = PipelineWorld(scenario)
     observations, _ = world.reset(seed=FIRST_TRAINING_SEED + mission)
-    deviation = _Deviation(scenario, mission, rng)
     guide: Teacher | None = None if teacher is None else TEACHERS[teacher](world)
-    share = 1.0 if guide is None else rng.uniform(0.0, guide.deviations)
-    for step in range(scenario.steps):
-        deviating = bool(rng.random() < share)
-        choices: dict[int, Action] = {}
-        references: dict[int, Reference | None] = {}
-        for agent, uav in world.live.items():
-            observation, taken = observations[agent], frozenset(sensor for sensor, _ in choices.values())
-            advised = None if guide is None else guide.refer(uav, observation, taken, deviating)
-            if advised is not None and not deviating:
-                choices[uav] = advised
-            else:
-                choices[uav] = deviation.action(advised, uav, observation, taken)
-            references[uav] = _reference(teacher, advised)
-            if guide is not None:
-                guide.flown(uav, step, choices[uav])
-        requests = {uav: decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in choices}
-        observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in choices.items()})
-        for uav, (sensor, velocity) in choices.items():
-            info = infos[f"uav_{uav}"]
-            if guide is not None:
-                guide.learn(uav, step, bool(info["failed"]))
-            yield RolloutStep(
-                request=requests[uav],
-                sensor_id=sensor,
-                velocity=velocity,
-                cost=float(info["cost"]),
-                failed=bool(info["failed"]),
-                fleet_lost=world.tally[-1].lost_packets,
-                reference=references[uav],
-            )
+    with ExitStack() as stack:
+        fleet: _Fleet
+        if edge is None:
+            fleet = _ExploringFleet(scenario, mission, guide)
+        else:
+            fleet = stack.enter_context(_EdgeFleet(edge, scenario, mission))
+        for step in range(scenario.steps):
+            fleet.begin_step()
+            choices: dict[int, Action] = {}
+            references: dict[int, Reference | None] = {}
+            for agent, uav in world.live.items():
+                observation, taken = observations[agent], frozenset(sensor for sensor, _ in choices.values())
+                advised = None if guide is None else guide.refer(uav, observation, taken, fleet.deviating)
+                choices[uav] = fleet.action(advised, uav, observation, taken)
+                references[uav] = _reference(teacher, advised)
+                if guide is not None:
+                    guide.flown(uav, step, choices[uav])
+            requests = {uav: decide_request(uav, observations[f"uav_{uav}"], f"train-{mission}") for uav in choices}
+            observations, _, _, _, infos = world.step({f"uav_{u}": np.array(c) for u, c in choices.items()})
+            for uav, (sensor, velocity) in choices.items():
+                info = infos[f"uav_{uav}"]
+                cost, failed = float(info["cost"]), bool(info["failed"])
+                if guide is not None:
+                    guide.learn(uav, step, failed)
+                fleet.learn(uav, cost, failed)
+                yield RolloutStep(
+                    request=requests[uav],
+                    sensor_id=sensor,
+                    velocity=velocity,
+                    cost=cost,
+                    failed=failed,
+                    fleet_lost=world.tally[-1].lost_packets,
+                    reference=references[uav],
+                )
 
 
 def _reference(teacher: TeacherName | None, advised: Action | None) -> Reference | None:
@@ -70,22 +86,49 @@ def _reference(teacher: TeacherName | None, advised: Action | None) -> Reference
     return Reference(teacher=teacher, sensor_id=advised[0], velocity=advised[1])
 
 
-class _Deviation:
-    """The exploring actions of a fleet that deviates from its teacher or has none."""
+class _Fleet(Protocol):
+    """Chooses the actions that are flown and recorded.
 
-    def __init__(self, scenario: Scenario, mission: int, rng: np.random.Generator) -> None:
+    Attributes:
+        deviating: whether the fleet explores in this step, and so a clairvoyant has no reference in it.
+    """
+
+    deviating: bool
+
+    def begin_step(self) -> None: ...
+
+    def action(self, advised: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action: ...
+
+    def learn(self, uav: int, cost: float, failed: bool) -> None: ...
+
+
+class _ExploringFleet:
+    """Flies the teacher's actions but in a share of the steps, which is drawn for the mission; 1 without a teacher."""
+
+    def __init__(self, scenario: Scenario, mission: int, guide: Teacher | None) -> None:
         from simulator.policies.registry import policy_named
 
-        self._rng = rng
+        self._rng = np.random.default_rng([FIRST_TRAINING_SEED, mission])
+        self._share = 1.0 if guide is None else self._rng.uniform(0.0, guide.deviations)
         self._levels = scenario.max_velocity + 1
-        self._guides = [policy_named("eof"), policy_named("wqcs")]
-        for guide in self._guides:
-            guide.reset(scenario, mission)
+        self._policies = [policy_named("eof"), policy_named("wqcs")]
+        for policy in self._policies:
+            policy.reset(scenario, mission)
+        self.deviating = False
+
+    def begin_step(self) -> None:
+        self.deviating = bool(self._rng.random() < self._share)
 
     def action(self, advised: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
-        """A random velocity, and a sensor of EOF, of WQCS or at random; sometimes one of the two is the teacher's."""
+        """The teacher's action, or a deviation from it.
+
+        A deviation has a random velocity, and a sensor of EOF, of WQCS or at random; sometimes one of the two is the
+        teacher's.
+        """
+        if advised is not None and not self.deviating:
+            return advised
         rng = self._rng
-        sensor, _ = self._guides[rng.integers(2)].decide(uav, observation, taken)
+        sensor, _ = self._policies[rng.integers(2)].decide(uav, observation, taken)
         heard = np.flatnonzero(observation["last_heard"] >= 0)
         if rng.random() < 0.5 and len(heard):
             sensor = int(rng.choice(heard))
@@ -94,3 +137,45 @@ class _Deviation:
             followed = rng.integers(3)
             return (advised[0] if followed == 1 else sensor), (advised[1] if followed == 2 else velocity)
         return sensor, velocity
+
+    def learn(self, uav: int, cost: float, failed: bool) -> None:
+        """Nothing."""
+
+
+class _EdgeFleet:
+    """Flies an edge's decisions in a mission of its own there, which ends with the flight; use as a context."""
+
+    deviating = False
+
+    def __init__(self, url: str, scenario: Scenario, mission: int) -> None:
+        from simulator.client import EdgeClient
+        from simulator.flying.pilots import EdgePilot
+
+        self._client = EdgeClient(url, timeout_s=_TIMEOUT_S)
+        self._mission_id = f"explore-{mission}-{secrets.token_hex(4)}"
+        self._pilot = EdgePilot(self._client, self._mission_id, scenario, mission, deadline_ms=_DEADLINE_MS)
+        self._choices: dict[int, Choice] = {}
+
+    def __enter__(self) -> Self:
+        self._client.put_mission(self._mission_id, self._pilot.spec)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(EdgeError):
+            self._client.delete_mission(self._mission_id)
+        self._client.close()
+
+    def begin_step(self) -> None:
+        """Nothing."""
+
+    def action(self, advised: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
+        """The edge's decision."""
+        choice = self._pilot.decide(uav, observation, taken)
+        if choice.exchange is None:
+            raise EdgeError(f"no decision: {self._pilot.last_error}")
+        self._choices[uav] = choice
+        return choice.sensor, choice.velocity
+
+    def learn(self, uav: int, cost: float, failed: bool) -> None:
+        """Keep the outcome for the UAV's next request."""
+        self._pilot.learn(uav, self._choices[uav], cost, failed)

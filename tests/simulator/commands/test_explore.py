@@ -10,6 +10,7 @@ from shared.rollouts import RolloutStep, read_rollouts
 from shared.scenario import SCENARIOS
 from simulator.commands.explore import main, teacher_of
 from simulator.flying.teachers import TEACHERS, TeacherName
+from tests.simulator.edge_stub import stub_edge
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
 NAMES: list[TeacherName] = ["planner", "clairvoyant"]
@@ -54,12 +55,31 @@ def test_a_second_file_goes_on_with_further_worlds(tmp_path: Path, monkeypatch: 
         (["--first", "-1"], "--first -1 is less than 0"),
         (["--workers", "0"], "--workers 0 is not between 1 and 64"),
         (["--scenario", "moon"], "unknown scenario 'moon'"),
+        (["--edge", "http://127.0.0.1:1"], "no edge is ready at http://127.0.0.1:1"),
+        (["--edge", "127.0.0.1"], "'127.0.0.1' is not an edge's URL"),
     ],
 )
 def test_bad_use_is_one_clear_line(
-    options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("simulator.commands.explore._READY_S", 0.0)
     assert main(["--out", str(tmp_path / "r.gz"), *options]) == 2
     printed = capsys.readouterr().err
     assert message in printed
     assert printed.count("\n") == 1
+
+
+def test_an_edge_that_fails_on_the_way_leaves_no_file_that_looks_whole(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "r.gz"
+    with stub_edge() as stub:
+        stub.script, stub.otherwise = ["ok"] * 5, "invalid"
+        options = ["--out", str(out), "--missions", "0", "--untaught", "1", "--edge", stub.url]
+        assert main(options) == 2
+    assert "aicvds explore: no decision" in capsys.readouterr().err
+    assert not out.exists()

@@ -9,6 +9,7 @@ import pytest
 
 from shared.rollouts import RolloutStep
 from shared.scenario import SCENARIOS
+from simulator.errors import EdgeError
 from simulator.flying.clairvoyant_bound import clairvoyant
 from simulator.flying.exploration import explore
 from simulator.flying.rollout import rollout
@@ -17,6 +18,7 @@ from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 from simulator.world import PipelineWorld
+from tests.simulator.edge_stub import stub_edge
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 12})
 NAMES: list[TeacherName] = ["planner", "clairvoyant"]
@@ -115,3 +117,23 @@ def test_a_clairvoyant_has_no_reference_during_deviations_and_plans_again(monkey
     assert silent
     assert all(flown_as_advised(step) for step in steps if step.request.step not in silent)
     assert any(step > min(silent) for step in range(SHORT.steps) if step not in silent)
+
+
+@pytest.mark.usefixtures("brief")
+def test_an_edges_decisions_are_flown_beside_the_teachers() -> None:
+    with stub_edge() as stub:
+        steps = list(explore(SHORT, 8, "planner", stub.url))
+    assert len(steps) == len(stub.decides) == 36
+    for step, asked in zip(steps, stub.decides, strict=True):
+        assert (step.request.step, step.request.uav_id) == (asked.step, asked.uav_id)
+        heard = asked.sensors.id
+        assert (step.sensor_id, step.velocity) == (heard[(asked.step + asked.uav_id) % len(heard)], 7)
+    assert all(step.reference is not None and step.reference.teacher == "planner" for step in steps)
+    # Each outcome comes with the UAV's next request; those of the last step come to nothing.
+    carried = [asked.outcome for asked in stub.decides if asked.outcome is not None]
+    assert [(one.cost, one.failed) for one in carried] == [(step.cost, step.failed) for step in steps[:-3]]
+
+
+def test_an_edge_that_does_not_answer_ends_the_exploration() -> None:
+    with pytest.raises(EdgeError, match=r"127\.0\.0\.1:1"):
+        list(explore(SHORT, 8, edge="http://127.0.0.1:1"))
