@@ -1,4 +1,4 @@
-"""LoRA training of the embedded model on prompt examples: cross-entropy of the labels against the teacher's."""
+"""LoRA training of the embedded model on prompt examples."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from service.distilling.examples import PromptExample
 from service.distilling.gguf_adapter import write_gguf_adapter
+from service.distilling.loss import LETTERS, Outputs, Targets, answer_loss, loss_of
 from service.distilling.options import Distill
 
 _MATRICES = ["q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj"]
 _BASE = "HuggingFaceTB/SmolLM2-135M-Instruct"
-_LETTERS = "ABCDEFGHIJKLMNOPQRST"
+# The tokens whose logits differ by a row's worth.
+_WORTH = "09"
 _WARM_UP_STEPS = 30
 _MOST_GRADIENT = 1.0
 _EVALUATION_BATCH = 64
@@ -57,28 +58,38 @@ class Student:
                 self.model = PeftModel.from_pretrained(base, begin, is_trainable=True)
         self.model.to(device)
         self._device = torch.device(device)
-        self._letters = torch.tensor(self._tokenizer.convert_tokens_to_ids(list(_LETTERS)), device=self._device)
+        self._letter_ids: Any = self._tokenizer.convert_tokens_to_ids(list(LETTERS))
+        self._letters = torch.tensor(self._letter_ids, device=self._device)
+        self._worth = torch.tensor(self._tokenizer.convert_tokens_to_ids(list(_WORTH)), device=self._device)
         self._before, self._after = self._frame(static)
 
-    def label_logits(self, texts: Sequence[str]) -> Tensor:
-        """The logits of the twenty letters after each user message, ``(B, 20)``."""
+    def read(self, texts: Sequence[str]) -> Outputs:
+        """The logits after each user message, and after the letter of each of its rows."""
         middles = self._tokenizer(list(texts), add_special_tokens=False).input_ids
         ids = [self._before + middle + self._after for middle in middles]
         longest = max(map(len, ids))
         tokens, mask = torch.zeros(2, len(ids), longest, dtype=torch.long)
-        for row, own in enumerate(ids):
-            # On the left, so that the answer's position is the last of every row.
-            tokens[row, longest - len(own) :] = torch.tensor(own)
-            mask[row, longest - len(own) :] = 1
+        rows: list[tuple[int, int]] = []
+        for number, (own, middle) in enumerate(zip(ids, middles, strict=True)):
+            # On the left, so that the answer's position is the last of every prompt.
+            begin = longest - len(own)
+            tokens[number, begin:] = torch.tensor(own)
+            mask[number, begin:] = 1
+            first = begin + len(self._before)
+            rows += [(number, first + place) for place, token in enumerate(middle) if token in self._letter_ids]
+        prompts, places = torch.tensor(rows, device=self._device).T
         with torch.autocast(self._device.type, dtype=torch.bfloat16):
             hidden = self.model.base_model.model.model(
                 input_ids=tokens.to(self._device),
                 # Without padding the attention needs no mask.
                 attention_mask=None if bool(mask.all()) else mask.to(self._device),
                 position_ids=(mask.cumsum(1) - 1).clamp(min=0).to(self._device),
-            ).last_hidden_state[:, -1]
-            logits = hidden @ self.model.get_output_embeddings().weight[self._letters].T
-        return torch.as_tensor(logits.float())
+            ).last_hidden_state
+            table = self.model.get_output_embeddings().weight
+            after_row = hidden[prompts, places]
+            answer, own_letter = (states @ table[self._letters].T for states in (hidden[:, -1], after_row))
+            worst, best = (after_row @ table[self._worth].T).T
+        return Outputs(answer.float(), own_letter.float(), (best - worst).float())
 
     def write_peft(self, folder: Path) -> None:
         """Write the adapter in Hugging Face's format, which names the model that the GGUF file was made of."""
@@ -113,22 +124,6 @@ class Student:
         return tuple(self._tokenizer(text, add_special_tokens=False).input_ids for text in (head, tail))
 
 
-def targets_of(examples: Sequence[PromptExample]) -> tuple[Tensor, Tensor]:
-    """Target probabilities ``(B, 20)``, and which letters are offered ``(B, 20)``."""
-    target, offered = torch.zeros(len(examples), len(_LETTERS)), torch.zeros(len(examples), len(_LETTERS)).bool()
-    for row, example in enumerate(examples):
-        columns = [_LETTERS.index(letter) for letter in example.labels]
-        target[row, columns] = torch.tensor(example.target, dtype=torch.float32)
-        offered[row, columns] = True
-    return target, offered
-
-
-def loss_of(logits: Tensor, target: Tensor, offered: Tensor) -> Tensor:
-    """``-sum_a t(a) ln p(a)`` over the offered letters, the mean of the batch."""
-    masked = logits.masked_fill(~offered, -1e4)
-    return -(target * torch.log_softmax(masked, dim=1)).sum(dim=1).mean()
-
-
 @dataclass(frozen=True, slots=True)
 class Agreement:
     """How a student decides beside the teacher, over held-out decisions.
@@ -136,7 +131,7 @@ class Agreement:
     Attributes:
         sensor: share of decisions whose likeliest letter is of the teacher's sensor, where that is shown.
         target: mean target probability of the likeliest letter's action.
-        loss: mean cross-entropy.
+        loss: mean cross-entropy of the answer's letter.
     """
 
     decisions: int
@@ -152,12 +147,12 @@ def agreement(student: Student, examples: Sequence[PromptExample]) -> Agreement:
     same, shown, share, loss = 0, 0, 0.0, 0.0
     for start in range(0, len(examples), _EVALUATION_BATCH):
         some = examples[start : start + _EVALUATION_BATCH]
-        logits = student.label_logits([example.text for example in some]).cpu()
-        target, offered = targets_of(some)
-        loss += float(loss_of(logits, target, offered)) * len(some)
-        best = logits.masked_fill(~offered, -1e4).argmax(dim=1)
+        answer = student.read([example.text for example in some]).answer.cpu()
+        targets = Targets.of(some)
+        loss += float(answer_loss(answer, targets)) * len(some)
+        best = answer.masked_fill(~targets.offered, -torch.inf).argmax(dim=1)
         for example, letter in zip(some, best.tolist(), strict=True):
-            place = example.labels.index(_LETTERS[letter])
+            place = example.labels.index(LETTERS[letter])
             share += float(example.target[place])
             if example.reference >= 0:
                 shown += 1
@@ -191,9 +186,8 @@ def train(
         for group in optimizer.param_groups:
             group["lr"] = args.learning_rate * _schedule(step, args.steps)
         some = [examples[i] for i in _batch(len(examples), args, step)]
-        target, offered = targets_of(some)
-        logits = student.label_logits([example.text for example in some])
-        loss = loss_of(logits, target.to(logits.device), offered.to(logits.device))
+        outputs = student.read([example.text for example in some])
+        loss = loss_of(outputs, Targets.of(some, outputs.answer.device))
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(weights, _MOST_GRADIENT)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from service.distilling.examples import PromptExample, prompt_examples
+from service.llm.adapter import PROMPT_VERSION
 from service.llm.model_file import sha256
 from shared.rollouts import read_rollouts
 
@@ -29,7 +30,7 @@ def examples_of(
         OSError, ValueError: a file cannot be read, or has no teacher.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = [(source, folder / f"examples-{sha256(source)[:16]}.json.gz") for source in rollouts]
+    jobs = [(source, folder / f"examples-{PROMPT_VERSION}-{sha256(source)[:16]}.json.gz") for source in rollouts]
     if workers == 1:
         for kept in map(_kept, jobs):
             yield _read(kept)

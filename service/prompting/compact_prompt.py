@@ -2,11 +2,12 @@
 
 The user message is one line of letters and digits, which the embedded model reads as one token each:
 
-    U 9 3 4 2 1 5   A 7 3 5 9 2 8 4 6   E 9 1 6 9 3 0 4 4   ...      (without the spaces)
+    9 3 4 2 1 5 U   7 3 5 9 2 8 4 6 A   9 1 6 9 3 0 4 4 E   ...      (without the spaces)
 
-``U`` begins the UAV's own six digits, and a row's first choice letter its sensor's eight. :func:`fleet_digits` and
-:func:`row_digits` define them. An adapter names the version of this prompt that it was trained on:
-:data:`service.llm.adapter.PROMPT_VERSION` changes whenever a text here does.
+``U`` ends the UAV's own six digits, and a row's first choice letter its sensor's eight: a causal model has read a row
+where it reads the row's letter. :func:`fleet_digits` and :func:`row_digits` define the digits. An adapter names the
+version of this prompt that it was trained on: :data:`service.llm.adapter.PROMPT_VERSION` changes whenever a text here
+does.
 """
 
 from __future__ import annotations
@@ -132,10 +133,10 @@ class CompactTemplate(GuidedTemplate):
 
         def write(letter: str, row: int, options: Sequence[int]) -> str:
             span = digits([level * options[0], level * options[-1]])
-            return letter + "".join(map(str, (*numbers[row].tolist(), *span.tolist())))
+            return "".join(map(str, (*numbers[row].tolist(), *span.tolist()))) + letter
 
         chosen = CandidateSet.of(state, reach, shown, self.letters, write)
-        return replace(chosen, rows=f"U{fleet_digits(state, outlook, view.step, scenario)}{chosen.rows}")
+        return replace(chosen, rows=f"{fleet_digits(state, outlook, view.step, scenario)}U{chosen.rows}")
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
         """None: the adapter is trained with shuffled rows, so it has no bias towards letters to be measured."""

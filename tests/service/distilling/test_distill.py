@@ -14,10 +14,11 @@ from rich.console import Console
 
 from service.commands.distill import main
 from service.config.settings import Settings
-from service.distilling.adapter_training import Student, loss_of, targets_of, train
+from service.distilling.adapter_training import Student, train
 from service.distilling.distill import distill
 from service.distilling.examples import PromptExample, prompt_examples
 from service.distilling.examples_file import examples_of
+from service.distilling.loss import Outputs, Targets, answer_loss, loss_of
 from service.distilling.options import Distill
 from service.llm.adapter import PROMPT_VERSION, check_adapter
 from service.llm.answers import Completion
@@ -118,10 +119,27 @@ def test_without_the_embedded_model_the_remedy_is_named(
 
 def test_the_loss_counts_only_offered_letters() -> None:
     example = PromptExample("U", "ABEF", np.array([0.5, 0.5, 0.0, 0.0]), (1, 1, 2, 2), 0)
-    target, offered = targets_of([example])
     logits = torch.zeros(1, 20)
     logits[0, 2] = 50.0
-    assert float(loss_of(logits, target, offered)) == pytest.approx(np.log(4.0), abs=1e-5)
+    assert float(answer_loss(logits, Targets.of([example]))) == pytest.approx(np.log(4.0), abs=1e-5)
+
+
+def test_the_loss_is_least_for_the_teachers_probabilities() -> None:
+    examples = [
+        PromptExample("U", "ABEF", np.array([0.1, 0.6, 0.2, 0.1]), (1, 1, 2, 2), 1),
+        PromptExample("U", "AB", np.array([0.3, 0.7]), (4, 4), 1),
+    ]
+    targets = Targets.of(examples)
+    assert targets.worth.tolist() == pytest.approx([0.7, 0.3, 1.0])
+    perfect = Outputs(
+        targets.answer.clamp(min=1e-9).log(),
+        (targets.answer[targets.prompt] * targets.of_row).clamp(min=1e-9).log(),
+        torch.logit(targets.worth.clamp(max=1.0 - 1e-6)),
+    )
+    torch.manual_seed(0)
+    for part in ("answer", "rows", "worth"):
+        other = replace(perfect, **{part: getattr(perfect, part) + torch.randn_like(getattr(perfect, part))})
+        assert float(loss_of(other, targets)) > float(loss_of(perfect, targets)) + 0.01
 
 
 @pytest.mark.long
@@ -147,7 +165,7 @@ def test_llama_cpp_gives_the_trained_probabilities(distilled: Path, rollouts: Pa
             if "lora_B" in name:
                 weight += 0.5 * torch.randn_like(weight)
                 large[name] = weight
-        trained = torch.softmax(student.label_logits([example.text]), dim=1)[0].numpy()
+        trained = torch.softmax(student.read([example.text]).answer, dim=1)[0].numpy()
     adapter = distilled.parent / "large.gguf"
     student.write_gguf(adapter)
     # llama.cpp's first draw decides whether its probabilities are among the labels or among all tokens.

@@ -22,7 +22,7 @@ from simulator.world import PipelineWorld
 from tests.service.making import PAPER, attended
 
 ADAPTED = Settings(mode="llm", llm_url="http://127.0.0.1:9/v1", llm_adapter="served")
-MESSAGE = re.compile(r"U(\d{6})((?:[A-T]\d{8})+)")
+MESSAGE = re.compile(r"(\d{6})U((?:\d{8}[A-T])+)")
 
 
 def flown(scenario: Scenario, steps: int, **spec: object) -> tuple[Mission, AttendedState]:
@@ -48,8 +48,8 @@ def test_the_message_is_one_line_of_letters_and_digits(name: str) -> None:
     mission, state = flown(SCENARIOS[name], 4)
     found = MESSAGE.fullmatch(candidates_of(state, template_of(mission)).rows)
     assert found is not None
-    rows = re.findall(r"([A-T])(\d{8})", found[2])
-    assert [letter for letter, _ in rows] == list("AEIMQ")[: len(state.rows)]
+    rows = re.findall(r"\d{8}([A-T])", found[2])
+    assert rows == list("AEIMQ")[: len(state.rows)]
     # One token a character, and 8 around the message: at most 70 are read anew.
     assert len(found[0]) + 8 <= 70
     assert "U" not in mission.template.static.replace("Collect", "")
@@ -60,7 +60,7 @@ def test_a_row_shows_the_queue_and_what_can_be_collected() -> None:
     text = candidates_of(state, template_of(mission)).rows
     found = MESSAGE.fullmatch(text)
     assert found is not None
-    rows = re.findall(r"[A-T](\d{8})", found[2])
+    rows = re.findall(r"(\d{8})[A-T]", found[2])
     for row, shown in zip(rows, state.shown(), strict=True):
         queue, packets = state.state.queue[shown], state.reach.best_packets[shown]
         assert int(row[0]) == round(9 * (queue / PAPER.queue_capacity) ** 0.5)
