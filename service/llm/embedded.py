@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
+from typing import Any
 
 import xllamacpp
 
@@ -23,11 +24,14 @@ class EmbeddedServer:
     The server requires a random key, so that other users of the machine cannot spend its time.
 
     Args:
-        adapter: a LoRA adapter that is applied to every request. The model's name then ends in ``+`` and the
-            adapter's.
+        adapter: a LoRA adapter that is applied to every request without :attr:`without_adapter`. The model's name then
+            ends in ``+`` and the adapter's.
         context: tokens, which the slots share evenly.
         slots: requests served at once, each with its own prefix cache. With one slot, the static block and the
             experiences are one prefix for the whole fleet.
+
+    Attributes:
+        without_adapter: the fields that a request needs to be answered by the bare model.
 
     Raises:
         LoadFailed: llama.cpp could not load the file.
@@ -42,11 +46,13 @@ class EmbeddedServer:
         params.n_parallel = slots
         # llama.cpp notices a cancelled call between batches: the next decision would wait seconds for a large one.
         params.n_batch = params.n_ubatch = _BATCH
-        params.cache_ram_mib = _PROMPT_CACHE_MIB
+        # llama.cpp's cache of old prompts ignores adapters: what was read with one would serve a request without it.
+        params.cache_ram_mib = _PROMPT_CACHE_MIB if adapter is None else 0
         params.verbosity = _ONLY_ERRORS
         params.ui = False
         if adapter is not None:
             params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(adapter), 1.0)]
+        self.without_adapter: dict[str, Any] = {} if adapter is None else {"lora": [{"id": 0, "scale": 0.0}]}
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
         try:

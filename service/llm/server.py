@@ -140,7 +140,7 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
+        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities) | self._bare(system)
         return await self._decide(body, self._silence)
 
     async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
@@ -149,7 +149,7 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
+        body = label_body(self.model, system, user, self.constraint, lists, self.logprobs) | self._bare(system)
         # The silence of a call for several UAVs says nothing about calls for one.
         answer = await self._decide(body, self._silence if len(lists) == 1 else None)
         if self.constraint != "grammar" or len(lists) == 1:
@@ -167,6 +167,7 @@ class LlmServer:
             NoDecision: no answer, with the reason.
         """
         body = rewriting_body(self.model, wanted, wanted.constrain(self.constraint), temperature, seed)
+        body |= self._bare(wanted.instruction)
         for _ in range(_STEPS_BACK if self._embedded is not None else 0):
             await self._await_silence()
             self._rewriting = asyncio.create_task(self._ask(body), name="llm-rewriting")
@@ -214,6 +215,11 @@ class LlmServer:
         finally:
             self._decisions -= 1
             self._decided_at = time.monotonic()
+
+    def _bare(self, system: str) -> dict[str, Any]:
+        """The fields without which the adapter would answer a prompt that it was not trained on."""
+        trained = system.endswith(self._warm_up.static)
+        return {} if trained or self._embedded is None else self._embedded.without_adapter
 
     async def _ask(self, body: dict[str, Any]) -> Completion:
         if self._client is None or self.status != "ready":

@@ -36,7 +36,9 @@ class ResolvedSpec(MissionSpec):
         """The spec, with the service's settings and the defaults of its mode for what it leaves open."""
         mode = spec.mode or settings.mode
         adapted = settings.adapted and mode in _LLM_MODES
-        row_format = spec.prompt.format or ("compact" if adapted else "csv")
+        # The compact prompt has no experiences and no demonstrations.
+        longer = bool(spec.prompt.experiences or spec.prompt.demonstrations)
+        row_format = spec.prompt.format or ("compact" if adapted and not longer else "csv")
         compact = row_format == "compact"
         # Mode `llm` is the paper's method as the paper has it, unless the spec or the adapter says otherwise.
         as_published = mode == "llm" and not compact

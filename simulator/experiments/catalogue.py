@@ -8,6 +8,7 @@ from __future__ import annotations
 from simulator.experiments import (
     ablation_features,
     ablation_prompt,
+    adapter,
     aoi,
     attention,
     fairness,
@@ -36,6 +37,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         fairness,
         ablation_prompt,
         ablation_features,
+        adapter,
         llm_models,
         obedience,
         jailbreak,

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import httpx
@@ -17,7 +18,7 @@ from shared.scenario import Scenario
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport
 from simulator.errors import EdgeError
-from simulator.experiments.schemes import CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
+from simulator.experiments.schemes import ADAPTED, CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
 from simulator.experiments.stand_ins import answering, drawn, worst
 from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
 from simulator.flying.run import API_KEY
@@ -25,7 +26,7 @@ from simulator.flying.run import API_KEY
 # Settings for the machine's capacity and paths. Every other setting may change decisions, and a figure must not depend
 # on the user's environment.
 _INHERITED = {"AICVDS_LLM_THREADS", "AICVDS_LLM_CONTEXT", "AICVDS_CACHE_DIR"}
-_MODEL = "AICVDS_LLM_MODEL"
+_MODEL, _ADAPTER = "AICVDS_LLM_MODEL", "AICVDS_LLM_ADAPTER"
 _OF_A_SERVER = {_MODEL, "AICVDS_LLM_API_KEY"}
 _WAIT_S = 300.0
 _TIMEOUT_SLACK_S = 5.0
@@ -57,6 +58,8 @@ class Llm:
             if self.edge is not None:
                 return f"edge {self.edge}"
             return self.option if self.embedded else f"{self.option} {os.environ.get(_MODEL, '')}".strip()
+        if backing == ADAPTED:
+            return f"adapted {_sha256(_adapter())[:16]}"
         return f"{Path(backing).stem} {_sha256(Path(backing))[:16]}"
 
 
@@ -102,11 +105,15 @@ def environment_for(backing: Backing, llm: Llm) -> Iterator[Mapping[str, str]]:
     base |= {"AICVDS_MAX_MISSIONS": "1000000", "AICVDS_LOG_LEVEL": "warning", "AICVDS_STORE": "none"}
     # Mode llm as in the paper, unless a scheme overrides it.
     base["AICVDS_VERIFY"] = "off"
+    # The embedded LLM as it is, unless a scheme names its adapter.
+    base[_ADAPTER] = "off"
     if backing == OFF:
         yield base | {"AICVDS_MODE": "value"}
     elif backing in (CHANCE, WORST):
         with answering(drawn if backing == CHANCE else worst) as url:
             yield base | {"AICVDS_LLM_URL": url}
+    elif backing == ADAPTED:
+        yield base | {_ADAPTER: str(_adapter())}
     elif backing != NAMED_BY_OPTION:
         yield base | {"AICVDS_LLM_GGUF": str(Path(backing).resolve())}
     elif llm.embedded:
@@ -142,6 +149,16 @@ def radio(url: str, deadline_ms: int | None, scenario: Scenario, seed: int) -> E
         transport = LossyTransport(inner, drop=scenario.uplink_drop, jitter_ms=scenario.uplink_jitter_ms, seed=seed)
     timeout_s = _DEFAULT_TIMEOUT_S if deadline_ms is None else deadline_ms / 1e3 + _TIMEOUT_SLACK_S
     return EdgeClient(url, timeout_s=timeout_s, api_key=os.environ.get(API_KEY), seed=seed, transport=transport)
+
+
+def _adapter() -> Path:
+    """The adapter's file; raises :class:`EdgeError` where there is none."""
+    service = find_spec("service")
+    shipped = Path(service.origin or "").parent / "checkpoints" / "adapter.gguf" if service is not None else None
+    found = Path(named).resolve() if (named := os.environ.get(_ADAPTER)) else shipped
+    if found is None or not found.is_file():
+        raise EdgeError(f"{found} does not exist: name an adapter of `aicvds distill` in {_ADAPTER}")
+    return found
 
 
 @cache

@@ -13,9 +13,10 @@ from simulator.records.record import Record
 # So long that the speed of this machine does not change an edge's decisions.
 GENEROUS_DEADLINE_MS = 30_000
 
-# The LLM behind an edge: none, that of --llm, uniform draws, the worst of the candidates, or a model file by its path.
+# The LLM behind an edge: none, that of --llm, the embedded one with its adapter, uniform draws, the worst of the
+# candidates, or a model file by its path.
 Backing = str
-OFF, NAMED_BY_OPTION, CHANCE, WORST = "off", "asked", "chance", "worst"
+OFF, NAMED_BY_OPTION, ADAPTED, CHANCE, WORST = "off", "asked", "adapted", "chance", "worst"
 
 
 class Local(Record):
@@ -29,8 +30,9 @@ class Local(Record):
 class OverEdge(Record):
     """An edge over HTTP. ``spec`` is its mission's, without scenario and seed.
 
-    ``backing`` is ``off`` (no LLM), ``asked`` (the LLM of ``--llm``), ``chance`` (an LLM that answers uniform draws),
-    ``worst`` (the emptiest queue at the highest velocity) or a GGUF file's path. ``deadline_ms`` of ``None`` is the
+    ``backing`` is ``off`` (no LLM), ``asked`` (the LLM of ``--llm``), ``adapted`` (the embedded LLM with the adapter of
+    ``AICVDS_LLM_ADAPTER``, by default the package's), ``chance`` (an LLM that answers uniform draws), ``worst`` (the
+    emptiest queue at the highest velocity) or a GGUF file's path. ``deadline_ms`` of ``None`` is the
     edge's default. ``operator`` guides the fleet, if set.
     """
 

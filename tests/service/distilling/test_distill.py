@@ -7,6 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 import torch
@@ -151,28 +152,59 @@ def test_it_writes_an_adapter_for_llama_cpp_one_for_vllm_and_a_card(distilled: P
     assert 0.0 <= card["held_out"]["paper"]["sensor"] <= 1.0
 
 
-@pytest.mark.long
-def test_llama_cpp_gives_the_trained_probabilities(distilled: Path, rollouts: Path) -> None:
-    header, steps = read_rollouts(rollouts)
-    example = next(prompt_examples(header, steps))[7]
-    gguf = embedded_model(Settings())
-    student = Student(gguf, STATIC, 2, "cpu", distilled / "peft")
-    # Three steps change little: a larger B shows that every matrix arrives at its place.
-    large = {}
+@pytest.fixture(scope="module")
+def changed(distilled: Path) -> tuple[Student, Path]:
+    """A student whose adapter changes every answer, and its GGUF file."""
+    student = Student(embedded_model(Settings()), STATIC, 2, "cpu", distilled / "peft")
+    large = 0
     torch.manual_seed(0)
     with torch.no_grad():
         for name, weight in student.model.named_parameters():
+            # Three steps change little: a larger B shows that every matrix arrives at its place.
             if "lora_B" in name:
                 weight += 0.5 * torch.randn_like(weight)
-                large[name] = weight
-        trained = torch.softmax(student.read([example.text]).answer, dim=1)[0].numpy()
+                large += 1
+    assert large == 30 * 7
     adapter = distilled.parent / "large.gguf"
     student.write_gguf(adapter)
+    return student, adapter
+
+
+@pytest.mark.long
+def test_llama_cpp_gives_the_trained_probabilities(changed: tuple[Student, Path], rollouts: Path) -> None:
+    student, adapter = changed
+    header, steps = read_rollouts(rollouts)
+    example = next(prompt_examples(header, steps))[7]
+    with torch.no_grad():
+        trained = torch.softmax(student.read([example.text]).answer, dim=1)[0].numpy()
+    gguf = embedded_model(Settings())
     # llama.cpp's first draw decides whether its probabilities are among the labels or among all tokens.
     base, adapted = answered(gguf, None, example.text, 1), answered(gguf, adapter, example.text, 8)
     assert np.abs(base - trained).max() > 0.15
     assert np.abs(adapted - trained).max() < 0.05
-    assert len(large) == 30 * 7
+
+
+@pytest.mark.long
+def test_a_request_without_the_adapter_is_answered_by_the_bare_model(changed: tuple[Student, Path]) -> None:
+    said: dict[str, list[str]] = {}
+    for name, adapter in (("bare", None), ("adapted", changed[1])):
+        server = EmbeddedServer(embedded_model(Settings()), threads=1, context=512, adapter=adapter)
+        said[name] = []
+        try:
+            for fields in ({}, server.without_adapter, {}, server.without_adapter):
+                body = {"messages": [{"role": "user", "content": "Say hello to Bob."}], "temperature": 0, **fields}
+                answer = httpx.post(
+                    f"{server.base_url}/chat/completions",
+                    json=body | {"max_tokens": 12},
+                    headers={"Authorization": f"Bearer {server.api_key}"},
+                    timeout=PATIENCE_S,
+                )
+                said[name].append(answer.json()["choices"][0]["message"]["content"])
+        finally:
+            server.close()
+    assert len(set(said["bare"])) == 1
+    assert said["adapted"][0] == said["adapted"][2] != said["bare"][0]
+    assert said["adapted"][1] == said["adapted"][3] == said["bare"][0]
 
 
 def answered(gguf: Path, adapter: Path | None, text: str, times: int) -> np.ndarray:

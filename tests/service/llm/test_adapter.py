@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from service.config.settings import Settings
 from service.llm.adapter import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+from service.llm.server import LlmServer
+from service.prompting.compact_prompt import CompactTemplate
+from service.prompting.prompt import Template
+from service.prompting.warm_up import warm_up
+from shared.scenario import SCENARIOS
 
 
 def metadata(version: int, kind: int = 4) -> bytes:
@@ -42,3 +50,15 @@ def test_any_other_file_is_refused_with_the_remedy(tmp_path: Path, content: byte
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(AdapterUnusable, match="cannot be read"):
         check_adapter(tmp_path / "adapter.gguf")
+
+
+@pytest.mark.parametrize("note", [None, "visit sensor 2 every third step"])
+def test_the_adapter_answers_only_the_prompt_that_it_was_trained_on(note: str | None, tmp_path: Path) -> None:
+    settings = Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))
+    server = LlmServer(settings, warm_up(settings))
+    off = {"lora": [{"id": 0, "scale": 0.0}]}
+    server._embedded = cast(Any, SimpleNamespace(without_adapter=off))
+    paper = SCENARIOS["paper"]
+    assert server._bare(CompactTemplate(paper, rows=5, note=note).static) == {}
+    assert server._bare(Template(paper, experiences=8, note=note).static) == off
+    assert server._bare("Rewrite the note.") == off

@@ -122,6 +122,12 @@ def test_it_has_no_experiences_and_no_demonstrations(field: str) -> None:
         Mission("test", spec, ADAPTED)
 
 
+@pytest.mark.parametrize("field", ["experiences", "demonstrations"])
+def test_a_mission_that_asks_for_them_has_the_long_prompt(field: str) -> None:
+    spec = MissionSpec.model_validate({"mode": "llm", "prompt": {field: 2}})
+    assert Mission("test", spec, ADAPTED).spec.prompt.format == "csv"
+
+
 def test_it_is_about_one_uav() -> None:
     fit = Mission("test", MissionSpec(mode="guided"), ADAPTED).prompt_fit
     assert fit.fits(1)

@@ -8,8 +8,9 @@ import httpx
 import pytest
 from rich.console import Console
 
-from simulator.experiments.edges import Llm, edge_for, environment_for
-from simulator.experiments.schemes import CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
+from simulator.errors import EdgeError
+from simulator.experiments.edges import Llm, _sha256, edge_for, environment_for
+from simulator.experiments.schemes import ADAPTED, CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
 
 SERVER = "http://127.0.0.1:8080/v1"
 
@@ -32,6 +33,8 @@ def exported(monkeypatch: pytest.MonkeyPatch) -> None:
 def settings(backing: str, llm: Llm) -> dict[str, str]:
     with environment_for(backing, llm) as environment:
         own = {"AICVDS_MAX_MISSIONS", "AICVDS_LOG_LEVEL", "AICVDS_STORE", "AICVDS_VERIFY"}
+        if environment["AICVDS_LLM_ADAPTER"] == "off":
+            own.add("AICVDS_LLM_ADAPTER")
         return {k: v for k, v in environment.items() if k.startswith("AICVDS_") and k not in own}
 
 
@@ -49,6 +52,21 @@ def test_a_server_gets_its_model_and_key() -> None:
 def test_a_model_file_is_embedded_by_its_whole_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert settings("m.gguf", Llm())["AICVDS_LLM_GGUF"] == str(tmp_path / "m.gguf")
+
+
+def test_only_the_scheme_that_names_the_adapter_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    adapter = tmp_path / "adapter.gguf"
+    monkeypatch.setenv("AICVDS_LLM_ADAPTER", str(adapter))
+    for backing in (NAMED_BY_OPTION, OFF, CHANCE):
+        assert "AICVDS_LLM_ADAPTER" not in settings(backing, Llm())
+    with pytest.raises(EdgeError, match="name an adapter"):
+        settings(ADAPTED, Llm())
+    adapter.write_bytes(b"one")
+    assert settings(ADAPTED, Llm())["AICVDS_LLM_ADAPTER"] == str(adapter)
+    first = Llm().identity(ADAPTED)
+    adapter.write_bytes(b"two")
+    _sha256.cache_clear()
+    assert Llm().identity(ADAPTED) != first
 
 
 def test_draws_at_random_come_from_a_server_of_our_own() -> None:
