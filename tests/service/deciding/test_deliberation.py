@@ -43,7 +43,7 @@ TEMPLATE = GuidedTemplate(PAPER, rows=5, experiences=8, ranked=True)
 
 
 def guided(**settings: Any) -> Mission:
-    return Mission("test", MissionSpec(features="reach"), Settings(mode="guided", **settings))
+    return Mission("test", MissionSpec(features="reach"), Settings(mode="guided", llm_adapter="off", **settings))
 
 
 def deliberation(mission: Mission, step: int = 0) -> tuple[AttendedState, Deliberation]:

@@ -21,7 +21,7 @@ Report = Callable[..., dict[str, Any]]
 
 @pytest.fixture(scope="module")
 def app() -> FastAPI:
-    return create_app(Settings(mode="llm", deadline_ms=60_000))
+    return create_app(Settings(mode="llm", llm_adapter="off", deadline_ms=60_000))
 
 
 @pytest.fixture(scope="module")

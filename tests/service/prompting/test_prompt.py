@@ -148,7 +148,7 @@ def test_shuffling_changes_the_prompt_and_nothing_else() -> None:
 
 
 def test_without_attention_every_admissible_sensor_is_shown_in_the_requests_order() -> None:
-    m = mission(MissionSpec(attention="off", top_k=2, mode="llm"))
+    m = mission(MissionSpec(attention="off", top_k=2, mode="llm"), llm_adapter="off")
     view = attended(m, uav(queue=[30.0, None, 60.0, 15.0]))
     prompt = m.template.prompt(view.state, view.shown(), [])
     assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids == [0, 2, 3]
