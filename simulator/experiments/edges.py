@@ -50,6 +50,12 @@ class Llm:
         """Whether schemes with the LLM of ``--llm`` can fly."""
         return self.option != "none" or self.edge is not None
 
+    def flies(self, backing: Backing) -> bool:
+        """Whether schemes with that backing can fly."""
+        if backing == ADAPTED:
+            return self.option != "none" and _adapter().is_file()
+        return self.available if backing == NAMED_BY_OPTION else True
+
     def identity(self, backing: Backing) -> str:
         """The LLM in a flight's key; LLMs of one identity answer alike."""
         if backing in (OFF, CHANCE, WORST):
@@ -152,13 +158,11 @@ def radio(url: str, deadline_ms: int | None, scenario: Scenario, seed: int) -> E
 
 
 def _adapter() -> Path:
-    """The adapter's file; raises :class:`EdgeError` where there is none."""
+    """Where the adapter's file is, or would be."""
+    if named := os.environ.get(_ADAPTER):
+        return Path(named).resolve()
     service = find_spec("service")
-    shipped = Path(service.origin or "").parent / "checkpoints" / "adapter.gguf" if service is not None else None
-    found = Path(named).resolve() if (named := os.environ.get(_ADAPTER)) else shipped
-    if found is None or not found.is_file():
-        raise EdgeError(f"{found} does not exist: name an adapter of `aicvds distill` in {_ADAPTER}")
-    return found
+    return Path((service and service.origin) or "").parent / "checkpoints" / "adapter.gguf"
 
 
 @cache

@@ -168,7 +168,9 @@ def _notes(plan: Plan, setup: Setup, groups: Sequence[Group]) -> list[str]:
     if plan.left_out:
         labels = ", ".join(scheme.label for scheme in plan.left_out)
         short = "by --quick, whose missions with an LLM would be too short for it"
-        notes.append(f"Left out {short if setup.llm.available else 'by --llm none'}: {labels}.")
+        backings = [scheme.decides.backing for scheme in plan.left_out if isinstance(scheme.decides, OverEdge)]
+        flies = all(map(setup.llm.flies, backings))
+        notes.append(f"Left out {short if flies else 'for want of an LLM or its adapter'}: {labels}.")
     for group in groups:
         notes += _doubts(group)
     notes += _below_bound(groups)

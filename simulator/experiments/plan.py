@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from simulator.experiments.edges import Llm
 from simulator.experiments.flight import flight_key
 from simulator.experiments.result import Sweep
-from simulator.experiments.schemes import NAMED_BY_OPTION, PLANNERS, Clairvoyant, Informed, Local, OverEdge, Scheme
+from simulator.experiments.schemes import PLANNERS, Clairvoyant, Informed, Local, OverEdge, Scheme
 
 if TYPE_CHECKING:
     from simulator.sites.site import Site
@@ -122,11 +122,7 @@ def plan(experiment: Experiment, setup: Setup) -> Plan:
     sites = {name: site for name, site in setup.sites.items() if name == first or name in experiment.worlds}
     for scheme in experiment.schemes(setup):
         without_llm = setup.quick and experiment.when_quick == "no_llm"
-        missing = (
-            isinstance(scheme.decides, OverEdge)
-            and scheme.decides.backing == NAMED_BY_OPTION
-            and not setup.llm.available
-        )
+        missing = isinstance(scheme.decides, OverEdge) and not setup.llm.flies(scheme.decides.backing)
         if scheme.asks_llm and (without_llm or missing):
             left_out.append(scheme)
             continue

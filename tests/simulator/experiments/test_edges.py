@@ -8,7 +8,6 @@ import httpx
 import pytest
 from rich.console import Console
 
-from simulator.errors import EdgeError
 from simulator.experiments.edges import Llm, _sha256, edge_for, environment_for
 from simulator.experiments.schemes import ADAPTED, CHANCE, NAMED_BY_OPTION, OFF, WORST, Backing
 
@@ -59,9 +58,9 @@ def test_only_the_scheme_that_names_the_adapter_has_it(tmp_path: Path, monkeypat
     monkeypatch.setenv("AICVDS_LLM_ADAPTER", str(adapter))
     for backing in (NAMED_BY_OPTION, OFF, CHANCE):
         assert "AICVDS_LLM_ADAPTER" not in settings(backing, Llm())
-    with pytest.raises(EdgeError, match="name an adapter"):
-        settings(ADAPTED, Llm())
+    assert not Llm().flies(ADAPTED)
     adapter.write_bytes(b"one")
+    assert Llm().flies(ADAPTED) and not Llm("none").flies(ADAPTED)
     assert settings(ADAPTED, Llm())["AICVDS_LLM_ADAPTER"] == str(adapter)
     first = Llm().identity(ADAPTED)
     adapter.write_bytes(b"two")
