@@ -18,8 +18,9 @@ from simulator.flying.pilots import Choice, Pilot
 from simulator.records.decision import Decision
 from simulator.records.decision_log import DecisionLog
 from simulator.records.summary import FlightFacts
+from simulator.records.track import Instant, Track
 from simulator.sites.site import Site
-from simulator.world import Info, Observation, StepTally
+from simulator.world import Info, Observation, PipelineWorld, StepTally
 
 
 @dataclass
@@ -27,6 +28,7 @@ class Flight:
     """The whole steps of a mission that were flown.
 
     ``decisions`` are in order of step and UAV. ``tally`` has one entry a step. ``sensor_xy`` has shape (J, 2), metres.
+    ``track`` has the true state before the first step and after each.
     """
 
     scenario: Scenario
@@ -34,6 +36,7 @@ class Flight:
     decisions: list[Decision] = field(default_factory=list)
     tally: list[StepTally] = field(default_factory=list)
     sensor_xy: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    track: Track = field(default_factory=Track)
     interrupted: bool = False
     started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     duration_s: float = 0.0
@@ -103,6 +106,7 @@ def fly(
         world = site.world()
         observations, _ = world.reset(seed=seed)
         flight.sensor_xy = np.array(observations["uav_0"]["sensor_position"], dtype=float)
+        flight.track.append(_instant(world, observations, {}))
         for _step in range(scenario.steps):
             choices: dict[int, Choice] = {}
             for agent, uav in world.live.items():
@@ -112,11 +116,12 @@ def fly(
                     on_decision(choices[uav])
             actions = {f"uav_{i}": np.array([c.sensor, c.velocity], dtype=np.int64) for i, c in choices.items()}
             before = observations
-            observations, _, _, _, infos = world.step(actions)
+            observations, _, left, _, infos = world.step(actions)
             _record(flight, before, choices, infos, log)
             for uav, choice in choices.items():
                 info = infos[f"uav_{uav}"]
                 pilot.learn(uav, choice, float(info["cost"]), bool(info["failed"]))
+            flight.track.append(_instant(world, observations, left))
             flight.tally.append(world.tally[-1])
             if on_step is not None:
                 on_step(flight)
@@ -128,6 +133,13 @@ def fly(
             log.rewrite(flight.decisions)
     flight.duration_s = time.monotonic() - began
     return flight
+
+
+def _instant(world: PipelineWorld, observations: Mapping[str, Observation], left: Mapping[str, bool]) -> Instant:
+    flying = [agent for agent in observations if not left.get(agent)]
+    positions = {int(agent.removeprefix("uav_")): observations[agent]["position"].tolist() for agent in flying}
+    sensors = world.sensors
+    return Instant(len(world.tally), positions, sensors.queue.copy(), sensors.battery.copy(), sensors.lost.copy())
 
 
 def _record(

@@ -301,7 +301,8 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
         from simulator.reporting.html_report import write_report
         from simulator.reporting.terminal_table import show
 
-        write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, flight.sensor_xy)
+        world = (flight.sensor_xy, flight.track)
+        write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, *world)
     show(summary, console)
     for name in (SUMMARY, DECISIONS, REPORT, FIGURES, *((REQUESTS,) if job.edge else ())):
         console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)

@@ -14,8 +14,10 @@ from simulator.policies.reach import cruise_velocity
 from simulator.records.decision import Decision
 from simulator.records.run_folder import FIGURES
 from simulator.records.summary import Summary, Tally
+from simulator.records.track import Track
 from simulator.reporting import figures
 from simulator.reporting.figure_style import PaperFigure
+from simulator.reporting.playback import Playback, playback
 from simulator.reporting.wording import ADVISERS, bound_text, llm_notice, number, percent, policy_labels, verdict
 
 COSTLIEST_DECISIONS = 15
@@ -57,11 +59,16 @@ def drawings(
 
 
 def render_report(
-    summary: Summary, scenario: Scenario, decisions: Sequence[Decision], drawn: Mapping[str, PaperFigure]
+    summary: Summary,
+    scenario: Scenario,
+    decisions: Sequence[Decision],
+    drawn: Mapping[str, PaperFigure],
+    played: Playback | None = None,
 ) -> str:
-    """The page as HTML; arguments as for ``drawings``, and ``drawn`` is its result."""
+    """The page as HTML; arguments as for ``drawings``, ``drawn`` is its result, and ``played`` a flight's playback."""
     pages = Environment(loader=PackageLoader("simulator.reporting", "."), autoescape=True, undefined=StrictUndefined)
     pages.trim_blocks = pages.lstrip_blocks = True
+    pages.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     pages.filters["number"] = number
     pages.filters["percent"] = percent
     labels = policy_labels(summary)
@@ -79,6 +86,7 @@ def render_report(
         figures={name: Markup(one.inline) for name, one in drawn.items()},
         costliest=costliest(decisions),
         maps=min(scenario.uavs, figures.MAPS),
+        playback=played,
     )
 
 
@@ -89,14 +97,19 @@ def write_report(
     decisions: Sequence[Decision],
     tallies: Mapping[str, Sequence[Tally]],
     sensor_xy: np.ndarray,
+    track: Track,
 ) -> None:
-    """Write the page, and its figures for print into the folder ``figures/`` beside it; arguments as for ``drawings``.
+    """Write the page, and its figures for print into the folder ``figures/`` beside it.
+
+    The first arguments are those of ``drawings``; ``track`` is what the playback shows.
 
     Raises:
         OSError: a file cannot be written.
     """
     drawn = drawings(summary, scenario, decisions, tallies, sensor_xy)
-    path.write_text(render_report(summary, scenario, decisions, drawn), encoding="utf-8")
+    instants = track.until(summary.steps_flown)
+    played = playback(scenario, sensor_xy, decisions, instants, track.stride)
+    path.write_text(render_report(summary, scenario, decisions, drawn, played), encoding="utf-8")
     folder = path.parent / FIGURES
     folder.mkdir(exist_ok=True)
     for one in drawn.values():

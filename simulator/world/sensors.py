@@ -46,6 +46,7 @@ class Sensors:
         initial_queue: shape ``(J,)``, packets.
         queue: shape ``(J,)``, packets waiting now, 0..W.
         battery: shape ``(J,)``, joules left.
+        lost: shape ``(J,)``, packets lost so far.
 
     Raises:
         ValueError: the trace does not cover the mission.
@@ -68,6 +69,7 @@ class Sensors:
             raise ValueError(f"the trace has shape {shape}, the mission is {scenario.steps} steps of {count} sensors")
         self.queue = self.initial_queue.copy()
         self.battery: FloatArray = np.full(count, scenario.battery_j)
+        self.lost: IntArray = np.zeros(count, dtype=np.int64)
 
     def serve(self, chosen: IntArray, uavs: Iterable[int], links: Links) -> tuple[IntArray, IntArray]:
         """Let UAVs collect, in this order, each from its sensor; returns f and the packets moved, each ``(I,)``.
@@ -112,7 +114,9 @@ class Sensors:
         """Add a step's arrivals, clip the queues to W, and return the packets lost, shape ``(J,)``."""
         filled: IntArray = self.queue + self.arrivals[step]
         self.queue = np.minimum(filled, self._scenario.queue_capacity)
-        return np.asarray(filled - self.queue)
+        lost: IntArray = filled - self.queue
+        self.lost = self.lost + lost
+        return lost
 
 
 def draw_positions(scenario: Scenario, rng: np.random.Generator) -> FloatArray:

@@ -16,13 +16,25 @@ from simulator.records.summary import LossBound, Summary, summarise
 from simulator.reporting import figures
 from simulator.reporting.figure_style import PaperFigure
 from simulator.reporting.html_report import costliest, drawings, render_report, write_report
+from simulator.reporting.playback import playback
 from simulator.reporting.wording import llm_notice, policy_labels
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
 Drawn = dict[str, PaperFigure]
 EVIL = '<script>alert("$x$")</script>&amp;'
-SECTIONS = ("outcome", "latency", "loss", "tokens", "visits", "deciders", "decisions", "glossary", "provenance")
+SECTIONS = (
+    "outcome",
+    "playback",
+    "latency",
+    "loss",
+    "tokens",
+    "visits",
+    "deciders",
+    "decisions",
+    "glossary",
+    "provenance",
+)
 
 
 def decision(**changes: object) -> Decision:
@@ -34,9 +46,9 @@ def page(flight: Flight, model: str | None = "stub-1", decisions: list[Decision]
     seen = flight.decisions if decisions is None else decisions
     tallies = {"aic_vds": flight.tally, **baselines(Site(flight.scenario), 0, flight.steps_flown)}
     summary = summary_of(flight, model)
-    return render_report(
-        summary, flight.scenario, seen, drawings(summary, flight.scenario, seen, tallies, flight.sensor_xy)
-    )
+    figures = drawings(summary, flight.scenario, seen, tallies, flight.sensor_xy)
+    played = playback(flight.scenario, flight.sensor_xy, seen, flight.track.until(flight.steps_flown), 1)
+    return render_report(summary, flight.scenario, seen, figures, played)
 
 
 def summary_of(flight: Flight, model: str | None) -> Summary:
@@ -93,7 +105,7 @@ class Page(HTMLParser):
 def test_every_section_is_there(drawn: str) -> None:
     for section in SECTIONS:
         assert f'<section id="{section}">' in drawn
-    assert Page(drawn).tags.count("svg") == 6
+    assert Page(drawn).tags.count("svg") == 7
     for words in ("AIC-VDS", "EOF", "WQCS", "Jain", "aicvds simulate", "stub-1", "seed 0"):
         assert words in drawn
 
@@ -182,7 +194,9 @@ def test_a_flight_without_costs_has_no_costly_decisions(flight: Flight) -> None:
 def test_the_page_needs_nothing_but_itself(drawn: str) -> None:
     parsed = Page(drawn)
     assert all(address.startswith(("#", "data:image/png;base64,")) for address in parsed.loaded)
-    assert not {"script", "link", "img", "iframe"} & set(parsed.tags)
+    assert not {"link", "img", "iframe"} & set(parsed.tags)
+    # The browser too refuses every request, and every script but the page's own.
+    assert re.search(r'Content-Security-Policy" content="default-src .none.;[^"]*script-src .sha256-[^ "]+"', drawn)
     assert "@import" not in drawn and "@font-face" not in drawn
     without_names = re.sub(r'xmlns(:\w+)?="[^"]*"', "", drawn).replace("http://edge:8000", "")
     assert not re.search(r"https?://", without_names)
@@ -204,7 +218,7 @@ def test_the_page_is_the_same_each_time(flight: Flight, drawn: str) -> None:
 def test_text_of_the_edge_is_escaped(flight: Flight) -> None:
     evil = [d.model_copy(update={"reason": EVIL}) for d in flight.decisions]
     html = page(flight, model=EVIL, decisions=evil)
-    assert "<script" not in html
+    assert "<script>alert" not in html and html.count("<script") == 2
     assert html.count("&lt;script&gt;") >= 2
 
 
@@ -225,7 +239,9 @@ def test_a_large_fleet_fits() -> None:
 def test_figures_are_written_for_print(tmp_path: Path) -> None:
     flown = fly(Site(SHORT), LocalPilot("random", SHORT, 0), seed=0)
     summary = summary_of(flown, None)
-    write_report(tmp_path / "r.html", summary, SHORT, flown.decisions, {"aic_vds": flown.tally}, flown.sensor_xy)
+    write_report(
+        tmp_path / "r.html", summary, SHORT, flown.decisions, {"aic_vds": flown.tally}, flown.sensor_xy, flown.track
+    )
     html = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "seed 0" in html and "<code>aicvds simulate</code>" in html
     widths = {"losses": 7.16, "latency-map": 7.16, "visits": 3.5, "deciders": 3.5, "latency-steps": 3.5}
