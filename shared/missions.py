@@ -35,6 +35,21 @@ class LearnedWorld(Wire):
     )
 
 
+class VisitDeadline(Wire):
+    """How one order to visit a sensor at least once in any ``visit_every`` steps was kept.
+
+    A deadline ends in each step whose last ``visit_every`` steps were flown under the order, and is met if the sensor
+    was visited in one of them. The steps are those that are over. A visit counts until its outcome says that it failed.
+    """
+
+    sensor_id: int
+    visit_every: int
+    since: int = Field(description="the first step under the order")
+    until: int | None = Field(description="the first step no longer under it; null while it is in force")
+    met: int
+    missed: int
+
+
 class MissionStatus(Wire):
     """``GET /missions/{id}``; ``experiences`` is their number, ``prompt.experiences`` the largest number."""
 
@@ -67,6 +82,11 @@ class MissionStatus(Wire):
         None,
         exclude_if=lambda value: value is None,
         description="how the world differs from the scenario's formulas; omitted where nothing shows that it does",
+    )
+    deadlines: list[VisitDeadline] | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="the orders to visit sensors, ended ones first, at most 100 of these; omitted where none was given",
     )
 
 

@@ -1,4 +1,4 @@
-"""What the reports of a fleet say about its troubles: overflows by step, silent sensors, and visit deadlines."""
+"""What the reports of a fleet say about its troubles: overflows by step, and silent sensors."""
 
 from __future__ import annotations
 
@@ -27,22 +27,18 @@ class Watched:
 
     Attributes:
         full: by step, the expected number of sensors that overflowed into it, as the fleet believed.
-        deadlines: by step, the numbers of visit deadlines that were kept and missed.
         silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
         decided_at: the monotonic time of the last decision, seconds; None before the first.
     """
 
     full: BoundedDict[int, float] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
-    deadlines: BoundedDict[int, tuple[int, int]] = field(default_factory=lambda: BoundedDict(_MOST_STEPS))
     silent: dict[int, int] = field(default_factory=dict)
     decided_at: float | None = None
 
     def totals(self) -> dict[str, Any]:
         """The page's numbers: sums over the steps, the silent sensors, and the seconds since the last decision."""
-        counts = list(self.deadlines.values())
         return {
             "overflows": round(sum(self.full.values()), 1),
-            "deadlines": {"kept": sum(kept for kept, _ in counts), "missed": sum(missed for _, missed in counts)},
             "silent": self.silent,
             "idle_s": None if self.decided_at is None else round(time.monotonic() - self.decided_at, 1),
         }
@@ -60,12 +56,6 @@ class FleetWatch:
         watched.decided_at = time.monotonic()
         watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
         self._hear(watched, mission, uav, step)
-        orders = mission.guidance.confirmed
-        if orders.wishes:
-            every = orders.every(mission.scenario.sensors)
-            late = orders.overdue(step, mission.records.visits) > 0
-            missed = int(late.sum())
-            watched.deadlines[step] = int(np.isfinite(every).sum()) - missed, missed
 
     def of(self, mission_id: str) -> Watched:
         """What was seen of the mission."""

@@ -92,6 +92,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "learner_updates": mission.learner.updates,
         "learner_loss": mission.learner.last_loss,
         "guidance": _guidance(mission),
+        "deadlines": _deadlines(mission),
         **watched.totals(),
         "queue": np.round(queue, 1).tolist(),
         "urgency": np.round(urgency(queue, rate, scenario), 3).tolist(),
@@ -128,6 +129,12 @@ def _guidance(mission: Mission) -> dict[str, Any]:
             for wish in orders.sensors
         ],
     }
+
+
+def _deadlines(mission: Mission) -> dict[str, int]:
+    """The deadlines of all visit orders so far."""
+    counts = mission.deadlines()
+    return {"met": sum(one.met for one in counts), "missed": sum(one.missed for one in counts)}
 
 
 def _curves(scenario: Scenario) -> list[Any]:

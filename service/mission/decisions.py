@@ -105,6 +105,10 @@ class PendingDecisions:
         """Whether the decision waits for its outcome, or has it."""
         return decision_id in self._decisions or decision_id in self.applied
 
+    def waits_for(self, step: int) -> bool:
+        """Whether a decision of the step waits for its outcome."""
+        return any(pending.step == step for pending in self._decisions.values())
+
     def find(self, outcome: Outcome) -> Literal["pending", "applied"]:
         """Whether the decision still waits for an outcome, or this outcome is already applied.
 

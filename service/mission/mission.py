@@ -23,11 +23,12 @@ from service.mission.planner import Planner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
 from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
+from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.measured import Measured
 from shared.guidance import Guidance, GuidanceAnswer
-from shared.missions import MissionStatus
+from shared.missions import MissionStatus, VisitDeadline
 from shared.records import Records, take_report
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Belief, Features, MissionSpec, Mode, Outcome, UavState
@@ -93,6 +94,7 @@ class Mission:
         planned = spec.planner == "on" and can_plan(self.scenario)
         self.planner = Planner(self.scenario, self.belief) if planned else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
+        self.visit_orders = VisitOrders()
         self.trust: dict[str, Trust] = {}
         self.record: Callable[[Event], None] = ignore_event
 
@@ -147,8 +149,11 @@ class Mission:
         reservation = Reservation(decision.uav_id, decision.sensor_id, decision.decision_id, attempt)
         earlier = self.reservations.reserve(decision.step, reservation)
         forgotten = self.pending.add(decision)
+        self.visit_orders.follow(self.guidance.confirmed, decision.step)
         if earlier is not None:
             self.records.withdraw(earlier.sensor_id, earlier.decision_id)
+            self.visit_orders.withdraw(earlier.sensor_id, decision.step)
+        self.visit_orders.visit(decision.sensor_id, decision.step)
         self.records.presume(decision.sensor_id, decision.decision_id, decision.step)
         for old in forgotten:
             self.records.confirm(old.sensor_id, old.decision_id, old.step)
@@ -169,6 +174,7 @@ class Mission:
         self.feedback += 1
         if outcome.failed:
             self.records.withdraw(decision.sensor_id, decision.decision_id)
+            self.visit_orders.withdraw(decision.sensor_id, decision.step)
         else:
             self.records.confirm(decision.sensor_id, decision.decision_id, decision.step)
         self.record(Settled(outcome, for_training))
@@ -205,6 +211,7 @@ class Mission:
             "turns": self.reservations.state_dict(),
             "belief": self.belief.state_dict(),
             "guidance": self.guidance.state_dict(),
+            "visit_orders": self.visit_orders.state_dict(),
             "trust": {model: trust.state_dict() for model, trust in self.trust.items()},
         }
 
@@ -221,12 +228,20 @@ class Mission:
         for model, trust in state["trust"].items():
             self.trust_in(model).load_state_dict(trust)
         self.restore_guidance(state["guidance"])
+        # Checkpoints of earlier versions have none: theirs count from the next decision.
+        if "visit_orders" in state:
+            self.visit_orders.load_state_dict(state["visit_orders"])
 
     def restore_guidance(self, state: dict[str, Any]) -> None:
         """Restore the operator's guidance from its ``state_dict``."""
         self.guidance.load_state_dict(state)
         if self.planner is not None:
             self.planner.follow(self.guidance.confirmed)
+
+    def deadlines(self) -> list[VisitDeadline]:
+        """How the operator's visit orders were kept in the steps that are over."""
+        last = self.visit_orders.last
+        return self.visit_orders.counts(last - 1 if self.pending.waits_for(last) else last)
 
     def status(self) -> MissionStatus:
         """The body of ``GET /missions/{id}``."""
@@ -252,4 +267,5 @@ class Mission:
             learner_loss=self.learner.last_loss,
             visits={int(s): int(visits[s]) for s in np.flatnonzero(visits >= 0)},
             learned=learned_world(self.belief),
+            deadlines=self.deadlines() or None,
         )

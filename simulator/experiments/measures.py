@@ -8,6 +8,7 @@ from itertools import accumulate
 
 import numpy as np
 
+from shared.visit_deadlines import judged
 from simulator.experiments.flight import DecisionRecord, FlightRecord, TokenCounts
 from simulator.records.statistics import jain_index
 
@@ -72,15 +73,14 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def _deadlines_met(flight: FlightRecord) -> float | None:
-    """The percentage of steps, from n - 1 on, at whose end a sensor to visit every n steps was served in the last n."""
-    met = []
+    """The percentage of the deadlines of the visits asked for, as :func:`shared.visit_deadlines.judged` counts them."""
+    met = total = 0
     for wish in flight.meant.sensors if flight.meant is not None else []:
-        if wish.visit_every is None:
-            continue
-        served = {d.step for d in flight.decisions if d.sensor == wish.sensor_id and not d.failed}
-        for step in range(wish.visit_every - 1, flight.steps):
-            met.append(not served.isdisjoint(range(step - wish.visit_every + 1, step + 1)))
-    return 100 * sum(met) / len(met) if met else None
+        if wish.visit_every is not None:
+            served = {d.step for d in flight.decisions if d.sensor == wish.sensor_id and not d.failed}
+            kept, missed = judged(wish.visit_every, 0, flight.steps - 1, served)
+            met, total = met + kept, total + kept + missed
+    return 100 * met / total if total else None
 
 
 def _velocities_allowed(flight: FlightRecord) -> float | None:

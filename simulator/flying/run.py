@@ -23,8 +23,9 @@ from shared.wire import MissionSpec, Mode, Uplink
 from simulator.cli.running import INTERRUPTED
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport
-from simulator.errors import EdgeRefused, UsageError
+from simulator.errors import EdgeError, EdgeRefused, UsageError
 from simulator.records.decision_log import DecisionLog
+from simulator.records.operator import Operator, recounted
 from simulator.records.request_log import RequestLog, resolved
 from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, fresh_folder, naming_out
 from simulator.records.summary import BySource, Summary, sources_text, summarise
@@ -96,7 +97,7 @@ def conduct(
     if job.edge is None:
         fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
-        return _conclude(job, flight, None, None, console)
+        return _conclude(job, flight, None, None, None, console)
     lossy = _radio_link(job.site.scenario, job.seed)
     with _client(job, job.edge) as ground, _client(job, job.edge, lossy) as radio, _probe(job.edge) as probe:
         model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
@@ -115,7 +116,8 @@ def conduct(
         with requests:
             pilot.on_request = requests.append
             flight = _fly(job, pilot, console, progress)
-    code = _conclude(job, flight, created.mode, model, console)
+        operator = _operator(probe, job.mission_id, flight)
+    code = _conclude(job, flight, created.mode, model, operator, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
         print(
@@ -267,6 +269,19 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
     return flight
 
 
+def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> Operator | None:
+    """The operator's part in the flight; ``None`` if there was none, or the edge that knows it is gone."""
+    try:
+        told, status = probe.guidance(mission_id), probe.mission(mission_id)
+    except EdgeError:
+        return None
+    orders = status.deadlines or []
+    if told.note is None and told.obeyed_in_words is None and not orders:
+        return None
+    deadlines = recounted(orders, flight.decisions, flight.steps_flown)
+    return Operator(note=told.note, orders=told.obeyed_in_words, deadlines=deadlines)
+
+
 def _bounded(job: Job, flight: Flight, summary: Summary, console: Console) -> Summary:
     """The summary with the bound on the losses, unless none is wanted."""
     if not job.bound_s:
@@ -279,7 +294,9 @@ def _bounded(job: Job, flight: Flight, summary: Summary, console: Console) -> Su
     return summary.model_copy(update=known)
 
 
-def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, console: Console) -> int:
+def _conclude(
+    job: Job, flight: Flight, mode: str | None, model: str | None, operator: Operator | None, console: Console
+) -> int:
     from simulator.flying.rollout import baselines
 
     flown_by = "aic_vds" if job.policy == "edge" else job.policy
@@ -295,7 +312,8 @@ def _conclude(job: Job, flight: Flight, mode: str | None, model: str | None, con
         deadline_ms=job.deadline_ms,
         command=job.command,
     )
-    summary = _bounded(job, flight, summarise(facts, flight.decisions, tallies), console)
+    flown = summarise(facts, flight.decisions, tallies).model_copy(update={"operator": operator})
+    summary = _bounded(job, flight, flown, console)
     with console.status("Drawing the report"), naming_out(job.out):
         (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
         from simulator.reporting.html_report import write_report

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from shared.wire import Tokens, Uplink
 from simulator.records.decision import Decision, queried_llm
+from simulator.records.operator import Operator
 from simulator.records.record import Record
 from simulator.records.statistics import jain_index, mean, percentile, visits_per_sensor
 
@@ -106,7 +107,8 @@ class Summary(FlightFacts):
     transmissions. ``llm_asked`` counts decisions for which the LLM was queried, with a usable answer or not.
     ``uplink_bytes_mean`` is the mean size of a request, ``attention_bytes_mean`` the mean size of the attention weights
     that a UAV fetched for its decision. ``trust`` is the mean weight of each adviser over the decisions of source
-    ``guided``. ``bound`` is ``null`` where ``bound_missing`` says why.
+    ``guided``. ``bound`` is ``null`` where ``bound_missing`` says why. ``operator`` is ``null`` without a note and
+    orders.
     """
 
     decisions: int
@@ -125,6 +127,7 @@ class Summary(FlightFacts):
     trust: dict[str, float] = {}
     bound: LossBound | None = None
     bound_missing: str | None = None
+    operator: Operator | None = None
 
 
 class Tally(Protocol):

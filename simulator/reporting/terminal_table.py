@@ -28,6 +28,8 @@ def show(summary: Summary, console: Console) -> None:
         console.print(bound, markup=False, highlight=False, soft_wrap=True)
     if summary.policy == "edge":
         console.print(f"{summary.decisions} decisions: {deciders_text(summary)}", markup=False)
+    if summary.operator is not None and summary.operator.deadlines:
+        console.print(f"Visit deadlines: {summary.operator.met} met, {summary.operator.missed} missed")
     tokens, trips = summary.tokens, summary.rtt_ms
     if trips.p50 is not None:
         console.print(f"Round trip: median {trips.p50:.0f} ms, 99th percentile {trips.p99:.0f} ms")

@@ -1,4 +1,4 @@
-// The operator's console: give a note, read what was understood, confirm or reject it, and see which deadlines are kept.
+// The operator's console: give a note, read what was understood, confirm or reject it, and see which deadlines are met.
 
 import { at, make, say } from "./dom.js";
 import { post, Refused } from "./edge.js";
@@ -52,8 +52,8 @@ export class Operator {
   #orders(guidance, deadlines, step) {
     say(at("orders-words"), guidance.obeyed_in_words ?? "None.");
     const due = guidance.orders.filter((order) => order.due !== null);
-    at("deadlines").hidden = due.length === 0;
-    say(at("deadlines-kept"), `Deadlines of sensors, summed over the steps: ${deadlines.kept} kept, ${deadlines.missed} missed.`);
+    at("deadlines").hidden = due.length + deadlines.met + deadlines.missed === 0;
+    say(at("deadlines-met"), `Visit deadlines of the steps that are over: ${deadlines.met} met, ${deadlines.missed} missed.`);
     const rows = due.map((order) => {
       const late = order.due < step;
       const text = late ? `late: it was due by step ${order.due}` : `due by step ${order.due}`;

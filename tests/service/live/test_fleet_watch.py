@@ -6,7 +6,6 @@ import pytest
 
 from service.live.fleet_watch import FleetWatch
 from service.mission.mission import Mission
-from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.wire import UavState
 from tests.service.making import mission, uav
 
@@ -49,14 +48,6 @@ def test_a_sensor_in_radio_range_that_is_not_heard_is_silent_until_it_is() -> No
     fleet.observe(heard, 2)
     watched.decided(fleet, heard, 2)
     assert watched.of("test").silent == {}
-
-
-def test_deadlines_are_kept_or_missed() -> None:
-    fleet = mission()
-    fleet.answer_guidance(GuidanceAnswer(guidance=Guidance(sensors=[SensorWish(sensor_id=1, visit_every=2)])))
-    watched = watch(fleet, *(uav(step=step) for step in range(3)))
-    # Never visited: due by step 1, late from there on.
-    assert watched.of("test").totals()["deadlines"] == {"kept": 1, "missed": 2}
 
 
 def test_a_forgotten_mission_begins_anew() -> None:

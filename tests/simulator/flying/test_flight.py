@@ -89,7 +89,7 @@ def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient, monkeypa
         *("tokens", "rtt_ms", "uplink_bytes_mean", "uplink", "attention_bytes_mean", "jain"),
         *("by_reason", "late", "failures", "model", "edge", "mission_id", "mode", "interrupted", "steps_flown"),
         *("started_at", "duration_s", "version", "policy", "deadline_ms", "command", "llm_asked"),
-        *("trust", "bound", "bound_missing"),
+        *("trust", "bound", "bound_missing", "operator"),
     }
     assert set(fields["by_source"]) == {"llm", "guided", "value", "policy", "onboard"}
     assert set(fields["lost_packets"]) == set(fields["loss_events"]) == {"aic_vds", *BASELINES}

@@ -1,0 +1,48 @@
+"""The operator's part of a flight: the note, the orders, and how they were kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from shared.missions import VisitDeadline
+from shared.visit_deadlines import judged
+from simulator.records.decision import Decision
+from simulator.records.record import Record
+
+
+class Operator(Record):
+    """The operator's newest note, the orders in force at the end in words, and every visit order's deadlines."""
+
+    note: str | None
+    orders: str | None
+    deadlines: list[VisitDeadline]
+
+    @property
+    def met(self) -> int:
+        """The deadlines that were met."""
+        return sum(one.met for one in self.deadlines)
+
+    @property
+    def missed(self) -> int:
+        """The deadlines that were missed."""
+        return sum(one.missed for one in self.deadlines)
+
+
+def recounted(orders: Iterable[VisitDeadline], decisions: Sequence[Decision], steps: int) -> list[VisitDeadline]:
+    """The orders with the deadlines that these decisions met and missed; an edge does not know those taken on board.
+
+    Args:
+        orders: the edge's; only their counts are replaced.
+        decisions: of the flight.
+        steps: that were flown.
+    """
+    served: dict[int, set[int]] = {}
+    for d in decisions:
+        if not d.failed:
+            served.setdefault(d.sensor_id, set()).add(d.step)
+    counted = []
+    for order in orders:
+        last = steps - 1 if order.until is None else min(steps, order.until) - 1
+        met, missed = judged(order.visit_every, order.since, last, served.get(order.sensor_id, ()))
+        counted.append(order.model_copy(update={"met": met, "missed": missed}))
+    return counted
