@@ -40,6 +40,12 @@ _OF_EXTRAS = frozenset((
 ))
 # fmt: on
 
+# An editable installation has the commands of the day when it was made, and the code of today.
+_STALE = (
+    "this installation is older than its checkout and cannot find that command. "
+    "Type `make install` in the checkout, or install the package again with pip."
+)
+
 _USAGE = """usage: aicvds COMMAND [OPTIONS]
 
 {commands}
@@ -68,12 +74,18 @@ def main() -> int:
         print(f"aicvds {version('aic-vds')}")
         return 0
     found = [e for e in entry_points(group="aicvds.commands") if e.name == name]
+    if not found and name in _SUMMARIES:
+        print(f"aicvds {name}: {_STALE}", file=sys.stderr)
+        return 2
     if not found:
         print(f"aicvds: there is no command {name!r}{suggestion(name, _SUMMARIES)}\n\n{usage()}", file=sys.stderr)
         return 2
     try:
         return int(found[0].load()(rest) or 0)
     except ModuleNotFoundError as missing:
+        if f"{found[0].value.partition(':')[0]}.".startswith(f"{missing.name}."):
+            print(f"aicvds {name}: {_STALE}", file=sys.stderr)
+            return 2
         module = str(missing.name).partition(".")[0]
         # A module missing inside an installed package is a bug too, not a missing extra.
         if module not in _OF_EXTRAS or find_spec(module) is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -40,3 +42,25 @@ def test_a_module_of_an_extra_that_is_not_installed_names_the_extra(
 def test_any_other_missing_module_is_a_traceback(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ModuleNotFoundError, match=missing):
         run(monkeypatch, missing)
+
+
+def test_an_installation_older_than_its_checkout_says_what_makes_it_new(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cli, "entry_points", lambda group: [])
+    monkeypatch.setattr(sys, "argv", ["aicvds", "distill"])
+    assert cli.main() == 2
+    lacks = capsys.readouterr().err
+    # Its module has moved since.
+    assert run(monkeypatch, "simulator.commands.bound") == 2
+    for error in (lacks, capsys.readouterr().err):
+        assert "older than its checkout" in error and "`make install`" in error
+        assert "did you mean" not in error and error.count("\n") == 1
+
+
+def test_every_command_of_the_help_is_installed_and_every_installed_one_is_in_the_help() -> None:
+    metadata = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
+    entries = set(metadata["project"]["entry-points"]["aicvds.commands"])
+    assert entries == {
+        line.split()[0] for line in cli.usage().splitlines() if line.startswith("  ") and line[2] != " "
+    } - {"aicvds"}
