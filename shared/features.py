@@ -94,7 +94,7 @@ class Reach:
     @classmethod
     def of(cls, links: ExpectedLinks, queue: FloatArray, urgency: FloatArray) -> Self:
         """From links ``(V, J)``, queues and urgencies ``(J,)``; the queue is 0 for a sensor that cannot send."""
-        packets = links.movable(queue)
+        packets = links.hold * np.minimum(queue, links.packets)
         velocities = np.arange(len(packets), dtype=np.float64)
         return cls(links, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
 
@@ -113,45 +113,6 @@ class Reach:
         """The packets that the UAV could move at the best velocity, ``(J,)``."""
         return np.asarray(np.take_along_axis(self.packets, self.best[None], axis=0)[0])
 
-    def sensor_features(self, urgency: FloatArray, overflow_in: FloatArray, scenario: Scenario) -> FloatArray:
-        """The features of preset ``reach`` beside preset ``paper``'s five, ``(J, 7)``, each 0..1.
-
-        They are, at the best velocity, packets / W, urgent packets / W, and that velocity / max; then steps until
-        overflow / T, the probabilities that the link holds at velocity 0 and at full speed, and half the distance at
-        velocity 0 in radio radii.
-
-        Args:
-            urgency: U, ``(J,)``.
-            overflow_in: ``(W - q) / rate``, steps, ``(J,)``.
-        """
-        packets = self.best_packets / scenario.queue_capacity
-        holds = self.links.holding([0, -1])
-        columns = (
-            packets,
-            urgency * packets,
-            self.best / scenario.max_velocity,
-            overflow_in / scenario.steps,
-            holds[0],
-            holds[1],
-            self.links.distance[0] / scenario.radio_radius_m / 2,
-        )
-        return np.asarray(np.clip(np.stack(columns, axis=1), 0.0, 1.0))
-
-    def level_features(self, rows: Sequence[int], urgency: FloatArray, scenario: Scenario) -> NDArray[np.float32]:
-        """The velocity scorer's inputs for the sensors in n rows in preset ``reach``, ``(n, V, 4)``.
-
-        They are at each level packets / W, urgent packets / W, velocity / max, and the distance in radio radii, at
-        most 2.
-
-        Args:
-            urgency: U, ``(J,)``.
-        """
-        packets = self.packets[:, rows].T / scenario.queue_capacity
-        levels = np.broadcast_to(np.arange(len(self.packets)) / scenario.max_velocity, packets.shape)
-        distance = np.minimum(self.links.distance[:, rows].T / scenario.radio_radius_m, 2.0)
-        urgent = urgency[rows][:, None] * packets
-        return np.stack((packets, urgent, levels, distance), axis=2).astype(np.float32)
-
 
 @dataclass(frozen=True, slots=True)
 class State:
@@ -160,8 +121,9 @@ class State:
     ``progress_m`` along the trajectory, if the UAV reported it; ``queue`` packets, ``battery`` J, ``gain`` dB,
     ``rate`` packets a step, ``since_visit`` steps, ``overflow`` (the probability of one before the next visit) and
     ``urgency`` 0..1, ``distance`` m from the UAV now. A sensor never heard (``heard`` false) has zeros
-    in the fields that only a beacon fills. ``channel`` and ``drift`` are the fleet's knowledge of its links and
-    ways; without them they follow the formula. Only preset ``reach`` has ``reach``.
+    in the fields that only a beacon fills. A sensor is ``able`` that was heard and whose battery is not flat.
+    ``channel`` and ``drift`` are the fleet's knowledge of its links and ways; without them they follow the formula.
+    Only preset ``reach`` has ``reach``.
     """
 
     position: Point
@@ -169,6 +131,7 @@ class State:
     places: FloatArray
     ids: NDArray[np.int64]
     heard: NDArray[np.bool_]
+    able: NDArray[np.bool_]
     admissible: NDArray[np.bool_]
     queue: FloatArray
     battery: FloatArray
@@ -181,11 +144,6 @@ class State:
     channel: LearnedChannel | None = None
     drift: Drift | None = None
     reach: Reach | None = None
-
-    @property
-    def able(self) -> NDArray[np.bool_]:
-        """Whether each sensor was heard and its battery is not flat."""
-        return self.heard & (self.battery > 0)
 
     @property
     def overflow_risk(self) -> float:
@@ -211,36 +169,47 @@ class State:
     def features(self, scenario: Scenario) -> NDArray[np.float32]:
         """Attention's input for the n admissible sensors, ``(n, d)``, each number 0..1.
 
-        Preset ``paper``, d = 5: ``[b/E0, q/W, h normalised, delta/T, U]``. Preset ``reach``, d = 12: these, and
-        :meth:`Reach.sensor_features`.
+        Preset ``paper``, d = 5: ``[b/E0, q/W, h normalised, delta/T, U]``. Preset ``reach``, d = 12: these, and, at the
+        best velocity, packets / W, urgent packets / W, and that velocity / max; then steps until overflow / T, the
+        probabilities that the link holds at velocity 0 and at full speed, and half the distance at velocity 0 in radio
+        radii.
         """
-        best = best_gain_db(scenario)
-        worst = -scenario.path_loss_limit_db
-        columns = (
+        best, worst, capacity = best_gain_db(scenario), -scenario.path_loss_limit_db, scenario.queue_capacity
+        columns = [
             self.battery / scenario.battery_j,
-            self.queue / scenario.queue_capacity,
+            self.queue / capacity,
             (self.gain - worst) / max(best - worst, 1.0),
             self.since_visit / scenario.steps,
             self.urgency,
-        )
+        ]
+        if (reach := self.reach) is not None:
+            packets, room = reach.best_packets / capacity, capacity - self.queue
+            columns += [
+                packets,
+                self.urgency * packets,
+                reach.best / scenario.max_velocity,
+                # A sensor without arrivals never overflows.
+                np.divide(room, self.rate, out=np.full_like(room, np.inf), where=self.rate > 0) / scenario.steps,
+                reach.links.hold[0],
+                reach.links.hold[-1],
+                reach.links.distance[0] / scenario.radio_radius_m / 2,
+            ]
         stacked = np.minimum(np.maximum(np.array(columns).T[self.admissible], 0.0), 1.0)
-        if self.reach is not None:
-            room = scenario.queue_capacity - self.queue
-            # A sensor without arrivals never overflows.
-            overflow_in = np.divide(room, self.rate, out=np.full_like(room, np.inf), where=self.rate > 0)
-            added = self.reach.sensor_features(self.urgency, overflow_in, scenario)
-            stacked = np.concatenate((stacked, added[self.admissible]), axis=1)
         return np.ascontiguousarray(stacked, dtype=np.float32)
 
     def approaches(self, rows: Sequence[int], scenario: Scenario) -> NDArray[np.float32]:
         """The velocity scorer's inputs for the sensors in n rows, beside their contexts.
 
-        Preset ``paper``: the distance in radio radii, at most 2, ``(n, 1)``. Preset ``reach``:
-        :meth:`Reach.level_features`, ``(n, V, 4)``.
+        Preset ``paper``: the distance in radio radii, at most 2, ``(n, 1)``. Preset ``reach``: at each level packets /
+        W, urgent packets / W, velocity / max, and the distance in radio radii, at most 2, ``(n, V, 4)``.
         """
-        if self.reach is not None:
-            return self.reach.level_features(rows, self.urgency, scenario)
-        return np.minimum(self.distance[rows] / scenario.radio_radius_m, 2.0)[:, None].astype(np.float32)
+        if (reach := self.reach) is None:
+            return np.minimum(self.distance[rows] / scenario.radio_radius_m, 2.0)[:, None].astype(np.float32)
+        packets = reach.packets[:, rows].T / scenario.queue_capacity
+        levels = np.broadcast_to(np.arange(len(reach.packets)) / scenario.max_velocity, packets.shape)
+        distance = np.minimum(reach.links.distance[:, rows].T / scenario.radio_radius_m, 2.0)
+        urgent = self.urgency[rows][:, None] * packets
+        return np.stack((packets, urgent, levels, distance), axis=2).astype(np.float32)
 
 
 def augment(
@@ -285,6 +254,7 @@ def augment(
         heard = np.ones_like(heard)
         coming = belief.arrivals.coming(step, scenario.overflow_horizon_steps)
         queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], coming[ids]
+    able = heard & (battery > 0)
     overflow = overflow_probability(queue, rate, scenario)
     urgencies = urgency_of(queue, overflow, scenario)
     state = State(
@@ -293,7 +263,8 @@ def augment(
         places=places,
         ids=ids,
         heard=heard,
-        admissible=heard & (battery > 0) & ~np.isin(ids, list(reserved)),
+        able=able,
+        admissible=able & ~np.isin(ids, list(reserved)),
         queue=queue,
         battery=battery,
         gain=np.where(beacon == step, gain, expected),

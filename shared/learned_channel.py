@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
 
-from shared.channel import FloatArray, IntArray, Links, link_holds, packets_per_step, path_loss_db
+from shared.channel import FloatArray, IntArray, Links, path_loss_db
 from shared.radio_map import RadioMap
 from shared.scenario import Point, Scenario
 
@@ -43,45 +41,29 @@ class ExpectedLinks:
     Attributes:
         distance: horizontal, metres.
         packets: that a step can move if the link holds; 0 where it is most unlikely to.
+        hold: the probability that each link holds, 0..1.
         margin: how many standard deviations the path loss lies below the threshold; None: the loss is certain.
-        alive: shape ``(J,)``, the probability that each sensor's radio works; None: 1.
     """
 
     distance: FloatArray
     packets: IntArray
-    scenario: Scenario
+    hold: FloatArray
     margin: FloatArray | None = None
-    alive: FloatArray | None = None
 
     @classmethod
     def by_formula(cls, distance: FloatArray, scenario: Scenario) -> Self:
         """The links of the mean path loss."""
-        return cls(distance, packets_per_step(distance, scenario), scenario)
-
-    @cached_property
-    def hold(self) -> FloatArray:
-        """The probability that each link holds, 0..1."""
-        return self.holding(slice(None))
-
-    def holding(self, rows: slice | Sequence[int]) -> FloatArray:
-        """The probability that the links of some places hold, ``(n, J)``."""
-        if self.margin is None:
-            likely = link_holds(self.distance[rows], self.scenario).astype(np.float64)
-        else:
-            likely = nearly_normal_below(self.margin[rows])
-        return likely if self.alive is None else likely * self.alive
+        packets, hold = np.zeros(distance.shape, dtype=np.int64), np.zeros(distance.shape)
+        # The path loss takes most of the time, and of many sensors most are out of radio range.
+        near = distance <= scenario.radio_radius_m
+        links = Links.at(distance[near], scenario)
+        packets[near], hold[near] = links.packets, links.hold
+        return cls(distance, packets, hold)
 
     @property
     def likely(self) -> IntArray:
         """``packets`` where the link is likely to hold, else 0."""
-        if self.margin is None and self.alive is None:
-            return self.packets
         return np.asarray(np.where(self.hold >= LIKELY, self.packets, 0))
-
-    def movable(self, queue: FloatArray) -> FloatArray:
-        """The packets that are expected to move from queues ``(J,)``: ``P(hold) min(q, packets)``."""
-        moved = np.minimum(queue, self.packets).astype(np.float64)
-        return moved if self.margin is None and self.alive is None else moved * self.hold
 
 
 class RadioFailures:
@@ -164,18 +146,20 @@ class LearnedChannel:
         which = np.flatnonzero(near) if ids is None else np.asarray(ids)[near]
         packets, margin = np.zeros(distance.shape, dtype=np.int64), np.full(distance.shape, -np.inf)
         mean, deviation = self.radio_map.predict(places, which)
-        links = Links.at(distance[:, near], world)
-        loss = links.loss_db + mean
+        metres = distance[:, near]
+        loss = path_loss_db(metres, world) + mean
         with np.errstate(divide="ignore", invalid="ignore"):
             spare = (world.path_loss_limit_db - loss) / deviation
         spare = np.where(np.isnan(spare), -np.inf, spare)
-        margin[:, near] = np.where(links.distance_m <= world.radio_radius_m, spare, -np.inf)
+        margin[:, near] = np.where(metres <= world.radio_radius_m, spare, -np.inf)
         # If a link holds that is expected to fail, its loss is just below the threshold.
-        held = Links(links.distance_m, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
+        held = Links(metres, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
         moved = np.floor(held.packets * self.share + 1e-9).astype(np.int64)
         packets[:, near] = np.where(margin[:, near] > -3.0, moved, 0)
-        alive = None if self.failures.none else self.failures.alive(slice(None) if ids is None else ids)
-        return ExpectedLinks(distance, packets, world, margin, alive)
+        hold = nearly_normal_below(margin)
+        if not self.failures.none:
+            hold *= self.failures.alive(slice(None) if ids is None else ids)
+        return ExpectedLinks(distance, packets, hold, margin)
 
     def packets(self, position: Point, place: FloatArray, sensor: int, *, held: bool) -> int:
         """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.
@@ -187,7 +171,7 @@ class LearnedChannel:
         if not metres <= self._scenario.radio_radius_m:
             return 0
         links = self.links(np.array([position]), np.array([[metres]]), np.array([sensor]))
-        return int((links.packets if held else links.likely)[0, 0])
+        return int(links.packets[0, 0]) if held or links.hold[0, 0] >= LIKELY else 0
 
     def gain_db(self, place: FloatArray, distance: FloatArray, ids: IntArray) -> FloatArray:
         """The expected gains ``(n,)``, dB, at a UAV's place ``(2,)``."""

@@ -93,6 +93,8 @@ class RadioMap:
         count: shape ``(J,)``, measurements kept.
         heard: measurements so far, of all sensors.
         exact: whether every measurement so far agrees with the formula.
+        offset_db: ``mu``, dB: the excess that all links share (generalised least squares, shrunk towards 0).
+        deviation_db: ``sigma``, dB: the standard deviation of the excess loss of a link that was never measured.
     """
 
     def __init__(self, sensors: int) -> None:
@@ -107,25 +109,11 @@ class RadioMap:
         self.kind = KINDS[0]
         self._compared = _COMPARE_FIRST
         self.exact = True
+        self.offset_db, self.deviation_db = 0.0, _PRIOR_DB
         # By sensor, K^-1, K^-1 r and K^-1 1. None until a gain differs from the formula.
         self._inverse: FloatArray | None = None
         self._measured: FloatArray = np.zeros((sensors, kept))
         self._ones: FloatArray = np.zeros((sensors, kept))
-
-    @property
-    def offset_db(self) -> float:
-        """``mu``, dB: the excess that all links share (generalised least squares, shrunk towards 0)."""
-        return float(self._measured.sum() / (self._ones.sum() + _OFFSET_WEIGHT))
-
-    @property
-    def deviation_db(self) -> float:
-        """``sigma``, dB: the standard deviation of the excess loss of a link that was never measured."""
-        if self.exact:
-            return 0.0 if self.heard else _PRIOR_DB
-        offset = self.offset_db
-        squares = (self.excess - offset) * (self._measured - offset * self._ones)
-        weight = _PRIOR_WEIGHT + int(self.count.sum())
-        return float(np.sqrt((_PRIOR_WEIGHT * _PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
     def measured_db(self) -> dict[int, float]:
         """The mean excess loss of each measured sensor, dB, over the measurements kept; empty if all are exact."""
@@ -168,6 +156,7 @@ class RadioMap:
         self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
         self.count[ids] += ~full
         if self.exact:
+            self.deviation_db = 0.0
             return excess
         if self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
@@ -208,7 +197,7 @@ class RadioMap:
         return mean.T, deviation * np.sqrt(share).T
 
     def _factor(self, ids: IntArray) -> None:
-        """Invert the covariances of these sensors' measurements.
+        """Invert the covariances of these sensors' measurements, and estimate what all links have in common.
 
         A matrix's size follows from its own sensor's measurements alone: the last bits of an inverse depend on it, and
         a restored map is the same to the bit.
@@ -224,6 +213,10 @@ class RadioMap:
             both = np.stack((self.excess[some, :size] * used, used), axis=2)
             solved = inverse @ both
             self._measured[some, :size], self._ones[some, :size] = solved[..., 0], solved[..., 1]
+        offset = self.offset_db = float(self._measured.sum() / (self._ones.sum() + _OFFSET_WEIGHT))
+        squares = (self.excess - offset) * (self._measured - offset * self._ones)
+        weight = _PRIOR_WEIGHT + int(self.count.sum())
+        self.deviation_db = float(np.sqrt((_PRIOR_WEIGHT * _PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
     def _covariances(self, ids: IntArray, kept: int) -> FloatArray:
         """``K``, ``(n, kept, kept)``; the rows without a measurement are the identity's."""
@@ -269,3 +262,5 @@ class RadioMap:
         self.exact = state["exact"]
         if not self.exact:
             self._factor(np.arange(len(self.count)))
+        elif self.heard:
+            self.deviation_db = 0.0

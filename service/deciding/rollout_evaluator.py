@@ -24,7 +24,6 @@ from shared.features import VELOCITY_BONUS, urgency
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.arrivals import Arrivals
 from shared.guidance import NO_GUIDANCE, Guidance, Waiting
-from shared.learned_channel import nearly_normal_below
 from shared.scenario import Scenario
 
 # Steps. Losses after the horizon do not count, because the positions where look-ahead leaves the UAVs are arbitrary.
@@ -58,6 +57,7 @@ class RolloutState:
             holds, by the sum of its velocities so far.
         margins: by UAV, of the same shape: the link's path loss below the threshold, in standard deviations of its
             uncertainty; empty if the links are certain.
+        holds: by UAV, of the same shape: the probability that the link holds; empty if the links are certain.
         alive: shape ``(n,)``, the probability that each sensor's radio works.
         decided: the velocities of the UAVs that already have a decision in this step.
         reserved: shape ``(n,)``, sensors that other UAVs have in this step.
@@ -80,6 +80,7 @@ class RolloutState:
     bursts: FloatArray
     links: dict[int, FloatArray]
     margins: dict[int, FloatArray]
+    holds: dict[int, FloatArray]
     alive: FloatArray
     decided: dict[int, int]
     reserved: NDArray[np.bool_]
@@ -135,6 +136,7 @@ class RolloutState:
             bursts=np.diff(burst, axis=0),
             links={i: table[:, sensors] for i, table in links.items()},
             margins={i: table[:, sensors] for i, table in margins.items()},
+            holds={i: expected[i].hold[:, sensors] for i in margins},
             alive=belief.channel.failures.alive(sensors),
             decided={i: decided[i][1] for i in others if i in decided},
             reserved=np.isin(sensors, list(reserved)),
@@ -177,7 +179,7 @@ def _most_urgent(
 ) -> NDArray[np.int64]:
     """The sensors in reach by these links that overflow soonest, after those with a visit interval in the guidance."""
     reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links], axis=0))
-    room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.arrivals.rate(), 1e-9)
+    room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.arrivals.rate, 1e-9)
     room = np.where(np.isfinite(guidance.every(scenario.sensors)), -np.inf, room)
     return np.sort(reached[np.argsort(room[reached], kind="stable")[:_MAX_SENSORS]])
 
@@ -285,8 +287,7 @@ class _RolloutBatch:
             uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.margins.items()
         }
         self._holds = {
-            uav: sliding_window_view(nearly_normal_below(table) * state.alive, scenario.max_velocity + 1, axis=0)
-            for uav, table in state.margins.items()
+            uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.holds.items()
         }
         self._fades = fades
         self._flown = {uav: np.zeros(len(queue), dtype=np.int64) for uav in self._ahead}

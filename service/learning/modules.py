@@ -277,7 +277,7 @@ class VelocityScorer(nn.Module):
 class ReachVelocityScorer(nn.Module):
     """``u_v = w_2 relu(W_1 [z_j, a_v] + b_1) + b_2``, with the same weights for every velocity level v.
 
-    ``a_v`` is a row of :meth:`Reach.level_features`, the effects of flying at v. So a scenario may have any number of
+    ``a_v`` is a row of :meth:`State.approaches`, the effects of flying at v. So a scenario may have any number of
     levels.
     """
 

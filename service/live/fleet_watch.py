@@ -83,7 +83,7 @@ class FleetWatch:
 def _overflowed(belief: FleetBelief, step: int, scenario: Scenario) -> FloatArray:
     """The probability that each queue is full at a step's start, ``P(base + Poisson(rate x steps since) >= W)``."""
     # The arrivals of the steps since, in terms of the function's own horizon.
-    arrived = belief.arrivals.rate() * np.maximum(step - belief.since, 0) / scenario.overflow_horizon_steps
+    arrived = belief.arrivals.rate * np.maximum(step - belief.since, 0) / scenario.overflow_horizon_steps
     # One packet more than there is: at least full, not more than full.
     reached = overflow_probability(belief.base + 1, arrived, scenario)
     return np.where(belief.base >= scenario.queue_capacity, 1.0, reached)

@@ -84,7 +84,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
     """The volatile part: counts, the fleet's belief of each sensor, and the operator's orders."""
     belief, scenario = mission.belief, mission.scenario
     step = belief.newest or 0
-    queue, rate = belief.queue(step), belief.arrivals.rate()
+    queue, rate = belief.queue(step), belief.arrivals.rate
     return {
         "step": step,
         "made": mission.decisions,

@@ -33,6 +33,7 @@ class Arrivals:
 
     Attributes:
         arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
+        rate: shape ``(J,)``, expected packets a step, ``arrived / watched``.
         dispersion: the variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more.
         recent: shape ``(J,)``, packets a step in the last interval, which ended in step ``recent_at``, -1 for none.
     """
@@ -44,18 +45,15 @@ class Arrivals:
         prior_steps = mean / max(spread, 1e-3) if mean > _ZERO_RATE else _CERTAIN_STEPS
         self.arrived: FloatArray = np.full(count, mean * prior_steps)
         self.watched: FloatArray = np.full(count, prior_steps)
+        self.rate: FloatArray = self.arrived / self.watched
         self.recent: FloatArray = np.zeros(count)
         self.recent_at: IntArray = np.full(count, -1)
         self._surprise, self._intervals = 0.0, 0
         self.dispersion = 1.0
 
-    def rate(self, which: Which = slice(None)) -> FloatArray:
-        """Expected packets a step, shape ``(J,)``, or of the sensors ``which``."""
-        return np.asarray(self.arrived[which] / self.watched[which])
-
     def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
         """Take the packets ``(n,)`` that came to sensors ``(n,)`` in so many steps, until these steps."""
-        rate = self.arrived[ids] / self.watched[ids]
+        rate = self.rate[ids]
         expected = rate * steps
         # At least a packet's: where next to nothing is expected, one packet is no burst.
         variance = np.maximum(expected + np.square(steps) * rate / self.watched[ids], 1.0)
@@ -65,6 +63,7 @@ class Arrivals:
         self.recent[ids], self.recent_at[ids] = came / steps, at
         self.arrived[ids] += came
         self.watched[ids] += steps
+        self.rate = self.arrived / self.watched
 
     def _estimate_dispersion(self) -> None:
         found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
@@ -74,14 +73,14 @@ class Arrivals:
         """Packets above the rate that are still to come of the bursts seen, from this step or steps on, ``(J,)``."""
         if self.dispersion == 1.0:
             return np.zeros(len(self.arrived))
-        above = np.where(self.recent_at >= 0, np.maximum(self.recent - self.rate(), 0.0), 0.0)
+        above = np.where(self.recent_at >= 0, np.maximum(self.recent - self.rate, 0.0), 0.0)
         return np.asarray(above * _GOES_ON ** (np.maximum(step - self.recent_at, 0) + 1) / (1.0 - _GOES_ON))
 
     def coming(self, step: int, horizon: float) -> FloatArray:
         """Packets a step that are expected in the steps from this one to the horizon, ``(J,)``."""
         if self.dispersion == 1.0:
-            return self.rate()
-        return self.rate() + self.burst(step) * float(self.burst_over(horizon)) / horizon
+            return self.rate
+        return self.rate + self.burst(step) * float(self.burst_over(horizon)) / horizon
 
     @staticmethod
     def burst_over(steps: ArrayLike) -> FloatArray:
@@ -97,6 +96,7 @@ class Arrivals:
         """Restore a state; one of an earlier version knows rates alone."""
         for name in _ARRAYS:
             setattr(self, name, state[name])
+        self.rate = self.arrived / self.watched
         if "surprise" in state:
             for name in _NEWER_ARRAYS:
                 setattr(self, name, state[name])

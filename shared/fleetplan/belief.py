@@ -84,7 +84,7 @@ class FleetBelief:
         known, base, since = self.heard[ids] >= 0, self.base[ids], self.since[ids]
         counted = newer & known & (beacon > since) & (queue < self._scenario.queue_capacity)
         # After a visit that moved less than believed, the packets that stayed are no arrivals.
-        expected = self.arrivals.rate(ids) * np.maximum(beacon - since, 0)
+        expected = self.arrivals.rate[ids] * np.maximum(beacon - since, 0)
         stayed = (self.visited[ids] == since) & (queue - base > expected + 4.0 * np.sqrt(expected) + 2.0)
         counted &= ~stayed
         came = np.maximum(queue - base, 0.0)
@@ -144,7 +144,7 @@ class FleetBelief:
         if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
             # The queue was known before and after: it tells what the link moved.
             soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(1)
-            rate = float((self.arrivals.rate() + soon)[visit.sensor])
+            rate = float((self.arrivals.rate + soon)[visit.sensor])
             moved = visit.base + rate - float(self.base[visit.sensor])
             slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
             self.channel.moved(moved, visit.base, int(link.packets), slack)
@@ -238,8 +238,7 @@ class FleetBelief:
 
     def queue(self, step: int, which: Which = slice(None)) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``which``."""
-        rate = self.arrivals.rate(which)
-        came = rate * np.maximum(step - self.since[which], 0)
+        came = self.arrivals.rate[which] * np.maximum(step - self.since[which], 0)
         if self.arrivals.dispersion > 1.0:
             since = np.minimum(self.since, step)
             came = came + (self.arrivals.burst(since) - self.arrivals.burst(step))[which]

@@ -181,7 +181,7 @@ class RecedingHorizon:
         for uav in free:
             near |= (belief.distances(uav, flown) <= world.radio_radius_m).any(axis=0)
         near |= not near.any()
-        room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.arrivals.rate(), 1e-9)
+        room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.arrivals.rate, 1e-9)
         if self.guidance.wishes:
             # The operator's sensors come before those that fill first.
             room = np.where(np.isfinite(self.guidance.every(world.sensors)), -1.0, room)
@@ -210,7 +210,7 @@ class RecedingHorizon:
     def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
         """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
-        queue, rate, burst = belief.queue(step)[kept], belief.arrivals.rate()[kept], belief.arrivals.burst(step)[kept]
+        queue, rate, burst = belief.queue(step)[kept], belief.arrivals.rate[kept], belief.arrivals.burst(step)[kept]
         ahead = np.arange(horizon + 1)[:, None]
         expected = np.rint(queue + ahead * rate + burst * Arrivals.burst_over(ahead)).astype(np.int64)
         risk = neglect(

@@ -36,7 +36,7 @@ def test_poissons_arrivals_have_no_bursts_to_the_bit(steps: int) -> None:
     arrivals = told(poisson(steps))
     assert arrivals.dispersion == 1.0
     assert not arrivals.burst(steps).any()
-    np.testing.assert_array_equal(arrivals.coming(steps, 8.0), arrivals.rate())
+    np.testing.assert_array_equal(arrivals.coming(steps, 8.0), arrivals.rate)
 
 
 def test_bursts_are_seen_and_go_on_for_a_while() -> None:
@@ -45,7 +45,7 @@ def test_bursts_are_seen_and_go_on_for_a_while() -> None:
     soon = in_burst.burst(196)
     assert (soon > 3.0).all()
     assert (in_burst.burst(206) < 0.1 * soon).all()
-    assert (in_burst.coming(196, 8.0) > in_burst.rate() + 0.5).all()
+    assert (in_burst.coming(196, 8.0) > in_burst.rate + 0.5).all()
     # A sensor that has less than its rate now expects its rate.
     np.testing.assert_array_equal(after.burst(216), 0.0)
 
@@ -64,14 +64,14 @@ def test_a_restored_state_goes_on_to_the_bit(came: IntArray) -> None:
     for step, row in enumerate(came[100:], 100):
         again.take(ALL, row.astype(np.float64), ONE_STEP, ONE_STEP * (step + 1))
     assert again.dispersion == whole.dispersion
-    for ours, theirs in ((whole.rate(), again.rate()), (whole.burst(200), again.burst(200))):
+    for ours, theirs in ((whole.rate, again.rate), (whole.burst(200), again.burst(200))):
         np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_state_of_an_earlier_version_knows_rates_alone() -> None:
     state, again = told(bursts()).state_dict(), Arrivals(WORLD)
     again.load_state_dict({name: state[name] for name in ("arrived", "watched")})
-    np.testing.assert_array_equal(again.rate(), told(bursts()).rate())
+    np.testing.assert_array_equal(again.rate, told(bursts()).rate)
     assert again.dispersion == 1.0
     assert not again.burst(200).any()
 

@@ -46,16 +46,16 @@ def test_the_rate_is_learned_from_successive_beacons() -> None:
     fleet = belief()
     for now in range(10):
         hear(fleet, [8.0 * now % 60, 2.0 * now], [now, now])
-    assert fleet.arrivals.rate()[0] > 6.5
-    assert fleet.arrivals.rate()[1] < 3.0
+    assert fleet.arrivals.rate[0] > 6.5
+    assert fleet.arrivals.rate[1] < 3.0
 
 
 def test_a_full_queue_says_nothing_of_the_rate() -> None:
     fleet = belief()
     hear(fleet, [50.0, 50.0], [0, 0])
     hear(fleet, [60.0, 55.0], [8, 8])
-    assert fleet.arrivals.rate()[0] == pytest.approx(5.0)
-    assert fleet.arrivals.rate()[1] < 5.0
+    assert fleet.arrivals.rate[0] == pytest.approx(5.0)
+    assert fleet.arrivals.rate[1] < 5.0
 
 
 def test_what_was_collected_is_subtracted_and_no_arrival() -> None:
@@ -64,7 +64,7 @@ def test_what_was_collected_is_subtracted_and_no_arrival() -> None:
     fleet.collect(0, 60, step=0)
     assert fleet.queue(1)[0] == pytest.approx(5.0)
     hear(fleet, [9.0, 50.0], [1, 0])
-    assert fleet.arrivals.rate()[0] > 5.0
+    assert fleet.arrivals.rate[0] > 5.0
 
 
 def test_a_report_may_name_some_sensors_only() -> None:
@@ -156,6 +156,6 @@ def test_a_uav_asked_again_is_not_held_to_what_it_was_told() -> None:
 def test_a_world_in_which_nothing_arrives_is_known_to_be_one(most: float) -> None:
     fleet = FleetBelief(Scenario(name="idle", sensors=2, uavs=2, arrival_rate_min=0.0, arrival_rate_max=most))
     hear(fleet, [10.0, 58.0], [0, 0])
-    np.testing.assert_allclose(fleet.arrivals.rate(), 0.0, atol=1e-12)
+    np.testing.assert_allclose(fleet.arrivals.rate, 0.0, atol=1e-12)
     np.testing.assert_allclose(fleet.queue(1_000_000), [10.0, 58.0])
     assert np.isfinite(np.random.default_rng(0).gamma(fleet.arrivals.arrived, 1.0 / fleet.arrivals.watched)).all()

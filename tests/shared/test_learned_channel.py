@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from shared.channel import link_holds, packets_per_step, path_loss_db
+from shared.features import Reach
 from shared.learned_channel import ExpectedLinks, LearnedChannel, RadioFailures
 from shared.scenario import SCENARIOS
 
@@ -30,7 +31,8 @@ def test_without_a_sign_of_another_world_the_formula_counts_to_the_bit() -> None
     assert learned.by_formula
     np.testing.assert_array_equal(links.packets, packets_per_step(DISTANCES, PAPER))
     np.testing.assert_array_equal(links.hold, link_holds(DISTANCES, PAPER))
-    np.testing.assert_array_equal(links.movable(np.full(5, 30.0)), np.minimum(30.0, packets_per_step(DISTANCES, PAPER)))
+    expected = Reach.of(links, np.full(5, 30.0), np.full(5, 0.5)).packets
+    np.testing.assert_array_equal(expected, np.minimum(30.0, packets_per_step(DISTANCES, PAPER)))
 
 
 def test_a_link_that_lost_more_than_the_threshold_allows_is_not_expected_again() -> None:
@@ -38,7 +40,7 @@ def test_a_link_that_lost_more_than_the_threshold_allows_is_not_expected_again()
     assert links.hold[0, 0] > 0.95
     assert links.hold[0, 2] < 0.1
     assert links.likely[0, 2] == 0 < links.likely[0, 1]
-    assert links.movable(np.full(5, 60.0))[0, 2] < 10
+    assert Reach.of(links, np.full(5, 60.0), np.full(5, 0.5)).packets[0, 2] < 10
 
 
 def test_a_better_link_than_the_formulas_never_reaches_past_the_radio_radius() -> None:
@@ -128,7 +130,8 @@ def test_a_restored_channel_expects_the_same_to_the_bit() -> None:
 def test_expected_links_by_the_formula_are_certain() -> None:
     links = ExpectedLinks.by_formula(DISTANCES, PAPER)
     assert set(links.hold.ravel().tolist()) == {0.0, 1.0}
-    assert links.likely is links.packets
+    np.testing.assert_array_equal(links.packets, packets_per_step(DISTANCES, PAPER))
+    np.testing.assert_array_equal(links.likely, links.packets)
 
 
 def test_a_radio_counts_as_dead_for_at_most_81_steps_after_the_last_forged_failure() -> None:

@@ -23,13 +23,13 @@ def flown(scenario: Scenario, policy: RecedingHorizon) -> RecedingHorizon:
 def test_nothing_that_it_sees_changes_its_model(scenario: str) -> None:
     belief = flown(SCENARIOS[scenario], FormulaPlanner()).belief
     assert belief.channel.by_formula and belief.drift.none
-    assert (belief.arrivals.rate() == SCENARIOS[scenario].mean_arrival_rate).all() and belief.arrivals.dispersion == 1.0
+    assert (belief.arrivals.rate == SCENARIOS[scenario].mean_arrival_rate).all() and belief.arrivals.dispersion == 1.0
 
 
 def test_the_planner_that_learns_learns_from_the_same_missions() -> None:
     assert not flown(SCENARIOS["shadowed"], RecedingHorizon()).belief.channel.by_formula
     windy = flown(SCENARIOS["windy"], RecedingHorizon()).belief
-    assert not windy.drift.none and (windy.arrivals.rate() != SCENARIOS["windy"].mean_arrival_rate).any()
+    assert not windy.drift.none and (windy.arrivals.rate != SCENARIOS["windy"].mean_arrival_rate).any()
 
 
 def test_beacons_still_tell_it_the_queues() -> None:
