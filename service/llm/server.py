@@ -48,7 +48,9 @@ _PATIENCE_S = 10.0
 
 
 @dataclass(slots=True)
-class _Status:
+class ServerStatus:
+    """The state of a server's LLM, why it is not ready, and whether the circuit breaker is open."""
+
     llm: Literal["loading", "ready", "unavailable", "off"]
     detail: str | None = None
     breaker_open: bool = False
@@ -66,6 +68,7 @@ class LlmServer:
         on_open: called when the circuit breaker opens.
 
     Attributes:
+        status: replaced as a whole when the state changes.
         model: name of the model, once it is known.
         constraint: the kind of constraint that the server obeys.
         logprobs: whether the server gives the probabilities of tokens.
@@ -76,7 +79,7 @@ class LlmServer:
         self._settings = settings
         self._warm_up = warm_up
         self._on_open = on_open
-        self._status = _Status("off" if settings.mode in ("value", "policy") else "loading")
+        self.status = ServerStatus("off" if settings.mode in ("value", "policy") else "loading")
         self._client: LLMClient | None = None
         self._embedded: EmbeddedServer | None = None
         # Brings the server up, or waits for its recovery.
@@ -93,35 +96,25 @@ class LlmServer:
         self._rewriting: asyncio.Task[Completion] | None = None
 
     @property
-    def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
-        """The state of the LLM."""
-        return self._status.llm
-
-    @property
-    def breaker_open(self) -> bool:
-        """Whether the circuit breaker is open."""
-        return self._status.breaker_open
-
-    @property
     def recovering(self) -> bool:
         """Whether an LLM that is not ready may become ready by itself."""
         return self._task is not None and not self._task.done()
 
     def readiness(self) -> Readiness:
         """The answer of ``/readyz``."""
-        ready = self.status == "ready"
+        ready = self.status.llm == "ready"
         return Readiness(
             ready=True,
             decides=self._settings.mode if ready else "policy",
-            llm=self.status,
+            llm=self.status.llm,
             model=self.model,
             constraint=self.constraint if ready else None,
-            detail=self._status.detail,
+            detail=self.status.detail,
         )
 
     def start(self) -> None:
         """Begin to load or reach the LLM, unless it is off."""
-        if self.status != "off":
+        if self.status.llm != "off":
             self._task = asyncio.create_task(self._bring_up(), name="llm-bring-up", context=Context())
 
     async def close(self) -> None:
@@ -222,23 +215,23 @@ class LlmServer:
         return {} if trained or self._embedded is None else self._embedded.without_adapter
 
     async def _ask(self, body: dict[str, Any]) -> Completion:
-        if self._client is None or self.status != "ready":
-            raise NoDecision("llm_loading" if self.status == "loading" else "llm_unavailable", self.status)
+        if self._client is None or self.status.llm != "ready":
+            raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
         try:
             return replace(await self._client.complete(body), model=self.model)
         except Unreachable as gone:
-            if self.status == "ready":
-                self._status = _Status("unavailable", str(gone))
+            if self.status.llm == "ready":
+                self.status = ServerStatus("unavailable", str(gone))
                 self.start()
             raise
 
     def _failed(self, reason: Reason) -> None:
-        if self.status != "ready" or not self._breaker.failed():
+        if self.status.llm != "ready" or not self._breaker.failed():
             return
         pause_s = self._breaker.pause_s
         detail = f"failed too often, the last time by {reason}: no calls for {pause_s:g} s"
-        self._status = _Status("unavailable", detail, breaker_open=True)
-        log.warning("LLM %s", self._status.detail)
+        self.status = ServerStatus("unavailable", detail, breaker_open=True)
+        log.warning("LLM %s", self.status.detail)
         self._on_open()
         self._task = asyncio.create_task(self._recover(), name="llm-recovery", context=Context())
 
@@ -253,7 +246,7 @@ class LlmServer:
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
             else:
-                self._status = _Status("ready")
+                self.status = ServerStatus("ready")
                 log.info("LLM answers again: %s", self.model)
                 return
 
@@ -261,18 +254,18 @@ class LlmServer:
         while True:
             try:
                 client = await self._connect()
-                self._status = _Status("ready")
+                self.status = ServerStatus("ready")
                 log.info("LLM ready: %s at %s, constraint %s", self.model, client.base_url, self.constraint)
                 return
             except (ModelMissing, AdapterUnusable, LoadFailed) as error:
-                self._status = _Status("unavailable", str(error))
+                self.status = ServerStatus("unavailable", str(error))
                 log.error("no embedded LLM: %s", error)
                 return
             except (NoDecision, TimeoutError) as error:
-                self._status = _Status("unavailable", str(error) or f"no answer in {_PROBE_TIMEOUT_S:g} s")
-                log.warning("LLM not ready, next try in %g s: %s", _RETRY_S, self._status.detail)
+                self.status = ServerStatus("unavailable", str(error) or f"no answer in {_PROBE_TIMEOUT_S:g} s")
+                log.warning("LLM not ready, next try in %g s: %s", _RETRY_S, self.status.detail)
             except Exception as error:
-                self._status = _Status("unavailable", f"{type(error).__name__}: see the log")
+                self.status = ServerStatus("unavailable", f"{type(error).__name__}: see the log")
                 log.exception("LLM not ready, next try in %g s", _RETRY_S)
             await asyncio.sleep(_RETRY_S)
 

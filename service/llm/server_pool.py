@@ -36,12 +36,12 @@ class ServerPool:
     @property
     def active(self) -> LlmServer:
         """The server that is called now: the first that is ready, or the first of all."""
-        return next((server for server in self._each if server.status == "ready"), self._each[0])
+        return next((server for server in self._each if server.status.llm == "ready"), self._each[0])
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
         """The state of the active server."""
-        return self.active.status
+        return self.active.status.llm
 
     @property
     def model(self) -> str | None:
@@ -65,17 +65,17 @@ class ServerPool:
     @property
     def statuses(self) -> Counter[str]:
         """Number of servers by state."""
-        return Counter(server.status for server in self._each)
+        return Counter(server.status.llm for server in self._each)
 
     @property
     def breakers_open(self) -> int:
         """Number of open circuit breakers."""
-        return sum(server.breaker_open for server in self._each)
+        return sum(server.status.breaker_open for server in self._each)
 
     def readiness(self) -> Readiness:
         """The answer of ``/readyz``: the active server's, and the number of other ready servers."""
         active = self.active
-        others = sum(server.status == "ready" for server in self._each if server is not active)
+        others = sum(server.status.llm == "ready" for server in self._each if server is not active)
         return active.readiness().model_copy(update={"standing_by": others})
 
     def start(self) -> None:
@@ -103,7 +103,7 @@ class ServerPool:
 
     def _first(self, call: Call, uavs: int = 1) -> Answer:
         """The first answer of the ready servers."""
-        ready = [server for server in self._each if server.status == "ready" and server.max_uavs_per_call >= uavs]
+        ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
         waiting = deque(ready or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
             # A hedge to the same address: there may be several machines behind it.
