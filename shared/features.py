@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -79,39 +78,34 @@ def urgency_of(queue: ArrayLike, overflow: FloatArray, scenario: Scenario) -> Fl
     return np.asarray(0.5 * np.minimum(np.maximum(fill, 0.0), 1.0) + 0.5 * overflow)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Reach:
     """One UAV's reach after a step at each of V velocity levels to each of J sensors; arrays ``(V, J)``.
 
     ``links``: the expected transfers. ``packets`` that are expected to move, ``P(hold) min(q_j, packets)``, 0 for a
-    sensor that was never heard or has a flat battery; ``worth`` in urgent packets, ``U_j packets + 0.5 v``.
+    sensor that was never heard or has a flat battery; ``worth`` in urgent packets, ``U_j packets + 0.5 v``. For each
+    sensor, ``(J,)``, ``best`` is the velocity level of the greatest worth, and ``best_packets`` those packets.
     """
 
     links: ExpectedLinks
     packets: FloatArray
     worth: FloatArray
+    best: NDArray[np.int64]
+    best_packets: FloatArray
 
     @classmethod
     def of(cls, links: ExpectedLinks, queue: FloatArray, urgency: FloatArray) -> Self:
         """From links ``(V, J)``, queues and urgencies ``(J,)``; the queue is 0 for a sensor that cannot send."""
         packets = links.hold * np.minimum(queue, links.packets)
         velocities = np.arange(len(packets), dtype=np.float64)
-        return cls(links, packets, urgency * packets + VELOCITY_BONUS * velocities[:, None])
+        worth = urgency * packets + VELOCITY_BONUS * velocities[:, None]
+        best = worth.argmax(axis=0)
+        return cls(links, packets, worth, best, packets[best, np.arange(len(best))])
 
     @property
     def likely(self) -> NDArray[np.bool_]:
         """Whether each link is likely to hold."""
         return np.asarray(self.links.hold >= LIKELY)
-
-    @cached_property
-    def best(self) -> NDArray[np.int64]:
-        """For each sensor the velocity level of the greatest worth, ``(J,)``."""
-        return np.asarray(self.worth.argmax(axis=0))
-
-    @cached_property
-    def best_packets(self) -> FloatArray:
-        """The packets that the UAV could move at the best velocity, ``(J,)``."""
-        return np.asarray(np.take_along_axis(self.packets, self.best[None], axis=0)[0])
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,11 +29,6 @@ _MOST = 4.0
 GOOD_LINK_DB = 0.5
 
 
-def nearly_normal_below(z: FloatArray) -> FloatArray:
-    """``Phi(z)`` within 0.01, by the logistic function: the standard library has no vectorised erf."""
-    return np.asarray(1.0 / (1.0 + np.exp(np.clip(-1.702 * z, -50.0, 50.0))))
-
-
 @dataclass(frozen=True)
 class ExpectedLinks:
     """Transfers that are expected from a UAV's places to sensors; arrays ``(P, J)``.
@@ -156,7 +151,8 @@ class LearnedChannel:
         held = Links(metres, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
         moved = np.floor(held.packets * self.share + 1e-9).astype(np.int64)
         packets[:, near] = np.where(margin[:, near] > -3.0, moved, 0)
-        hold = nearly_normal_below(margin)
+        # Phi(margin) within 0.01, by the logistic function: the standard library has no vectorised erf.
+        hold = 1.0 / (1.0 + np.exp(np.clip(-1.702 * margin, -50.0, 50.0)))
         if not self.failures.none:
             hold *= self.failures.alive(slice(None) if ids is None else ids)
         return ExpectedLinks(distance, packets, hold, margin)

@@ -99,11 +99,10 @@ class RecedingHorizon:
         self._saved = _SAVED_WORK
 
     def begin(self, step: int) -> None:
-        """Go to a later step: the belief advances, and the plans lose their flown steps."""
+        """Go to a later step, to which the belief advances by itself: the plans lose their flown steps."""
         if step <= self.step:
             return
         passed = step - self.step
-        self._belief.advance(step)
         self._saved += _WORK
         self.plans = {uav: actions[passed:] for uav, actions in self.plans.items()}
         self.step = step

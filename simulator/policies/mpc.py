@@ -34,6 +34,7 @@ class RecedingHorizon:
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
         step = int(observation["step"][0])
+        self.belief.advance(step)
         self._planner.begin(step)
         self.belief.locate(uav, step, observation["position"].tolist(), float(observation["progress"][0]))
         ids = np.arange(len(observation["queue"]))

@@ -51,6 +51,7 @@ def test_on_an_unknown_trajectory_the_most_urgent_in_range_at_full_speed() -> No
 
 @pytest.mark.parametrize("position", [ON_LAP, (500.0, 500.0)])
 def test_an_empty_battery_sends_nothing(position: tuple[float, float]) -> None:
-    s = state(queue=[10.0, 60.0], position=position, x=[position[0] - 50, position[0] - 60])
-    s.battery[1] = 0.0
+    report = uav(queue=[10.0, 60.0], position=position, x=[position[0] - 50, position[0] - 60])
+    report.sensors.battery[1] = 0.0
+    s = attended(mission(), report).state
     assert look_ahead(s, s.reach_ahead(0, PAPER), frozenset())[0] == 0
