@@ -26,7 +26,7 @@ from rich.progress import track
 from service.api.app import create_app
 from service.config.settings import Settings
 from service.deciding.decision_time import Deadline
-from service.deciding.llm_query import LlmAdvice
+from service.deciding.deliberation import LlmAdvice
 from service.edge.engine import Engine
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet

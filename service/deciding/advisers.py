@@ -77,7 +77,10 @@ def _by_plan(state: AttendedState) -> Preference | None:
 
 def _by_value(state: AttendedState) -> Preference:
     """The learned values."""
-    values = state.values()
+    values = {}
+    for velocities, kept in zip(state.values_of_velocities(state.rows), state.candidates, strict=True):
+        levels = velocities.numpy()
+        values[kept.sensor_id] = kept.score + levels - levels.max()
     return LearnedValues(state.best_by_value(), values)
 
 

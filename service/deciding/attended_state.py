@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from time import perf_counter
 from typing import Self
 
 import numpy as np
@@ -77,7 +78,7 @@ class AttendedState:
         if obeyed is not None:
             reach = state.reach_ahead(uav.uav_id, scenario)
             guidance = StepGuidance.of(obeyed, state, reach, step, mission.records.visits, scenario)
-        watch.lap("augment")
+        watch.ended.append(("augment", perf_counter()))
         admissible: list[int] = np.flatnonzero(state.admissible).tolist()
         features = state.features(scenario)
         kept, scores, contexts = _attend(mission, features, admissible, guidance)
@@ -86,7 +87,7 @@ class AttendedState:
             Candidate(sensor_id=sensor, score=round(scores[i], 6))
             for sensor, i in zip(state.ids[rows].tolist(), kept, strict=True)
         ]
-        watch.lap("attend")
+        watch.ended.append(("attend", perf_counter()))
         return cls(
             mission=mission,
             uav_id=uav.uav_id,
@@ -128,18 +129,10 @@ class AttendedState:
     def best_by_value(self) -> Action:
         """The best-scored sensor and the best velocity for it that is allowed, by the learned values."""
         row = self.rows[0]
-        level = int(self._values_of_velocities([row])[0].argmax())
+        level = int(self.values_of_velocities([row])[0].argmax())
         if self.guidance is not None:
             level = self.guidance.nearest(row, level)
         return Action(int(self.state.ids[row]), level)
-
-    def values(self) -> dict[int, NDArray[np.float32]]:
-        """The learned values of the sensors kept: by ID ``s_j + u_jv - max_v u_jv`` at each velocity level v, (V,)."""
-        found = {}
-        for values, candidate in zip(self._values_of_velocities(self.rows), self.candidates, strict=True):
-            levels = values.numpy()
-            found[candidate.sensor_id] = candidate.score + levels - levels.max()
-        return found
 
     def pending(self, decision_id: str, action: Action) -> Pending:
         """The decision, with what its outcome will be learned from."""
@@ -164,8 +157,8 @@ class AttendedState:
             sample=sample,
         )
 
-    def _values_of_velocities(self, rows: Sequence[int]) -> list[Tensor]:
-        """``u_jv`` of the sensors in these rows, ``(V,)`` each; once a state, for two advisers ask."""
+    def values_of_velocities(self, rows: Sequence[int]) -> list[Tensor]:
+        """The learned ``u_jv`` of the sensors in these rows at each velocity level v, ``(V,)`` each."""
         if missing := [row for row in rows if row not in self._velocity_values]:
             contexts = self.contexts[[self.admissible.index(row) for row in missing]]
             approaches = self.state.approaches(missing, self.mission.scenario)

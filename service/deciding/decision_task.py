@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import dataclass
 
 from service.deciding.decision_time import Deadline, Stopwatch
-from service.deciding.llm_query import LlmAdvice
+from service.deciding.deliberation import LlmAdvice
 from service.learning.trust import Advice
 from service.llm.answers import Completion
 from service.mission.mission import Mission

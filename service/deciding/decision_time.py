@@ -16,25 +16,22 @@ class Deadline:
         """Seconds from now, 0 once the deadline has passed."""
         return max(0.0, self.at - time.perf_counter())
 
-    def earlier_by(self, seconds: float) -> Deadline:
-        """The deadline with so many seconds kept back."""
-        return Deadline(self.at - seconds)
-
 
 @dataclass(slots=True)
 class Stopwatch:
-    """Milliseconds by stage since the request arrived."""
+    """When a request arrived, and when the stages of its decision ended; moments of ``time.perf_counter``.
+
+    Attributes:
+        ended: each stage, or a further part of it, and its end, in their order. The next one begins there.
+    """
 
     started: float = field(default_factory=time.perf_counter)
-    stages: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=time.perf_counter)
+    ended: list[tuple[str, float]] = field(default_factory=list)
 
-    def lap(self, stage: str) -> None:
-        """End a stage, or a further part of it."""
-        now = time.perf_counter()
-        self.stages[stage] = round(self.stages.get(stage, 0.0) + (now - self._last) * 1e3, 3)
-        self._last = now
-
-    def total(self) -> dict[str, float]:
-        """The stages and their total."""
-        return {**self.stages, "total": round((time.perf_counter() - self.started) * 1e3, 3)}
+    def milliseconds(self, now: float) -> dict[str, float]:
+        """By stage, and in total until now."""
+        last, stages = self.started, dict[str, float]()
+        for stage, end in self.ended:
+            stages[stage] = stages.get(stage, 0.0) + (end - last) * 1e3
+            last = end
+        return {name: round(taken, 3) for name, taken in (*stages.items(), ("total", (now - self.started) * 1e3))}

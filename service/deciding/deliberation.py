@@ -18,7 +18,7 @@ The weights and their guarantee are in :mod:`service.learning.trust`; the evalua
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Self
@@ -29,16 +29,56 @@ from service.deciding.advisers import ADVISERS, SMOOTHING
 from service.deciding.attended_state import AttendedState
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
+from service.llm.answers import Completion
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
+from shared.reasons import Reason
 from shared.wire import Guided, Weighed
 
 # Candidates that a response names.
 _REPORTED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class LlmAdvice:
+    """The LLM's preference among one UAV's candidates in mode ``guided``.
+
+    Attributes:
+        prompt: of a query about several UAVs, this UAV's share of it; the first UAV's share has the static block and
+            the experiences too, and the whole query's ``completion``.
+        probabilities: by action; None where the LLM gave none, for the ``reason``.
+        calibrated: whether the LLM's bias towards labels is known.
+        model: the LLM's name, if it is known.
+    """
+
+    prompt: Prompt
+    probabilities: dict[Action, float] | None
+    reason: Reason | None
+    completion: Completion | None
+    calibrated: bool
+    model: str | None
+
+    def over(self, actions: Sequence[Action]) -> FloatArray | None:
+        """The probabilities of these actions, ``(n,)``; None where the LLM gave none for any of them.
+
+        The probability of a velocity that is not among them goes to the sensor's nearest: the operator may have
+        forbidden it since.
+        """
+        found = np.zeros(len(actions))
+        index = {action: i for i, action in enumerate(actions)}
+        for action, probability in (self.probabilities or {}).items():
+            at = index.get(action)
+            if at is None:
+                same = [other for other in actions if other.sensor_id == action.sensor_id]
+                if not same:
+                    continue
+                at = index[min(same, key=lambda other: abs(other.velocity - action.velocity))]
+            found[at] += probability
+        return found / found.sum() if found.sum() > 0.0 else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +108,8 @@ class Deliberation:
         """For a state of a mission of mode ``guided`` with at least one row."""
         mission = state.mission
         preferences = {name: found for name, advise in ADVISERS.items() if (found := advise(state)) is not None}
-        template = template_of(mission)
-        candidates = candidates_of(state, template).with_actions([found.action for found in preferences.values()])
+        template, proposals = template_of(mission), [found.action for found in preferences.values()]
+        candidates = candidates_of(state, template).with_actions(proposals)
         take_rollout = partial(
             RolloutState.of,
             mission.belief.copy(),
@@ -78,7 +118,7 @@ class Deliberation:
             state.uav_id,
             seed=mission.spec.seed,
             reserved=state.reserved,
-            plans=None if mission.planner is None else mission.planner.actions(),
+            plans={} if mission.planner is None else dict(mission.planner.plans),
             guidance=mission.guidance.confirmed,
         )
         return cls(

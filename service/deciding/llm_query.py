@@ -5,15 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
+from functools import partial
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_time import Deadline
-from service.deciding.deliberation import candidates_of, template_of
+from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
 from service.llm.answers import Completion, NoDecision
 from service.llm.calibration import LabelReader
 from service.llm.server_pool import ServerPool
@@ -21,8 +19,6 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
-from shared.actions import Action
-from shared.channel import FloatArray
 from shared.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -31,44 +27,6 @@ log = logging.getLogger(__name__)
 _CLOSING_S = 4.0
 # Queries about a whole fleet that may be late in a row before the LLM is asked about one UAV at a time.
 _LATE = 2
-
-
-@dataclass(frozen=True, slots=True)
-class LlmAdvice:
-    """The LLM's preference among one UAV's candidates in mode ``guided``.
-
-    Attributes:
-        prompt: of a query about several UAVs, this UAV's share of it; the first UAV's share has the static block and
-            the experiences too, and the whole query's ``completion``.
-        probabilities: by action; None where the LLM gave none, for the ``reason``.
-        calibrated: whether the LLM's bias towards labels is known.
-        model: the LLM's name, if it is known.
-    """
-
-    prompt: Prompt
-    probabilities: dict[Action, float] | None
-    reason: Reason | None
-    completion: Completion | None
-    calibrated: bool
-    model: str | None
-
-    def over(self, actions: Sequence[Action]) -> FloatArray | None:
-        """The probabilities of these actions, ``(n,)``; None where the LLM gave none for any of them.
-
-        The probability of a velocity that is not among them goes to the sensor's nearest: the operator may have
-        forbidden it since.
-        """
-        found = np.zeros(len(actions))
-        index = {action: i for i, action in enumerate(actions)}
-        for action, probability in (self.probabilities or {}).items():
-            at = index.get(action)
-            if at is None:
-                same = [other for other in actions if other.sensor_id == action.sensor_id]
-                if not same:
-                    continue
-                at = index[min(same, key=lambda other: abs(other.velocity - action.velocity))]
-            found[at] += probability
-        return found / found.sum() if found.sum() > 0.0 else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +71,7 @@ class LlmQueries:
 
     async def ask_for_pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: Deadline) -> Completion:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``."""
-        return await self._within(self._llm.ask(prompt.static, prompt.user, sensor_ids, levels), deadline)
+        return await self._within(partial(self._llm.ask, prompt.static, prompt.user, sensor_ids, levels), deadline)
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
@@ -178,7 +136,7 @@ class LlmQueries:
     ) -> _Answer:
         completion, by_label, reason = None, None, None
         try:
-            completion = await self._within(self._llm.ask_labels(static, user, labels), deadline)
+            completion = await self._within(partial(self._llm.ask_labels, static, user, labels), deadline)
             by_label = self._labels.read(completion, static, labels)
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
@@ -190,15 +148,14 @@ class LlmQueries:
         unknown = by_label is not None and bool(completion.positions) and not known
         return _Answer(completion, by_label, reason, calibrated=known, to_calibrate=unknown, model=completion.model)
 
-    async def _within(self, query: Coroutine[Any, Any, Completion], deadline: Deadline) -> Completion:
+    async def _within(self, query: Callable[[], Awaitable[Completion]], deadline: Deadline) -> Completion:
         if len(self._waiting) >= self._limit:
-            query.close()
             raise NoDecision("llm_busy", f"{self._limit} decisions wait for it already")
         limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))
         try:
             async with limit:
                 self._waiting.add(limit)
-                return await query
+                return await query()
         except TimeoutError:
             raise NoDecision("llm_timeout", "no answer within the deadline") from None
         finally:

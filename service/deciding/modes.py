@@ -6,6 +6,7 @@ import asyncio
 import logging
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, ClassVar, Protocol
 
 from service.deciding.attended_state import AttendedState
@@ -102,7 +103,7 @@ class Llm(Policy):
             try:
                 completion = await self._queries.ask_for_pair(question.prompt, state.kept_ids, levels, task.deadline)
             finally:
-                task.watch.lap("llm")
+                task.watch.ended.append(("llm", perf_counter()))
             answer = Action(*check_answer(completion.text, state.kept_ids, levels))
             if not state.mission.guidance.confirmed.allows(answer.velocity):
                 raise NoDecision("answer_velocity", f"the operator forbids {answer.velocity} m/s")
@@ -132,7 +133,7 @@ class LlmByLetter(Policy):
         if question.candidates is None:
             return Fallback("no_candidate")
         advice = await self._queries.ask(state.mission, question.candidates, question.prompt, task.deadline)
-        task.watch.lap("llm")
+        task.watch.ended.append(("llm", perf_counter()))
         probabilities = advice.over(question.candidates.actions)
         if probabilities is None:
             return Fallback(advice.reason or "answer_format", advice.completion, advice.model)
@@ -176,7 +177,7 @@ class Guided(Policy):
             asking = asyncio.create_task(
                 self._queries.ask(mission, deliberation.candidates, deliberation.prompt, task.deadline)
             )
-            asking.add_done_callback(lambda _: task.watch.lap("llm"))
+            asking.add_done_callback(lambda _: task.watch.ended.append(("llm", perf_counter())))
             waiting.add(asking)
         try:
             await asyncio.wait(waiting, timeout=task.evaluation_deadline.left())
@@ -187,13 +188,13 @@ class Guided(Policy):
             # An evaluation that still waits for a thread does not begin.
             for unfinished in waiting:
                 unfinished.cancel()
-        task.watch.lap("judge")
+        task.watch.ended.append(("judge", perf_counter()))
         if evaluation is None:
             reason = advice.reason or "critic_timeout"
             return Fallback(reason, advice.completion, advice.model, evaluated_late=True)
         reserved = mission.reservations.of_others(state.step, state.uav_id)
         llm = advice.over(deliberation.candidates.actions)
-        trust = mission.trust_in(advice.model)
+        trust = mission.trust[advice.model or ""]
         verdict = deliberation.conclude(trust, evaluation, llm, calibrated=advice.calibrated, reserved=reserved)
         if verdict is None:
             return Fallback("answer_reserved", advice.completion, advice.model)

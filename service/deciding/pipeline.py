@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from time import perf_counter
 
 from service.config.cores import usable_cores
 from service.config.settings import Settings
@@ -21,6 +22,7 @@ from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
+from shared.guidance import Guidance
 from shared.wire import Mode as ModeName
 from shared.wire import Tokens
 
@@ -77,17 +79,24 @@ class Pipeline:
         state = AttendedState.of(task.mission, task.uav, task.step, task.watch)
         question = mode.question(state, task)
         tokens = self._counter.account(question.prompt)
-        task.watch.lap("prompt")
+        task.watch.ended.append(("prompt", perf_counter()))
         choice = await mode.choose(state, question, task)
         if isinstance(choice, Fallback):
             if not mode.plan_first:
                 await _await_plan(task)
             choice = choice.to(_without_llm(state))
-        decided = _commit(task, state, question.prompt, tokens, _enforce(task.mission, choice))
-        times = decided.latency_ms
+        orders, decision_id = task.mission.guidance.orders, uuid.uuid4().hex
+        if orders is not None:
+            choice = _enforce(orders, task.mission, choice)
+        pending = state.pending(decision_id, choice.action)
+        task.watch.ended.append(("check", perf_counter()))
+        report = None if choice.advice is None else AdviserReport(choice.model or "", choice.advice)
+        task.mission.commit(pending, task.attempt, report)
+        task.mission.reports.remember(task.uav, task.step, decision_id)
+        times = task.watch.milliseconds(perf_counter())
         waited_ms = times.get("llm", 0.0) + times.get("plan", 0.0)
         self.own_s += ((times["total"] - waited_ms) / 1e3 - self.own_s) / _OWN_MEMORY
-        return decided
+        return Decided(decision_id, task, state, question.prompt, tokens, choice, times)
 
     def begin_plan(
         self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline
@@ -114,7 +123,7 @@ async def _await_plan(task: DecisionTask) -> None:
     """Wait for the plan until the deadline; a later plan serves the fleet's next decisions."""
     if task.plan is not None:
         await asyncio.wait({task.plan}, timeout=task.deadline.left())
-    task.watch.lap("plan")
+    task.watch.ended.append(("plan", perf_counter()))
 
 
 def _without_llm(state: AttendedState) -> Action:
@@ -131,21 +140,7 @@ def _without_llm(state: AttendedState) -> Action:
     return Action(sensor, velocity)
 
 
-def _enforce(mission: Mission, choice: Choice) -> Choice:
+def _enforce(orders: Guidance, mission: Mission, choice: Choice) -> Choice:
     """The choice at a velocity that the operator's guidance allows, which may have been confirmed meanwhile."""
-    orders = mission.guidance.orders
-    if orders is None:
-        return choice
     velocity = orders.nearest(choice.action.velocity, mission.scenario.max_velocity + 1)
     return replace(choice, action=Action(choice.action.sensor_id, velocity))
-
-
-def _commit(task: DecisionTask, state: AttendedState, prompt: Prompt, tokens: Tokens, choice: Choice) -> Decided:
-    """Record the decision in its mission."""
-    decision_id = uuid.uuid4().hex
-    report = None if choice.advice is None else AdviserReport(choice.model or "", choice.advice)
-    pending = state.pending(decision_id, choice.action)
-    task.watch.lap("check")
-    task.mission.commit(pending, task.attempt, report)
-    task.mission.reports.remember(task.uav, task.step, decision_id)
-    return Decided(decision_id, task, state, prompt, tokens, choice, task.watch.total())

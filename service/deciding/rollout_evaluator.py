@@ -104,7 +104,7 @@ class RolloutState:
         *,
         seed: int = 0,
         reserved: Collection[int] = (),
-        plans: Mapping[int, Sequence[Action]] | None = None,
+        plans: Mapping[int, NDArray[np.int64] | Sequence[Action]] | None = None,
         guidance: Guidance = NO_GUIDANCE,
     ) -> RolloutState:
         """The state before this UAV's decision at this step; ``plans`` are the fleet's from this step on."""
@@ -184,7 +184,7 @@ def _most_urgent(
     return np.sort(reached[np.argsort(room[reached], kind="stable")[:_MAX_SENSORS]])
 
 
-def _indexed(sensors: NDArray[np.int64], actions: Sequence[Action]) -> NDArray[np.int64]:
+def _indexed(sensors: NDArray[np.int64], actions: NDArray[np.int64] | Sequence[Action]) -> NDArray[np.int64]:
     """A plan's actions with indices into ``sensors`` in place of IDs, ``(steps, 2)``."""
     index = {int(sensor): row for row, sensor in enumerate(sensors)}
     return np.array([(index.get(j, -1), v) for j, v in actions], dtype=np.int64).reshape(-1, 2)

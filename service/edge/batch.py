@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import time
+from time import perf_counter
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import RESERVE_S, DecisionTask
 from service.deciding.decision_time import Deadline, Stopwatch
-from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.deciding.deliberation import LlmAdvice
+from service.deciding.llm_query import LlmQueries
 from service.deciding.pipeline import Decided, Pipeline
 from service.mission.mission import Mission
 from shared.wire import BatchRequest
@@ -41,20 +42,20 @@ class BatchDecider:
         advice: dict[int, LlmAdvice] = {}
         query_s = self._query_s(deadline.at - watch.started, len(uavs))
         if query_s is not None and self._queries.may_ask_for_fleet(mission, len(uavs)):
-            plan = self._pipeline.begin_plan(mission, uavs, step, deadline.earlier_by(RESERVE_S))
+            plan = self._pipeline.begin_plan(mission, uavs, step, Deadline(deadline.at - RESERVE_S))
             states = [AttendedState.of(mission, uav, step, watch) for uav in request.uavs]
             advice = await self._queries.ask_for_fleet(mission, states, Deadline(watch.started + query_s))
-            watch.lap("llm")
+            watch.ended.append(("llm", perf_counter()))
         decisions: list[Decided] = []
         for index, uav in enumerate(request.uavs):
             own = Stopwatch() if index else watch
-            now, later = time.perf_counter(), len(uavs) - index - 1
+            now, later = perf_counter(), len(uavs) - index - 1
             share_s = (deadline.at - now) / (later + 1)
             plan = plan or self._pipeline.begin_plan(mission, uavs[index:], step, Deadline(now + share_s - RESERVE_S))
             deadline_ms = max(1, int((now - own.started + share_s) * 1e3))
             mine = Deadline(own.started + deadline_ms / 1e3 - RESERVE_S)
             # The evaluator may exceed its UAV's share, as long as enough time is left for the later UAVs.
-            evaluation = max(mine, deadline.earlier_by(RESERVE_S + self._pipeline.own_s * later))
+            evaluation = max(mine, Deadline(deadline.at - RESERVE_S - self._pipeline.own_s * later))
             task = DecisionTask(
                 mission,
                 uav,

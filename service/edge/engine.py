@@ -163,7 +163,7 @@ class Engine:
         if request.outcome is not None:
             self._feedback.apply_reported(mission, request.outcome)
         attempt = mission.observe(request, request.step)
-        deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, deadline.earlier_by(RESERVE_S)
+        deadline_ms, mine = request.deadline_ms or self._settings.deadline_ms, Deadline(deadline.at - RESERVE_S)
         plan = self.pipeline.begin_plan(mission, [request.uav_id], request.step, mine)
         task = DecisionTask(mission, request, request.step, attempt, deadline_ms, mine, mine, watch, plan)
         return [await self.pipeline.decide_one(task)]
@@ -186,7 +186,7 @@ class Engine:
             else:
                 decisions, answers = await self._once(mission, request, key, make)
             began = time.perf_counter()
-            stored = await self.journal.stored(min(_STORE_S, deadline.left()))
+            stored = await self.journal.stored(min(_STORE_S, deadline.at - began))
             waited_ms = round((time.perf_counter() - began) * 1e3, 3)
             for index, answer in enumerate(answers):
                 total = round(answer.latency_ms["total"] + waited_ms, 3)

@@ -113,7 +113,7 @@ class MissionRegistry:
         mission_id = request.mission_id
         mission = self._missions.get(mission_id)
         if mission is None:
-            mission = await self._find(mission_id, deadline.earlier_by(RESERVE_S).left())
+            mission = await self._find(mission_id, Deadline(deadline.at - RESERVE_S).left())
         if mission is not None and key is not None and mission.idempotent_answers.knows(key):
             return mission, request
         if mission is None and not may_make:

@@ -32,8 +32,7 @@ _MANY, _BLOCK, _LEAST_BLOCKS = 2048, 256, 4
 _VECTOR = 32
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(NamedTuple):
     """A training sample: one decision as the modules saw it.
 
     Attributes:

@@ -31,9 +31,8 @@ never flown stays uncorrected. That is the price of not exploring; a draw would 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from math import exp
-from typing import Any
+from typing import Any, NamedTuple
 
 from shared.bounded import BoundedDict
 
@@ -60,8 +59,7 @@ PRIOR = {LLM: 0.2, PLANNER: 0.6, "value": 0.1, "policy": 0.1}
 PRIOR_UNPLANNED = {LLM: 0.8, "value": 0.1, "policy": 0.1}
 
 
-@dataclass(frozen=True, slots=True)
-class Advice:
+class Advice(NamedTuple):
     """The advice for one decision, by name of the adviser; advisers without advice are left out.
 
     Attributes:
@@ -70,13 +68,9 @@ class Advice:
         expected_cost: of the action that was flown, by the rollout evaluator.
     """
 
-    regret: Mapping[str, float]
-    flown: Mapping[str, float]
+    regret: dict[str, float]
+    flown: dict[str, float]
     expected_cost: float
-
-    def state_dict(self) -> dict[str, Any]:
-        """The fields."""
-        return {"regret": dict(self.regret), "flown": dict(self.flown), "expected_cost": self.expected_cost}
 
 
 class Trust:
@@ -88,11 +82,12 @@ class Trust:
 
     Attributes:
         weights: each adviser's weight, 0..1.
+        open: by decision, the advice whose outcome is pending.
         updates: number of outcomes that changed the weights.
     """
 
     def __init__(self, prior: Mapping[str, float], most_open: int = 64) -> None:
-        self._open = BoundedDict[str, Advice](most_open)
+        self.open = BoundedDict[str, Advice](most_open)
         total = sum(prior.values())
         self._prior = {name: weight / total for name, weight in prior.items()}
         self.weights = dict(self._prior)
@@ -104,13 +99,9 @@ class Trust:
         total = sum(self.weights[name] for name in names)
         return {name: self.weights[name] / total for name in names}
 
-    def note(self, decision_id: str, advice: Advice) -> None:
-        """Store the advice until the decision's outcome is known."""
-        self._open[decision_id] = advice
-
     def settle(self, decision_id: str, cost: float) -> None:
         """Update the weights by a decision's realised cost, if its advice is stored."""
-        advice = self._open.take(decision_id)
+        advice = self.open.take(decision_id)
         if advice is not None:
             self.update(advice.regret, advice.flown, self._surprise_of(cost, advice.expected_cost))
 
@@ -149,7 +140,7 @@ class Trust:
             "weights": dict(self.weights),
             "surprise": self._surprise,
             "updates": self.updates,
-            "open": [(name, advice.state_dict()) for name, advice in self._open.items()],
+            "open": [(name, advice._asdict()) for name, advice in self.open.items()],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -157,6 +148,6 @@ class Trust:
         if state["weights"].keys() != self._prior.keys():
             return
         self.weights, self._surprise, self.updates = state["weights"], state["surprise"], state["updates"]
-        self._open.clear()
+        self.open.clear()
         for name, advice in state["open"]:
-            self._open[name] = Advice(**advice)
+            self.open[name] = Advice(**advice)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from service.errors import Conflict, NotFound, Refused
 from service.learning.modules import Sample
@@ -20,8 +20,7 @@ PENDING_PER_UAV = 8
 _APPLIED_PER_UAV = 64
 
 
-@dataclass(frozen=True, slots=True)
-class Pending:
+class Pending(NamedTuple):
     """A decision whose outcome is still to come.
 
     Attributes:
@@ -37,16 +36,9 @@ class Pending:
     seen: Cells
     sample: Sample | None
 
-    def state_dict(self) -> dict[str, Any]:
-        """Plain values and arrays."""
-        sample = self.sample
-        fields = None if sample is None else [sample.features, sample.chosen, sample.approach, sample.velocity]
-        names = ("decision_id", "uav_id", "step", "sensor_id", "velocity")
-        return {**{name: getattr(self, name) for name in names}, "seen": dict(self.seen), "sample": fields}
-
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> Pending:
-        """From its ``state_dict``."""
+        """From its fields by name, the sample's in their order."""
         sample = None if state["sample"] is None else Sample(*state["sample"])
         return cls(**{**state, "sample": sample})
 
@@ -163,7 +155,7 @@ class PendingDecisions:
 
     def state_dict(self) -> list[dict[str, Any]]:
         """The waiting decisions, oldest first; the applied outcomes have a state of their own."""
-        return [decision.state_dict() for decision in self._decisions.values()]
+        return [decision._asdict() for decision in self._decisions.values()]
 
     def load_state_dict(self, state: list[dict[str, Any]]) -> None:
         """Restore a ``state_dict``."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,7 +48,8 @@ class Mission:
         requested_spec: the spec of the request; ``spec`` is the resolved one.
         prompt_fits: whether the LLM's context is large enough for every prompt; True in a mode without an LLM.
         measured: by UAV, what the gains of its newest report show, until it is told.
-        trust: in mode ``guided``, the trust in the advisers, by the LLM's name.
+        trust: in mode ``guided``, the trust in the advisers, by the name of the LLM that is one of them; "" where that
+            is unknown.
 
     Args:
         spec: the resolved spec of a restored mission, which stays as it is whatever the settings are now.
@@ -95,7 +98,8 @@ class Mission:
         self.planner = Planner(self.scenario, self.belief) if planned else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         self.visit_orders = VisitOrders()
-        self.trust: dict[str, Trust] = {}
+        prior = PRIOR if self.planner is not None else PRIOR_UNPLANNED
+        self.trust = defaultdict[str, Trust](partial(Trust, prior, most_open=PENDING_PER_UAV * self.scenario.uavs))
         self.record: Callable[[Event], None] = ignore_event
 
     def answer_guidance(self, answer: GuidanceAnswer) -> None:
@@ -117,14 +121,6 @@ class Mission:
         if self.planner is not None:
             self.planner.follow(self.guidance.confirmed)
         self.record(Guided(self.guidance.state_dict()))
-
-    def trust_in(self, model: str | None) -> Trust:
-        """Mode ``guided``: the trust in the advisers while this LLM is one of them."""
-        name = model or ""
-        if name not in self.trust:
-            prior = PRIOR if self.planner is not None else PRIOR_UNPLANNED
-            self.trust[name] = Trust(prior, most_open=PENDING_PER_UAV * self.scenario.uavs)
-        return self.trust[name]
 
     def observe(self, uav: UavState, step: int) -> int:
         """Add a UAV's report to the sensors' records and to the fleet's belief.
@@ -160,7 +156,7 @@ class Mission:
         self.belief.tell(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
         self.decisions += 1
         if advice is not None:
-            self.trust_in(advice.model).note(decision.decision_id, advice.advice)
+            self.trust[advice.model].open[decision.decision_id] = advice.advice
         self.record(Decided(decision, attempt, advice))
 
     def apply(self, outcome: Outcome, *, for_training: bool = True) -> Sample | None:
@@ -226,7 +222,7 @@ class Mission:
         self.reservations.load_state_dict(state["turns"])
         self.belief.load_state_dict(state["belief"])
         for model, trust in state["trust"].items():
-            self.trust_in(model).load_state_dict(trust)
+            self.trust[model].load_state_dict(trust)
         self.restore_guidance(state["guidance"])
         # Checkpoints of earlier versions have none: theirs count from the next decision.
         if "visit_orders" in state:

@@ -77,7 +77,3 @@ class Planner(RecedingHorizon):
             return None
         sensor, velocity = actions[0].tolist()
         return None if sensor < 0 or sensor in reserved else Action(int(sensor), int(velocity))
-
-    def actions(self) -> dict[int, list[Action]]:
-        """The actions of each UAV from this step on; sensor -1 where nothing is in reach."""
-        return {uav: [Action(int(s), int(v)) for s, v in plan.tolist()] for uav, plan in self.plans.items()}

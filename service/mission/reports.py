@@ -122,7 +122,10 @@ class Reports:
         A fleet may be out of contact for as long as its scenario lasts. The first report may be of any step: an edge
         that lost its missions meets them in mid-flight, and fleets fly on past their scenario's last step.
         """
-        newest, ahead = self._belief.newest, max(MAX_STEPS_APART, self._scenario.steps)
+        ahead = max(MAX_STEPS_APART, self._scenario.steps)
+        if step <= ahead:
+            return
+        newest = self._belief.newest
         if newest is not None and step > newest + ahead:
             raise Refused(
                 "step",

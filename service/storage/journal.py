@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -68,10 +68,15 @@ class NullJournal:
 
 
 class Journal:
-    """The journal of the missions of one store; used on the event loop only."""
+    """The journal of the missions of one store; used on the event loop only.
+
+    Attributes:
+        stored: as :meth:`GroupCommit.stored`.
+    """
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
         self._commits = GroupCommit(store.writer(), metrics)
+        self.stored = self._commits.stored
         self._loop = asyncio.get_running_loop()
         self._logs: dict[str, MissionLog] = {}
         self._packing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoints")
@@ -137,10 +142,6 @@ class Journal:
         else:
             # Packed at once: until it is written, the state would take the memory of a thousand small objects.
             self._take(mission_log, mission_log.seq, pack(state))
-
-    def stored(self, within_s: float) -> Coroutine[Any, Any, bool]:
-        """Wait until every event so far is durable; False if that takes longer, or if the store fails."""
-        return self._commits.stored(within_s)
 
     async def close(self, within_s: float) -> bool:
         """Write the queue once more; returns whether that has ended, so that the store may be closed."""

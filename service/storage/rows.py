@@ -108,8 +108,8 @@ def encode(event: Event) -> tuple[Kind, bytes]:
         case Reported(step, uav):
             return "reported", pack([step, uav.model_dump(include=_REPORT, exclude_defaults=True)])
         case Decided(decision, attempt, report):
-            packed = None if report is None else [report.model, report.advice.state_dict()]
-            return "decided", pack([decision.state_dict(), attempt, packed])
+            packed = None if report is None else [report.model, report.advice._asdict()]
+            return "decided", pack([decision._asdict(), attempt, packed])
         case Settled(outcome, used_for_training):
             return "settled", pack([outcome.model_dump(include=_OUTCOME), used_for_training])
         case Guided(state):

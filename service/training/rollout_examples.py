@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Self
 
@@ -40,7 +40,7 @@ class TeacherDecision:
 
     def ranked(self, speed: Speed) -> Sample:
         """The sample to be ranked first, with the teacher's velocity or the best by look-ahead."""
-        return self.sample if speed == "teacher" else replace(self.sample, velocity=self.best_velocity)
+        return self.sample if speed == "teacher" else self.sample._replace(velocity=self.best_velocity)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from fastapi.responses import Response
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_time import Deadline
-from service.deciding.deliberation import Deliberation
-from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.deciding.deliberation import Deliberation, LlmAdvice
+from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.learning.trust import LLM
 from service.llm.answers import Completion, NoDecision, TokenPosition
@@ -222,7 +222,7 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
     place = made.candidates.actions.index(plan)
     losses = np.zeros(len(made.candidates.actions))
     losses[place] = lost
-    verdict = made.conclude(mission.trust_in("stub"), Evaluation(losses, losses), None, calibrated=False)
+    verdict = made.conclude(mission.trust["stub"], Evaluation(losses, losses), None, calibrated=False)
     assert verdict is not None
     assert (verdict.action == plan) == flown
 
@@ -230,7 +230,7 @@ def test_a_plan_is_overruled_only_where_the_critic_sees_a_disaster(lost: float, 
 @pytest.mark.parametrize("answer", ["worst", "random"])
 def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
     mission = guided(planner="on")
-    trust, random = mission.trust_in("stub"), np.random.default_rng(0)
+    trust, random = mission.trust["stub"], np.random.default_rng(0)
     for step in range(6):
         view, _ = deliberation(mission, step)
         plan = planned(mission, view)
@@ -247,7 +247,7 @@ def test_a_bad_llm_cannot_talk_the_fleet_out_of_its_plan(answer: str) -> None:
 
 def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
     mission = guided(planner="off")
-    trust = mission.trust_in("stub")
+    trust = mission.trust["stub"]
     for step in range(15):
         view, made = deliberation(mission, step)
         judgement = made.evaluate()
@@ -258,7 +258,7 @@ def learned(answer: Callable[[Deliberation, np.ndarray], str]) -> float:
         verdict = made.conclude(trust, judgement, word, calibrated=False)
         assert verdict is not None
         decision_id = f"{step:032x}"
-        trust.note(decision_id, verdict.advice)
+        trust.open[decision_id] = verdict.advice
         trust.settle(decision_id, verdict.advice.expected_cost)
     return trust.weights[LLM]
 
@@ -283,7 +283,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
     told = np.array(
         list(made.candidates.by_action({name: float(name == worst) for name in made.candidates.labels}).values())
     )
-    verdict = made.conclude(mission.trust_in("stub"), judgement, told, calibrated=False)
+    verdict = made.conclude(mission.trust["stub"], judgement, told, calibrated=False)
     assert verdict is not None
     assert verdict.action != made.candidates.actions[made.candidates.labels[worst]]
 
@@ -291,7 +291,7 @@ def test_a_disaster_is_not_flown_even_before_trust_has_learned() -> None:
 def test_what_others_got_meanwhile_is_not_flown() -> None:
     mission = guided()
     view, made = deliberation(mission)
-    trust, judgement = mission.trust_in("stub"), made.evaluate()
+    trust, judgement = mission.trust["stub"], made.evaluate()
     first = made.conclude(trust, judgement, None, calibrated=False)
     assert first is not None
     second = made.conclude(trust, judgement, None, calibrated=False, reserved={first.action[0]})

@@ -9,8 +9,8 @@ import httpx
 import pytest
 
 from service.config.cores import usable_cores
-from service.deciding.deliberation import Deliberation
-from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.deciding.deliberation import Deliberation, LlmAdvice
+from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, wait_for

@@ -14,7 +14,8 @@ from fastapi.responses import JSONResponse, Response
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_time import Deadline
-from service.deciding.llm_query import LlmAdvice, LlmQueries
+from service.deciding.deliberation import LlmAdvice
+from service.deciding.llm_query import LlmQueries
 from service.llm.request_bodies import constrain_labels
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate

@@ -1,7 +1,6 @@
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from types import FrameType
 from typing import Any
@@ -31,7 +30,7 @@ def sample(preset: Features = "paper", seed: int = 0, sensors: int = 6) -> Sampl
 @pytest.mark.parametrize("preset", PRESETS)
 def test_gradient_equals_a_finite_difference(preset: Features) -> None:
     modules = Modules(preset, 15, seed=3).double()
-    case = replace(sample(preset), features=sample(preset).features.astype(np.float64))
+    case = sample(preset)._replace(features=sample(preset).features.astype(np.float64))
     modules.loss(case, reward=-0.8).backward()  # type: ignore[no-untyped-call]
     for name, parameter in modules.named_parameters():
         assert parameter.grad is not None, name

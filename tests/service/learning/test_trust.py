@@ -9,7 +9,7 @@ PRIOR = {"llm": 0.5, "value": 0.25, "policy": 0.25}
 
 def advise(trust: Trust, regret: dict[str, float], *, cost: float = 0.0, expected: float = 0.0, times: int = 1) -> None:
     for _ in range(times):
-        trust.note("a" * 32, Advice(regret, dict.fromkeys(regret, 0.5), expected))
+        trust.open["a" * 32] = Advice(regret, dict.fromkeys(regret, 0.5), expected)
         trust.settle("a" * 32, cost)
 
 
@@ -53,7 +53,7 @@ def test_who_is_silent_keeps_its_weight() -> None:
 
 def test_who_advised_what_failed_unexpectedly_is_trusted_less() -> None:
     trust = Trust(PRIOR)
-    trust.note("a" * 32, Advice(dict.fromkeys(PRIOR, 0.0), {"llm": 1.0, "value": 0.0, "policy": 0.0}, 0.0))
+    trust.open["a" * 32] = Advice(dict.fromkeys(PRIOR, 0.0), {"llm": 1.0, "value": 0.0, "policy": 0.0}, 0.0)
     trust.settle("a" * 32, cost=1.0)
     assert trust.weights["llm"] < 0.3
     # An outcome counts once, and one of a decision that it knows nothing of not at all.
@@ -67,7 +67,7 @@ def test_a_cost_that_is_always_higher_than_the_critic_thinks_says_nothing_in_the
     flown = {"llm": 1.0, "value": 0.0, "policy": 0.0}
     weights = []
     for _ in range(200):
-        trust.note("a" * 32, Advice(dict.fromkeys(PRIOR, 0.0), flown, 0.0))
+        trust.open["a" * 32] = Advice(dict.fromkeys(PRIOR, 0.0), flown, 0.0)
         trust.settle("a" * 32, cost=0.7)
         weights.append(trust.weights["llm"])
     assert weights[-1] > weights[99]
@@ -76,7 +76,7 @@ def test_a_cost_that_is_always_higher_than_the_critic_thinks_says_nothing_in_the
 def test_open_advice_is_bounded() -> None:
     trust = Trust(PRIOR, most_open=2)
     for number in range(3):
-        trust.note(f"{number:032x}", Advice(dict.fromkeys(PRIOR, 0.0), dict.fromkeys(PRIOR, 0.5), 0.0))
+        trust.open[f"{number:032x}"] = Advice(dict.fromkeys(PRIOR, 0.0), dict.fromkeys(PRIOR, 0.5), 0.0)
     trust.settle(f"{0:032x}", 1.0)
     assert trust.updates == 0
     trust.settle(f"{2:032x}", 1.0)
