@@ -90,7 +90,7 @@ def test_a_mission_appears_while_it_flies(another_edge: str, visit: Open, tmp_pa
     expect(page.locator("#connection")).to_have_text("Connected")
     assert page.locator(".trails line").count() > DECISIONS // 2
     assert len(set(page.locator(".trails line").evaluate_all("all => all.map(l => l.getAttribute('stroke'))"))) > 3
-    for chart in ("loss", "latency", "tokens"):
+    for chart in ("loss", "latency"):
         expect(page.locator(f"#{chart} canvas")).to_have_count(1)
         expect(page.locator(f"#{chart}-text")).not_to_be_empty()
     expect(page.locator("#legend")).to_contain_text("round trip as the UAV measured it")
@@ -127,6 +127,7 @@ def test_every_decision_and_sensor_is_reached_by_keyboard(visit: Open, flown: st
     expect(dialog.locator("tr.chosen")).to_have_count(1)
     expect(dialog.locator("tbody tr")).to_have_count(5)
     expect(dialog).to_contain_text("No LLM was asked")
+    expect(dialog.get_by_role("heading", name="Tokens")).to_have_count(0)
     page.keyboard.press("Escape")
     expect(dialog).to_be_hidden()
     expect(first).to_be_focused()
@@ -154,6 +155,8 @@ def test_mode_guided_shows_candidates_with_probabilities_and_trust(visit: Open, 
         expect(dialog.locator("tbody tr").first).to_contain_text(f"{best['llm']:.3f}{best['mixture']:.3f}")
         expect(dialog.locator("meter")).to_have_count(len(answer["guided"]["trust"]))
         expect(dialog).to_contain_text("As the LLM received it.")
+        expect(dialog.get_by_role("heading", name="Tokens")).to_be_visible()
+        expect(page.locator("#tokens canvas")).to_have_count(1)
         assert violations(page) == []
 
 
@@ -176,7 +179,7 @@ def test_what_comes_from_outside_is_text(visit: Open, edge: str, report: Report)
 @pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1280)])
 def test_it_is_accessible_and_fits(visit: Open, flown: str, scheme: str, width: int) -> None:
     page = visit(flown, color_scheme=scheme, viewport={"width": width, "height": 844}, reduced_motion="reduce")
-    expect(page.locator("#tokens canvas")).to_have_count(1)
+    expect(page.locator("#latency canvas")).to_have_count(1)
     assert violations(page) == []
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.locator("#feed button").first.click()
@@ -393,6 +396,8 @@ def test_the_page_says_what_the_records_say(visit: Open, edge: str, tmp_path: Pa
     assert tiles["Failed"] == str(summary["failures"])
     # Mode value asks no LLM: nothing is said of tokens.
     assert "Tokens saved" not in tiles
+    expect(page.locator("#latency canvas")).to_have_count(1)
+    expect(page.locator("#tokens-text")).to_be_hidden()
     detail = page.locator("#numbers .detail").all_inner_texts()
     assert any(f"cost {sum(d['cost'] for d in decisions):.1f}".removesuffix(".0") in text for text in detail)
     for source, count in summary["by_source"].items():

@@ -71,6 +71,10 @@ export class Charts {
     const steps = [...this.mission.steps].filter(([, s]) => s.count > 0).sort((a, b) => a[0] - b[0]);
     if (!steps.length) return;
     for (const [name, chart] of Object.entries(CHARTS)) {
+      // A prompt that no LLM reads costs and saves nothing.
+      const hidden = name === "tokens" && !this.mission.about.asks;
+      at(name).closest("figure").hidden = hidden;
+      if (hidden) continue;
       const rows = chart.rows(steps);
       const data = [steps.map(([number]) => number), ...rows];
       if (this.plots[name]) this.plots[name].setData(data);

@@ -9,8 +9,8 @@ let opened = null;
 
 at("decision-close").addEventListener("click", () => at("decision").close());
 
-/** Show a decision; its prompt is asked for. */
-export function open(decision) {
+/** Show a decision; its prompt is asked for. `asks`: whether the mission's mode asks an LLM. */
+export function open(decision, asks) {
   const { answer } = decision;
   opened = answer.decision_id;
   say(at("decision-title"), `Step ${answer.step}: U${answer.uav_id} to S${answer.sensor_id} at ${answer.velocity} m/s`);
@@ -18,7 +18,7 @@ export function open(decision) {
   const said = why(answer);
   at("decision-body").replaceChildren(
     make("p", {}, make("span", { class: "who", "data-source": answer.source }, decider(answer)), said ? ` ${said}` : ""),
-    candidates(answer), ...trust(answer), times(decision), tokens(answer), prompt);
+    candidates(answer), ...trust(answer), times(decision), ...(asks ? [tokens(answer)] : []), prompt);
   if (!at("decision").open) at("decision").showModal();
   at("decision-title").focus();
   showPrompt(answer, prompt);

@@ -26,10 +26,10 @@ let paused = false;
 let remark = null;
 let mayCommand = false;
 
-const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id)));
+const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id), mission.about.asks));
 const map = new MissionMap((kind, id) => {
   const last = mission.newest(1000).find(({ answer }) => (kind === "uav" ? answer.uav_id : answer.sensor_id) === id);
-  if (last) open(last);
+  if (last) open(last, mission.about.asks);
 });
 const charts = new Charts();
 const operator = new Operator();
