@@ -1,4 +1,4 @@
-"""What a fleet has learned of its world comes back to the bit: from events, and from a checkpoint and events."""
+"""What a fleet has learned and met comes back to the bit: from events, and from a checkpoint and events."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from service.storage.recovery import restore_mission
 from service.storage.store import Store
 from shared.actions import Action
 from shared.channel import channel_gain_db
+from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.trajectory import trajectories
 from shared.wire import MissionSpec, Outcome, SensorColumns, UavState
 from tests.service.keeping import same, state
@@ -74,6 +75,11 @@ class Flight:
         return UavState(uav_id=uav, position=[x, y], progress_m=self._progress[uav], sensors=columns)
 
 
+def visits(every: int) -> Guidance:
+    """Orders to visit every sensor."""
+    return Guidance(sensors=[SensorWish(sensor_id=sensor, visit_every=every) for sensor in range(SENSORS)])
+
+
 def the_same(one: Mission, other: Mission) -> None:
     """Both know, tell and predict the same, to the bit."""
     assert same(state(one), state(other))
@@ -94,11 +100,13 @@ async def test_a_restored_mission_expects_the_same_links(tmp_path: Path, checkpo
     mission = Mission("test", MissionSpec(mode="value", planner="off"), settings)
     journal.begin(mission)
     flight = Flight(mission)
+    mission.answer_guidance(GuidanceAnswer(guidance=visits(3)))
     flight.fly(range(13))
     if checkpointed:
         track = journal.due(mission, 1)
         assert track is not None
         journal.checkpoint(track, state(mission))
+    mission.answer_guidance(GuidanceAnswer(guidance=visits(2)))
     flight.fly(range(13, 20))
     assert await journal.stored(PATIENCE_S)
     kept = store.load("test")
@@ -113,6 +121,9 @@ async def test_a_restored_mission_expects_the_same_links(tmp_path: Path, checkpo
     assert not mission.belief.channel.failures.none
     counts = mission.belief.channel.radio_map.count
     assert len(set(counts[counts > 0].tolist())) > 2
+    # Of ended orders and of those in force, some deadlines were met and others missed.
+    spans = [mission.deadlines()[:SENSORS], mission.deadlines()[SENSORS:]]
+    assert all(sum(one.met for one in span) and sum(one.missed for one in span) for span in spans)
     the_same(mission, again)
     assert await journal.close(PATIENCE_S)
     store.close()
