@@ -152,7 +152,7 @@ class Scribe(LocalPilot):
 
 def missions(scenario: Scenario, seed: int) -> dict[str, Mission]:
     """The edge's mission for each of ``WAYS``, with the default settings."""
-    settings = Settings(llm_context=CONTEXT)
+    settings = Settings(llm_context=CONTEXT, llm_adapter="off")
     many = PromptStyle(experiences=EXPERIENCES)
 
     def made(name: str, **spec: Any) -> Mission:

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.long
 
 def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
     # The deadline is generous because this tests what is decided, not how fast the machine is.
-    with serving_edge(AICVDS_MODE="llm", AICVDS_DEADLINE_MS="30000") as (url, _):
+    with serving_edge(AICVDS_MODE="llm", AICVDS_LLM_ADAPTER="off", AICVDS_DEADLINE_MS="30000") as (url, _):
         flown = run(
             "simulate", "--edge", url, "--steps", "4", "--seed", "2", "--no-bound", "--out", str(tmp_path / "out")
         )

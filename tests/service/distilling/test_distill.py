@@ -34,6 +34,9 @@ from shared.scenario import SCENARIOS
 from simulator.flying.exploration import explore
 from tests.waiting import PATIENCE_S
 
+# Training takes a minute on idle cores.
+pytestmark = pytest.mark.timeout(900)
+
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 5})
 
 
