@@ -69,15 +69,15 @@ class Viewpoint:
     learned: bool = True
 
 
-class RowWriter(Protocol):
-    """Writes one row of the prompt."""
+class RowsWriter(Protocol):
+    """Writes the rows of the prompt."""
 
-    def __call__(self, letter: str, row: int, options: Sequence[int]) -> str:
-        """The text of a state's row.
+    def __call__(self, rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
+        """The text of a state's rows.
 
         Args:
-            letter: the row's first choice letter.
-            options: its velocity options, slowest first.
+            letters: each row's first choice letter.
+            options: each row's velocity options, slowest first.
         """
         ...
 
@@ -97,18 +97,16 @@ class CandidateSet:
     rows: str
 
     @classmethod
-    def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters, write: RowWriter) -> Self:
+    def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters, write: RowsWriter) -> Self:
         """The candidates for these rows of a state, in this order, as far as there are letters for them."""
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
-        text = []
-        for number, row in enumerate(shown[: letters.rows]):
-            options = velocity_options(reach, row, letters.velocities)
-            own = letters.of_row(number)
-            for letter, velocity in zip(own, options, strict=True):
+        rows = shown[: letters.rows]
+        options = [velocity_options(reach, row, letters.velocities) for row in rows]
+        for number, row in enumerate(rows):
+            for letter, velocity in zip(letters.of_row(number), options[number], strict=True):
                 labels[letter] = actions.setdefault(Action(int(state.ids[row]), velocity), len(actions))
-            text.append(write(own[0], row, options))
-        return cls(list(actions), labels, "".join(text))
+        return cls(list(actions), labels, write(rows, letters.first[: len(rows)], options))
 
     def with_velocities(self, velocity: Callable[[int, int], int]) -> CandidateSet:
         """The set with each action's velocity replaced by ``velocity(sensor, velocity)``; equal actions merge."""

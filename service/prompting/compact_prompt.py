@@ -13,7 +13,7 @@ does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -131,12 +131,15 @@ class CompactTemplate(GuidedTemplate):
         numbers = row_digits(state, reach, outlook, scenario)
         level = _NINE / scenario.max_velocity
 
-        def write(letter: str, row: int, options: Sequence[int]) -> str:
-            span = digits([level * options[0], level * options[-1]])
-            return "".join(map(str, (*numbers[row].tolist(), *span.tolist()))) + letter
+        def write(rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
+            spans = digits([(level * own[0], level * own[-1]) for own in options])
+            shown_digits = np.concatenate((numbers[list(rows)], spans.reshape(-1, 2)), axis=1).tolist()
+            text = f"{fleet_digits(state, outlook, view.step, scenario)}U"
+            return text + "".join(
+                "".join(map(str, row)) + letter for letter, row in zip(letters, shown_digits, strict=True)
+            )
 
-        chosen = CandidateSet.of(state, reach, shown, self.letters, write)
-        return replace(chosen, rows=f"{fleet_digits(state, outlook, view.step, scenario)}U{chosen.rows}")
+        return CandidateSet.of(state, reach, shown, self.letters, write)
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
         """None: the adapter is trained with shuffled rows, so it has no bias towards letters to be measured."""

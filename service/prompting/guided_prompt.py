@@ -88,16 +88,16 @@ class GuidedTemplate(Template):
 
     def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
         """The candidates for these rows of a state, in this order."""
-        lettered = shown[: self.letters.rows]
-        texts = dict(zip(lettered, cells(state, lettered), strict=True))
 
-        def write(letter: str, row: int, options: Sequence[int]) -> str:
-            # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
-            slowest, fastest = options[0], options[-1]
-            span = f"{slowest}-{fastest}" if 0 < slowest < fastest else str(fastest)
-            return f"{letter}{texts[row]['queue']},{texts[row]['age']},{span}\n"
+        def write(rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
+            text = ""
+            for letter, cell, own in zip(letters, cells(state, rows), options, strict=True):
+                # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
+                span = f"{own[0]}-{own[-1]}" if 0 < own[0] < own[-1] else own[-1]
+                text += f"{letter}{cell['queue']},{cell['age']},{span}\n"
+            return text
 
-        return CandidateSet.of(state, reach, lettered, self.letters, write)
+        return CandidateSet.of(state, reach, shown, self.letters, write)
 
     def choice_prompt(
         self, candidates: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()
