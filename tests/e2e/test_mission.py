@@ -42,3 +42,15 @@ def test_a_mission_flown_by_the_llm_and_asked_again(tmp_path: Path) -> None:
     assert replay["replayed"]["by_source"]["llm"] > 6
     assert replay["replayed"]["llm_new_tokens"] < 0.5 * replay["replayed"]["llm_prompt_tokens"]
     assert replay["replayed"]["cost_usd"] == 0
+
+
+def test_the_llm_with_its_adapter_decides_better_than_eof(tmp_path: Path) -> None:
+    settings = {"AICVDS_MODE": "llm", "AICVDS_VERIFY": "off", "AICVDS_DEADLINE_MS": "30000"}
+    with serving_edge(**settings) as (url, _):
+        options = ("--scenario", "paper", "--seed", "1", "--no-bound", "--out", str(tmp_path))
+        flown = run("simulate", "--edge", url, *options)
+    assert flown.returncode == 0, flown.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["by_source"]["llm"] == summary["decisions"] == 90
+    assert summary["model"].endswith("+adapter")
+    assert summary["lost_packets"]["aic_vds"] < summary["lost_packets"]["eof"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,8 +10,9 @@ from typing import Any, cast
 
 import pytest
 
-from service.config.settings import Settings
+from service.config.settings import SHIPPED_ADAPTER, Settings
 from service.llm.adapter import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+from service.llm.model_file import GGUF_NAME, GGUF_SHA256, sha256
 from service.llm.server import LlmServer
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.prompt import Template
@@ -62,3 +64,12 @@ def test_the_adapter_answers_only_the_prompt_that_it_was_trained_on(note: str | 
     assert server._bare(CompactTemplate(paper, rows=5, note=note).static) == {}
     assert server._bare(Template(paper, experiences=8, note=note).static) == off
     assert server._bare("Rewrite the note.") == off
+
+
+def test_the_adapter_that_ships_is_the_one_of_its_card() -> None:
+    check_adapter(SHIPPED_ADAPTER)
+    assert SHIPPED_ADAPTER.stat().st_size <= 12_000_000
+    card = json.loads(SHIPPED_ADAPTER.with_suffix(".json").read_text(encoding="utf-8"))
+    assert (card["adapter_sha256"], card["prompt_version"]) == (sha256(SHIPPED_ADAPTER), PROMPT_VERSION)
+    assert (card["base"], card["base_sha256"]) == (GGUF_NAME, GGUF_SHA256)
+    assert Settings().embedded_adapter == SHIPPED_ADAPTER

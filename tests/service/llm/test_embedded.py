@@ -1,7 +1,7 @@
 """The real embedded model: SmolLM2-135M out of the installed package, in this process, over its own HTTP server."""
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import httpx
@@ -24,17 +24,23 @@ def app() -> FastAPI:
     return create_app(Settings(mode="llm", llm_adapter="off", deadline_ms=60_000))
 
 
-@pytest.fixture(scope="module")
-def loaded(app: FastAPI) -> Iterator[httpx.Client]:
+@contextmanager
+def ready(app: FastAPI) -> Iterator[httpx.Client]:
     with ExitStack() as stack:
         patient = stack.enter_context(pytest.MonkeyPatch.context())
         for limit in ("server._PROBE_TIMEOUT_S", "probing._TOGETHER_TIMEOUT_S", "calibration._TIMEOUT_S"):
             patient.setattr(f"service.llm.{limit}", PATIENCE_S)
         url = stack.enter_context(serving(app))
         client = stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S))
-        ready = wait_for(client, "ready")
-        assert ready["constraint"] == "grammar"
-        assert "SmolLM2-135M" in ready["model"]
+        readiness = wait_for(client, "ready")
+        assert readiness["constraint"] == "grammar"
+        assert "SmolLM2-135M" in readiness["model"]
+        yield client
+
+
+@pytest.fixture(scope="module")
+def loaded(app: FastAPI) -> Iterator[httpx.Client]:
+    with ready(app) as client:
         yield client
 
 
@@ -120,6 +126,21 @@ def test_a_fleets_step_takes_one_call(loaded: httpx.Client, app: FastAPI, report
         measured(app)
     assert decisions[0]["guided"]["calibrated"]
     assert decisions[0]["tokens"]["cached"] > decisions[0]["tokens"]["static"]
+
+
+def test_the_adapters_prompt_is_short_and_little_of_it_is_read_anew(report: Report) -> None:
+    with ready(create_app(Settings(mode="llm", deadline_ms=60_000))) as edge:
+        read = []
+        for step in range(3):
+            body = report(mission_id="compact", step=step)
+            heard = {"queue": [52, 17, 33, 28, 60], "battery": [50.0] * 5, "channel_gain": [-90.0] * 5}
+            body["sensors"] |= {**heard, "last_seen": [step] * 5, "x": [420.0, 650.0, 300.0, 520.0, 610.0]}
+            answer = edge.post("/decide", json=body).json()
+            assert (answer["source"], answer["reason"]) == ("llm", None)
+            assert answer["tokens"]["completion"] == 1
+            read.append((answer["tokens"]["server_prompt"], answer["tokens"]["cached"]))
+    assert all(whole <= 130 for whole, _ in read), read
+    assert all(whole - cached <= 70 for whole, cached in read[1:]), read
 
 
 def calls(client: httpx.Client) -> float:
