@@ -84,7 +84,7 @@ def main() -> int:
         return int(found[0].load()(rest) or 0)
     except ModuleNotFoundError as missing:
         if f"{found[0].value.partition(':')[0]}.".startswith(f"{missing.name}."):
-            print(f"aicvds {name}: {_STALE}", file=sys.stderr)
+            print(f"aicvds {name}: {_STALE} (No module named '{missing.name}'.)", file=sys.stderr)
             return 2
         module = str(missing.name).partition(".")[0]
         # A module missing inside an installed package is a bug too, not a missing extra.

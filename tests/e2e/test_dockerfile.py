@@ -152,7 +152,7 @@ def test_every_file_that_is_copied_for_the_model_is_needed(tmp_path: Path) -> No
         (folder / left_out).unlink()
         ran = fetch_model(folder)
         module = left_out.removesuffix(".py").replace("/", ".")
-        assert ran.returncode == 1 and f"No module named '{module}'" in ran.stderr, ran.stdout + ran.stderr
+        assert ran.returncode != 0 and f"No module named '{module}'" in ran.stderr, ran.stdout + ran.stderr
 
 
 @pytest.mark.long
