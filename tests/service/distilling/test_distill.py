@@ -194,7 +194,8 @@ def test_a_request_without_the_adapter_is_answered_by_the_bare_model(changed: tu
         server = EmbeddedServer(embedded_model(Settings()), threads=1, context=512, adapter=adapter)
         said[name] = []
         try:
-            for fields in ({}, server.without_adapter, {}, server.without_adapter):
+            again = {"cache_prompt": False}
+            for fields in ({}, server.without_adapter, again, server.without_adapter):
                 body = {"messages": [{"role": "user", "content": "Say hello to Bob."}], "temperature": 0, **fields}
                 answer = httpx.post(
                     f"{server.base_url}/chat/completions",

@@ -61,9 +61,11 @@ def test_the_adapter_answers_only_the_prompt_that_it_was_trained_on(note: str | 
     off = {"lora": [{"id": 0, "scale": 0.0}]}
     server._embedded = cast(Any, SimpleNamespace(without_adapter=off))
     paper = SCENARIOS["paper"]
-    assert server._bare(CompactTemplate(paper, rows=5, note=note).static) == {}
+    compact = CompactTemplate(paper, rows=5, note=note).static
+    assert server._bare(compact) == {}
     assert server._bare(Template(paper, experiences=8, note=note).static) == off
     assert server._bare("Rewrite the note.") == off
+    assert [server._bare(compact) for _ in range(2)] == [{"cache_prompt": False}, {}]
 
 
 def test_the_adapter_that_ships_is_the_one_of_its_card() -> None:
