@@ -53,6 +53,8 @@ class EmbeddedServer:
         if adapter is not None:
             params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(adapter), 1.0)]
         self.without_adapter: dict[str, Any] = {} if adapter is None else {"lora": [{"id": 0, "scale": 0.0}]}
+        # Whether the newest request was without the adapter.
+        self._read_bare = False
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
         try:
@@ -62,6 +64,17 @@ class EmbeddedServer:
             raise LoadFailed(f"llama.cpp cannot load {files}: {error}") from error
         self.base_url = f"{self._server.listening_address}/v1"
         self.model = gguf.stem if adapter is None else f"{gguf.stem}+{adapter.stem}"
+
+    def fields_for(self, system: str, trained: str) -> dict[str, Any]:
+        """The fields of the next request: the adapter answers only prompts whose static block ends as ``trained``."""
+        if not self.without_adapter:
+            return {}
+        if not system.endswith(trained):
+            self._read_bare = True
+            return self.without_adapter
+        # llama.cpp would reuse what the bare model has read of the chat's first tokens.
+        again, self._read_bare = self._read_bare, False
+        return {"cache_prompt": False} if again else {}
 
     def close(self) -> None:
         """Stop the server and free the model; blocks until its threads have ended."""

@@ -94,8 +94,6 @@ class LlmServer:
         self._decisions = 0
         self._decided_at = -math.inf
         self._rewriting: asyncio.Task[Completion] | None = None
-        # Whether the embedded model's newest request was without its adapter.
-        self._read_bare = False
 
     @property
     def recovering(self) -> bool:
@@ -213,16 +211,7 @@ class LlmServer:
 
     def _bare(self, system: str) -> dict[str, Any]:
         """The fields without which the adapter would answer a prompt that it was not trained on."""
-        if self._embedded is None or not self._embedded.without_adapter:
-            return {}
-        if not system.endswith(self._warm_up.static):
-            self._read_bare = True
-            return self._embedded.without_adapter
-        if self._read_bare:
-            # llama.cpp would reuse what the bare model has read of the chat's first tokens.
-            self._read_bare = False
-            return {"cache_prompt": False}
-        return {}
+        return {} if self._embedded is None else self._embedded.fields_for(system, self._warm_up.static)
 
     async def _ask(self, body: dict[str, Any]) -> Completion:
         if self._client is None or self.status.llm != "ready":

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
 from service.config.settings import SHIPPED_ADAPTER, Settings
 from service.llm.adapter import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import GGUF_NAME, GGUF_SHA256, sha256
 from service.llm.server import LlmServer
 from service.prompting.compact_prompt import CompactTemplate
@@ -58,8 +57,10 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 def test_the_adapter_answers_only_the_prompt_that_it_was_trained_on(note: str | None, tmp_path: Path) -> None:
     settings = Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))
     server = LlmServer(settings, warm_up(settings))
+    embedded = EmbeddedServer.__new__(EmbeddedServer)
     off = {"lora": [{"id": 0, "scale": 0.0}]}
-    server._embedded = cast(Any, SimpleNamespace(without_adapter=off))
+    embedded.without_adapter, embedded._read_bare = off, False
+    server._embedded = embedded
     paper = SCENARIOS["paper"]
     compact = CompactTemplate(paper, rows=5, note=note).static
     assert server._bare(compact) == {}
