@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +55,8 @@ class EmbeddedServer:
         if adapter is not None:
             params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(adapter), 1.0)]
         self.without_adapter: dict[str, Any] = {} if adapter is None else {"lora": [{"id": 0, "scale": 0.0}]}
-        # Whether the newest request was without the adapter.
-        self._read_bare = False
+        # Requests without the adapter, and how many of them had begun when the adapter last read a whole prompt.
+        self._bare_requests = self._read_again_after = 0
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
         try:
@@ -65,16 +67,20 @@ class EmbeddedServer:
         self.base_url = f"{self._server.listening_address}/v1"
         self.model = gguf.stem if adapter is None else f"{gguf.stem}+{adapter.stem}"
 
-    def fields_for(self, system: str, trained: str) -> dict[str, Any]:
-        """The fields of the next request: the adapter answers only prompts whose static block ends as ``trained``."""
+    @contextmanager
+    def request(self, system: str, trained: str) -> Iterator[dict[str, Any]]:
+        """While a request runs, its fields: the adapter answers prompts whose static block ends as ``trained``."""
         if not self.without_adapter:
-            return {}
+            yield {}
+            return
         if not system.endswith(trained):
-            self._read_bare = True
-            return self.without_adapter
+            self._bare_requests += 1
+            yield self.without_adapter
+            return
         # llama.cpp would reuse what the bare model has read of the chat's first tokens.
-        again, self._read_bare = self._read_bare, False
-        return {"cache_prompt": False} if again else {}
+        bare = self._bare_requests
+        yield {} if bare == self._read_again_after else {"cache_prompt": False}
+        self._read_again_after = bare
 
     def close(self) -> None:
         """Stop the server and free the model; blocks until its threads have ended."""

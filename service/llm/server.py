@@ -133,8 +133,9 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities) | self._bare(system)
-        return await self._decide(body, self._silence)
+        return await self._decide(
+            chat_body(self.model, system, user, self.constraint, sensor_ids, velocities), self._silence
+        )
 
     async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
         """Call for one label of each list, with the likeliest tokens' probabilities where the server gives them.
@@ -142,7 +143,7 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = label_body(self.model, system, user, self.constraint, lists, self.logprobs) | self._bare(system)
+        body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
         # The silence of a call for several UAVs says nothing about calls for one.
         answer = await self._decide(body, self._silence if len(lists) == 1 else None)
         if self.constraint != "grammar" or len(lists) == 1:
@@ -160,7 +161,6 @@ class LlmServer:
             NoDecision: no answer, with the reason.
         """
         body = rewriting_body(self.model, wanted, wanted.constrain(self.constraint), temperature, seed)
-        body |= self._bare(wanted.instruction)
         for _ in range(_STEPS_BACK if self._embedded is not None else 0):
             await self._await_silence()
             self._rewriting = asyncio.create_task(self._ask(body), name="llm-rewriting")
@@ -209,15 +209,14 @@ class LlmServer:
             self._decisions -= 1
             self._decided_at = time.monotonic()
 
-    def _bare(self, system: str) -> dict[str, Any]:
-        """The fields without which the adapter would answer a prompt that it was not trained on."""
-        return {} if self._embedded is None else self._embedded.fields_for(system, self._warm_up.static)
-
     async def _ask(self, body: dict[str, Any]) -> Completion:
         if self._client is None or self.status.llm != "ready":
             raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
         try:
-            return replace(await self._client.complete(body), model=self.model)
+            if self._embedded is None:
+                return replace(await self._client.complete(body), model=self.model)
+            with self._embedded.request(body["messages"][0]["content"], self._warm_up.static) as fields:
+                return replace(await self._client.complete(body | fields), model=self.model)
         except Unreachable as gone:
             if self.status.llm == "ready":
                 self.status = ServerStatus("unavailable", str(gone))

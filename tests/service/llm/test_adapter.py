@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import struct
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from service.config.settings import SHIPPED_ADAPTER, Settings
 from service.llm.adapter import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+from service.llm.answers import Completion
+from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import GGUF_NAME, GGUF_SHA256, sha256
-from service.llm.server import LlmServer
+from service.llm.request_bodies import Rewriting
+from service.llm.server import LlmServer, ServerStatus
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.prompt import Template
 from service.prompting.warm_up import warm_up
 from shared.scenario import SCENARIOS
+from tests.waiting import soon
 
 
 def metadata(version: int, kind: int = 4) -> bytes:
@@ -53,20 +59,74 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         check_adapter(tmp_path / "adapter.gguf")
 
 
+OFF = {"lora": [{"id": 0, "scale": 0.0}]}
+READ_AGAIN = {"cache_prompt": False}
+
+
+def embedded_server() -> EmbeddedServer:
+    """An embedded server with an adapter, without its llama.cpp."""
+    server = EmbeddedServer.__new__(EmbeddedServer)
+    server.without_adapter, server._bare_requests, server._read_again_after = OFF, 0, 0
+    return server
+
+
 @pytest.mark.parametrize("note", [None, "visit sensor 2 every third step"])
 def test_the_adapter_answers_only_the_prompt_that_it_was_trained_on(note: str | None, tmp_path: Path) -> None:
-    settings = Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))
-    server = LlmServer(settings, warm_up(settings))
-    embedded = EmbeddedServer.__new__(EmbeddedServer)
-    off = {"lora": [{"id": 0, "scale": 0.0}]}
-    embedded.without_adapter, embedded._read_bare = off, False
-    server._embedded = embedded
+    server = embedded_server()
+    trained = warm_up(Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))).static
+
+    def fields(system: str) -> dict[str, Any]:
+        with server.request(system, trained) as sent:
+            return sent
+
     paper = SCENARIOS["paper"]
     compact = CompactTemplate(paper, rows=5, note=note).static
-    assert server._bare(compact) == {}
-    assert server._bare(Template(paper, experiences=8, note=note).static) == off
-    assert server._bare("Rewrite the note.") == off
-    assert [server._bare(compact) for _ in range(2)] == [{"cache_prompt": False}, {}]
+    assert fields(compact) == {}
+    assert fields(Template(paper, experiences=8, note=note).static) == OFF
+    assert fields("Rewrite the note.") == OFF
+    assert [fields(compact) for _ in range(2)] == [READ_AGAIN, {}]
+
+
+def test_a_prompt_is_read_again_until_one_is_answered_that_was_sent_after_the_bare_request() -> None:
+    server = embedded_server()
+    with server.request("trained", "trained") as sent:
+        assert sent == {}
+        with server.request("another", "trained"):
+            pass
+    with pytest.raises(TimeoutError), server.request("trained", "trained") as sent:
+        assert sent == READ_AGAIN
+        raise TimeoutError
+    for expected in (READ_AGAIN, {}):
+        with server.request("trained", "trained") as sent:
+            assert sent == expected
+
+
+async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    settings = Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))
+    warm = warm_up(settings)
+    sent: list[dict[str, Any]] = []
+
+    class Client:
+        async def complete(self, body: dict[str, Any]) -> Completion:
+            sent.append({key: body.get(key) for key in ("lora", "cache_prompt")})
+            if len(sent) == 1:
+                await asyncio.Event().wait()
+            return Completion("visit 0", None, None, None)
+
+    server = LlmServer(settings, warm)
+    server._embedded, server._client = embedded_server(), cast(LLMClient, Client())
+    server.status = ServerStatus("ready")
+    rewriting = Rewriting("Rewrite the note.", [], "note", lambda _: {})
+    note = asyncio.create_task(server.rewrite(rewriting, temperature=0.0, seed=0))
+    await soon(lambda: sent)
+    await server.ask(warm.static, "user", [0], 15)
+    await note
+    await server.ask(warm.static, "user", [0], 15)
+    bare, again = {"lora": OFF["lora"], "cache_prompt": None}, {"lora": None, "cache_prompt": False}
+    assert sent == [bare, again, bare, again]
 
 
 def test_the_adapter_that_ships_is_the_one_of_its_card() -> None:
