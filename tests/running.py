@@ -76,9 +76,11 @@ def listening(handler: Handler) -> Iterator[str]:
     loop = asyncio.new_event_loop()
     started = threading.Event()
     address: list[str] = []
+    transports: set[asyncio.WriteTransport] = set()
 
     async def run() -> None:
         async def connection(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            transports.add(writer.transport)
             try:
                 await handler(reader, writer)
             except (ConnectionError, asyncio.IncompleteReadError):
@@ -97,6 +99,10 @@ def listening(handler: Handler) -> Iterator[str]:
         for task in asyncio.all_tasks() - {asyncio.current_task()}:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+        for transport in transports:
+            # A closed transport whose peer has not read everything stays open, and warns in whichever test runs later.
+            transport.abort()
+        await asyncio.sleep(0)
 
     stop = asyncio.Event()
     thread = threading.Thread(target=lambda: loop.run_until_complete(until_stopped()), daemon=True)

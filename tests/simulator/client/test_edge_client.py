@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import asyncio
+import re
+import socket
+import struct
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -17,7 +20,7 @@ from simulator.client.lossy_transport import LossyTransport
 from simulator.client.observation_report import decide_request
 from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from simulator.world import PipelineWorld
-from tests.running import listening
+from tests.running import Handler, listening
 from tests.simulator.edge_stub import EdgeStub, stub_edge
 from tests.waiting import PATIENCE_S, Clock, Gate, soon, until
 
@@ -174,30 +177,45 @@ def test_garbage_is_no_traceback(stub: EdgeStub, request_: DecideRequest, client
             edge.decide(request_)
 
 
+async def _whole_request(reader: asyncio.StreamReader) -> None:
+    """Read the request and its body: a connection that is closed with a part unread is reset."""
+    headers = (await reader.readuntil(b"\r\n\r\n")).lower()
+    length = re.search(rb"content-length: (\d+)", headers)
+    await reader.readexactly(int(length[1]) if length else 0)
+
+
+async def _end(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    await _whole_request(reader)
+
+
 async def _reset(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    await reader.readuntil(b"\r\n\r\n")
+    await _whole_request(reader)
+    writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 async def _silence(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    await reader.readuntil(b"\r\n\r\n")
+    await _whole_request(reader)
     await reader.read()
 
 
 async def _redirect(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    await reader.readuntil(b"\r\n\r\n")
+    await _whole_request(reader)
     writer.write(b"HTTP/1.1 302 Found\r\nLocation: /login\r\nContent-Length: 0\r\n\r\n")
     await writer.drain()
 
 
 async def _broken_gzip(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    await reader.readuntil(b"\r\n\r\n")
+    await _whole_request(reader)
     writer.write(b"HTTP/1.1 200 OK\r\nContent-Encoding: gzip\r\nContent-Length: 4\r\n\r\nabcd")
     await writer.drain()
 
 
-def test_a_reset_edge_is_unreachable(request_: DecideRequest, client: Opened) -> None:
-    again = pytest.raises(EdgeUnreachable, match="tried 2 times: RemoteProtocolError")
-    with listening(_reset) as url, client(url, attempts=2) as edge, again:
+@pytest.mark.parametrize(("answer", "failure"), [(_end, "RemoteProtocolError"), (_reset, "ReadError")])
+def test_an_edge_that_ends_the_connection_is_unreachable(
+    request_: DecideRequest, client: Opened, answer: Handler, failure: str
+) -> None:
+    again = pytest.raises(EdgeUnreachable, match=f"tried 2 times: {failure}")
+    with listening(answer) as url, client(url, attempts=2) as edge, again:
         edge.decide(request_)
 
 
