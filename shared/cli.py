@@ -12,6 +12,7 @@ _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
     "doctor": "look for what keeps an edge from running here, and say what to type",
     "mission": "`mission create`: tell an edge your world, and print a request that works for it",
+    "world": "`world import` and `world export`: flight plans of QGroundControl to a world and back",
     "simulate": "fly one mission against an edge, local or remote, and write its report",
     "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
     "compare": "set two or more missions side by side: a table and the figures",

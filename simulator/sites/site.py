@@ -10,6 +10,8 @@ from shared.scenario import Scenario
 # The world takes a second to import, and pyproj a tenth: commands answer `--help` and bad use without them.
 if TYPE_CHECKING:
     from shared.channel import IntArray
+    from simulator.sites.fence import Fence
+    from simulator.sites.files.projection import Frame
     from simulator.world import Cost, PipelineWorld
     from simulator.world.gain_trace import GainTrace
 
@@ -22,11 +24,17 @@ class Site:
         arrivals: shape ``(at least T, J)``, packets that arrive in each step at each sensor; ``None`` for Poisson
             arrivals.
         gains: excess losses along the UAVs' ways, beside the scenario's.
+        frame: the place of the scenario's plane on the globe; ``None`` for a site that has none.
+        sensor_names: the sensors' IDs on the globe, ``()`` for a site that has none.
+        fences: areas that no UAV may leave or enter, metres in the scenario's plane.
     """
 
     scenario: Scenario
     arrivals: IntArray | None = None
     gains: GainTrace | None = None
+    frame: Frame | None = None
+    sensor_names: tuple[str, ...] = ()
+    fences: tuple[Fence, ...] = ()
 
     def world(self, cost: Cost = "default", render_mode: str | None = None) -> PipelineWorld:
         """A new world on this site."""

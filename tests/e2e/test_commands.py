@@ -41,6 +41,8 @@ FLOWN = {
     f"{BIN}aicvds compare runs/mission runs/eof": "",
     f"{BIN}aicvds compare runs/mission runs/pipeline_world": "",
     f"{BIN}aicvds mission create --edge {EDGE} --world examples/pipeline_world": "",
+    f"{BIN}aicvds world export examples/pipeline_world --plan runs/plans": "",
+    f"{BIN}aicvds world import runs/plans/*.plan --out runs/from_plans": "",
 }
 # The edge that the others are flown against is this one; the commands of "Authentication" have an edge of their own.
 SERVED = [

@@ -1,12 +1,56 @@
-"""From longitudes and latitudes to metres in a scenario's square area."""
+"""From longitudes and latitudes to metres in a scenario's square area, and back."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pyproj import Proj
 
 from shared.channel import FloatArray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The plane of a scenario on the globe: azimuthal equidistant (WGS 84), x metres east and y metres north.
+
+    Attributes:
+        longitude: of the projection's centre, degrees.
+        latitude: of the projection's centre, degrees.
+        centre: the scenario's x and y of that point.
+    """
+
+    longitude: float
+    latitude: float
+    centre: tuple[float, float]
+
+    def metres(self, degrees: ArrayLike) -> FloatArray:
+        """The x and y, ``(N, 2)`` metres, of longitudes and latitudes ``(N, 2)``."""
+        longitude, latitude = np.asarray(degrees, dtype=np.float64).reshape(-1, 2).T
+        return np.stack(_plane(self.longitude, self.latitude)(longitude, latitude), axis=-1) + self.centre
+
+    def degrees(self, metres: ArrayLike) -> FloatArray:
+        """The longitudes and latitudes, ``(N, 2)``, of points ``(N, 2)`` metres."""
+        x, y = (np.asarray(metres, dtype=np.float64).reshape(-1, 2) - self.centre).T
+        return np.stack(_plane(self.longitude, self.latitude)(x, y, inverse=True), axis=-1)
+
+
+@lru_cache(maxsize=8)
+def _plane(longitude: float, latitude: float) -> Proj:
+    return Proj(proj="aeqd", ellps="WGS84", units="m", lon_0=longitude, lat_0=latitude)
+
+
+def middle_of(degrees: ArrayLike) -> tuple[float, float]:
+    """The longitude and latitude of the mean of points ``(N, 2)`` as directions from the Earth's centre, degrees."""
+    longitude, latitude = np.asarray(degrees, dtype=np.float64).T
+    east, north = np.radians(longitude), np.radians(latitude)
+    x, y, z = np.mean((np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)), axis=1)
+    # Rounded, since the last bits of the mean depend on how it is summed.
+    lon_0 = round(float(np.degrees(np.arctan2(y, x))), 6)
+    lat_0 = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 6)
+    return lon_0, lat_0
 
 
 def to_metres(degrees: ArrayLike) -> FloatArray:
@@ -25,13 +69,7 @@ def to_metres(degrees: ArrayLike) -> FloatArray:
         with another version of the projection's library.
     """
     longitude, latitude = np.asarray(degrees, dtype=np.float64).T
-    east, north = np.radians(longitude), np.radians(latitude)
-    x, y, z = np.mean((np.cos(north) * np.cos(east), np.cos(north) * np.sin(east), np.sin(north)), axis=1)
-    # Rounded, since the last bits of the mean depend on how it is summed.
-    lon_0 = round(float(np.degrees(np.arctan2(y, x))), 6)
-    lat_0 = round(float(np.degrees(np.arctan2(z, np.hypot(x, y)))), 6)
-    plane = Proj(proj="aeqd", ellps="WGS84", units="m", lon_0=lon_0, lat_0=lat_0)
-    return np.round(np.stack(plane(longitude, latitude), axis=-1), 3)
+    return np.round(np.stack(_plane(*middle_of(degrees))(longitude, latitude), axis=-1), 3)
 
 
 def in_square(points: FloatArray) -> tuple[FloatArray, float]:

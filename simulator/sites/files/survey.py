@@ -1,4 +1,4 @@
-"""``world.geojson``: the sensors' sites, the UAVs' trajectories and the pipeline, as features on the globe."""
+"""``world.geojson``: the sensors' sites, the UAVs' trajectories, the pipeline and fences, as features on the globe."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from pydantic_core import ErrorDetails, from_json
 
 from shared.scenario import Point
 from simulator.errors import UsageError
+from simulator.sites.fence import Fence, FenceRole
 from simulator.sites.files.reading import quoted, text_of
 
 MAX_BYTES = 20_000_000
-MAX_SENSORS, MAX_TRAJECTORIES, MAX_WAYPOINTS = 10_000, 100, 1000
-ROLES = '"sensor", "trajectory" or "pipeline"'
+MAX_SENSORS, MAX_TRAJECTORIES, MAX_WAYPOINTS, MAX_FENCES = 10_000, 100, 1000, 100
+MAX_RADIUS_M = 1e6
+ROLES = '"sensor", "trajectory", "pipeline", "fence" or "no_fly"'
 # RFC 7946 has no `crs` member; older programs still write one, which is valid if it names WGS 84.
 _WGS84 = {"urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "urn:ogc:def:crs:EPSG::4326", "EPSG:4326"}
 
@@ -36,7 +38,7 @@ def _on_earth(position: list[float]) -> list[float]:
 
 def _ring(rings: list[list[list[float]]]) -> list[list[list[float]]]:
     if len(rings) != 1:
-        raise ValueError(f"the Polygon has {len(rings)} rings; a trajectory is one ring, without holes")
+        raise ValueError(f"the Polygon has {len(rings)} rings; give one ring, without holes")
     if len(rings[0]) < 4 or rings[0][0] != rings[0][-1]:
         raise ValueError(
             "the Polygon's ring is not closed; its first position comes again at the end, at least four in all"
@@ -71,9 +73,10 @@ _Name = Annotated[str, Field(min_length=1, max_length=64)] | int | None
 
 
 class _Properties(_Member):
-    role: Literal["sensor", "trajectory", "pipeline"]
+    role: Literal["sensor", "trajectory", "pipeline", "fence", "no_fly"]
     id: _Name = None
     name: _Name = None
+    radius_m: float | None = Field(None, gt=0, le=MAX_RADIUS_M)
 
 
 class _Feature(_Member):
@@ -105,19 +108,21 @@ class Survey:
         trajectories: waypoints by the feature's label, such as ``features[3] ('north')``; the last waypoint of a ring
             equals the first.
         pipeline: a polyline, or empty.
+        fences: fence by the feature's label; the radius of a circle is in metres.
     """
 
     sensors: dict[str, Point] = field(default_factory=dict)
     trajectories: dict[str, list[Point]] = field(default_factory=dict)
     pipeline: list[Point] = field(default_factory=list)
+    fences: dict[str, Fence] = field(default_factory=dict)
 
 
 def read_survey(path: Path) -> Survey:
     """The features of a GeoJSON file (RFC 7946), by their property ``role``.
 
     Raises:
-        UsageError: the file cannot be read, is no valid GeoJSON, or lacks sensors or trajectories; the text names the
-            line, or the feature by its index from 0 and its ID.
+        UsageError: the file cannot be read, or is no valid GeoJSON; the text names the line, or the feature by its
+            index from 0 and its ID.
     """
     survey = Survey()
     for label, feature in _features(path):
@@ -125,13 +130,17 @@ def read_survey(path: Path) -> Survey:
             _add(survey, label, feature)
         except ValueError as error:
             raise UsageError(f"{path}, {label}: {error}") from None
+    return survey
+
+
+def check_complete(path: Path, survey: Survey) -> None:
+    """Raises ``UsageError`` for a survey without sensors or trajectories."""
     for found, role, geometry in (
         (survey.sensors, "sensor", "Point"),
         (survey.trajectories, "trajectory", "LineString or Polygon"),
     ):
         if not found:
             raise UsageError(f'{path} has no {role}: give a {geometry} the property "role": "{role}"')
-    return survey
 
 
 def _features(path: Path) -> Iterator[tuple[str, _Feature]]:
@@ -217,9 +226,23 @@ def _add(survey: Survey, label: str, feature: _Feature) -> None:
         if len(survey.trajectories) == MAX_TRAJECTORIES:
             raise ValueError(f"a world has at most {MAX_TRAJECTORIES} trajectories")
         survey.trajectories[label] = feature.line
-    else:
+    elif role == "pipeline":
         if geometry != "LineString":
             raise ValueError(f"the pipeline is a LineString, not a {geometry}")
         if survey.pipeline:
             raise ValueError("the pipeline comes twice; join its parts to one LineString")
         survey.pipeline = feature.line
+    else:
+        survey.fences[label] = _fence(survey, role, feature)
+
+
+def _fence(survey: Survey, role: FenceRole, feature: _Feature) -> Fence:
+    """The fence of a feature; raises ``ValueError`` for a geometry that is no area, or for one fence too many."""
+    geometry, radius = feature.geometry.type, feature.properties.radius_m
+    if geometry == "LineString" or (geometry == "Point") != (radius is not None):
+        raise ValueError(f"a {role} is a Polygon, or a Point with the property radius_m")
+    if role == "fence" and any(fence.role == "fence" for fence in survey.fences.values()):
+        raise ValueError("the fence comes twice; autopilots differ in what two mean, so draw one Polygon around both")
+    if len(survey.fences) == MAX_FENCES:
+        raise ValueError(f"a world has at most {MAX_FENCES} fences")
+    return Fence(role, tuple(feature.line), radius or 0.0)

@@ -7,6 +7,8 @@
 | ``sensor`` | Point; property ``id`` or ``name`` | a site; sensor j is the j-th in the file |
 | ``trajectory`` | LineString: there and back; closed LineString or Polygon: laps, in the order drawn | UAV i's route |
 | ``pipeline`` (at most one) | LineString | the line in pictures |
+| ``fence`` (at most one) | Polygon, or Point with ``radius_m`` | an area that no trajectory may leave |
+| ``no_fly`` | Polygon, or Point with ``radius_m`` | an area that no trajectory may enter |
 
 ``scenario.toml`` (optional): any field of :class:`shared.scenario.Scenario` that does not follow from the features,
 such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are those of scenario ``paper``.
@@ -33,11 +35,12 @@ from shared.channel import FloatArray, link_holds
 from shared.scenario import Point, Scenario
 from shared.trajectory import trajectories
 from simulator.errors import UsageError
+from simulator.sites.fence import Fence
 from simulator.sites.files.gains import read_gains
 from simulator.sites.files.overrides import read_overrides
-from simulator.sites.files.projection import in_square, to_metres
+from simulator.sites.files.projection import Frame, in_square, middle_of, to_metres
 from simulator.sites.files.reading import quoted
-from simulator.sites.files.survey import Survey, read_survey
+from simulator.sites.files.survey import Survey, check_complete, read_survey
 from simulator.sites.files.trace import read_trace
 from simulator.sites.site import Site
 
@@ -65,8 +68,10 @@ def site_from_folder(
     if not folder.is_dir():
         raise UsageError(f"--world {folder} is no folder; name one that contains {FEATURES}")
     survey = read_survey(folder / FEATURES)
+    check_complete(folder / FEATURES, survey)
     overrides = read_overrides(folder / OVERRIDES)
-    derived = _placed(survey, folder / FEATURES) | ({} if steps is None else {"steps": steps})
+    placed, frame = _placed(survey, folder / FEATURES)
+    derived = placed | ({} if steps is None else {"steps": steps})
     if "name" not in overrides.values:
         derived["name"] = _fit_name(folder.resolve().name)
     scenario = overrides.scenario(derived)
@@ -76,6 +81,9 @@ def site_from_folder(
         scenario,
         _arrivals(folder / ARRIVALS, scenario, names),
         read_gains(gains, names, lengths_m) if gains.exists() else None,
+        frame,
+        tuple(names),
+        _fences(survey, folder / FEATURES, frame, scenario),
     )
     far = [name for name, near in zip(survey.sensors, _in_reach(scenario), strict=True) if not near]
     if far:
@@ -87,10 +95,11 @@ def site_from_folder(
     return site
 
 
-def _placed(survey: Survey, path: Path) -> dict[str, object]:
-    """The fields of a scenario that follow from the features."""
+def _placed(survey: Survey, path: Path) -> tuple[dict[str, object], Frame]:
+    """The fields of a scenario that follow from the features, and the place of its plane on the globe."""
     lines = [list(survey.sensors.values()), *survey.trajectories.values(), survey.pipeline]
-    metres = to_metres([point for line in lines for point in line])
+    degrees = [point for line in lines for point in line]
+    metres = to_metres(degrees)
     across = float(np.ptp(metres, axis=0).max()) if np.isfinite(metres).all() else np.inf
     if across > MAX_AREA_M:
         how_far = f"{across / 1000:,.0f} km across" if np.isfinite(across) else "spread around the Earth"
@@ -98,7 +107,10 @@ def _placed(survey: Survey, path: Path) -> dict[str, object]:
             f"{path}: the features are {how_far}, at most {MAX_AREA_M / 1000:,.0f} km fit; look for a swapped or "
             f"mistyped coordinate"
         )
+    projected = metres[0]
     metres, side = in_square(metres)
+    x, y = (metres[0] - projected).tolist()
+    frame = Frame(*middle_of(degrees), (x, y))
     ends = np.cumsum([len(line) for line in lines])[:-1]
     sites, *routes, pipeline = (_points(part) for part in np.split(metres, ends))
     for label, route in zip(survey.trajectories, routes, strict=True):
@@ -112,7 +124,21 @@ def _placed(survey: Survey, path: Path) -> dict[str, object]:
         "sites": sites,
         "routes": tuple(routes),
         "pipeline": pipeline,
-    }
+    }, frame
+
+
+def _fences(survey: Survey, path: Path, frame: Frame, scenario: Scenario) -> tuple[Fence, ...]:
+    """The fences in the scenario's plane; raises ``UsageError`` for a trajectory that breaks one."""
+    fences = []
+    for label, drawn in survey.fences.items():
+        fence = Fence(drawn.role, _points(frame.metres(drawn.points)), drawn.radius)
+        for of, route in zip(survey.trajectories, scenario.routes, strict=True):
+            broken = fence.first_breach(route)
+            if broken is not None:
+                does = "leaves the fence" if fence.role == "fence" else "enters the no_fly area"
+                raise UsageError(f"{path}, {of}: it {does} {label} at waypoint {broken}; move the one or the other")
+        fences.append(fence)
+    return tuple(fences)
 
 
 def _in_reach(scenario: Scenario) -> Iterator[bool]:
