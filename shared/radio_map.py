@@ -71,6 +71,25 @@ KINDS = (
     Shadowing(sensor=0.4, place=0.2, range_m=60.0),
     Shadowing(sensor=0.05, place=0.05, range_m=60.0),
 )
+# The kinds' shares, as columns for arrays (kinds, n, kept, kept), and their ranges, each once.
+_SENSOR_SHARES = np.array([kind.sensor for kind in KINDS])[:, None, None, None]
+_PLACE_SHARES = np.array([kind.place for kind in KINDS])[:, None, None, None]
+_FADINGS = np.array([kind.fading for kind in KINDS])[:, None, None]
+_RANGES_M, _RANGE_OF_KIND = np.unique([kind.range_m for kind in KINDS], return_inverse=True)
+_RANGES_M = _RANGES_M[:, None, None, None]
+
+# A packed symmetric matrix has its upper triangle column by column, so that a leading block of it comes first. By row
+# and column, the place in it.
+_ROWS, _COLUMNS = np.tril_indices(_MOST_OF_ONE)[::-1]
+_PLACE_IN_PACKED = np.zeros((_MOST_OF_ONE, _MOST_OF_ONE), dtype=np.int64)
+_PLACE_IN_PACKED[_ROWS, _COLUMNS] = _PLACE_IN_PACKED[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
+
+
+def _packed(matrices: FloatArray) -> FloatArray:
+    """Symmetric matrices ``(n, k, k)`` in half the memory, ``(n, k (k + 1) / 2)``."""
+    size = matrices.shape[1]
+    few = size * (size + 1) // 2
+    return np.asarray(matrices[:, _ROWS[:few], _COLUMNS[:few]])
 
 
 class RadioMap:
@@ -110,7 +129,7 @@ class RadioMap:
         self._compared = _COMPARE_FIRST
         self.exact = True
         self.offset_db, self.deviation_db = 0.0, _PRIOR_DB
-        # By sensor, K^-1, K^-1 r and K^-1 1. None until a gain differs from the formula.
+        # By sensor, K^-1 as :func:`_packed` has it, K^-1 r and K^-1 1. None until a gain differs from the formula.
         self._inverse: FloatArray | None = None
         self._measured: FloatArray = np.zeros((sensors, kept))
         self._ones: FloatArray = np.zeros((sensors, kept))
@@ -191,7 +210,8 @@ class RadioMap:
         covariance *= (np.arange(kept) < self.count[which, None])[:, None]
         left = self._measured[which, :kept] - offset * self._ones[which, :kept]
         mean = offset + np.matmul(covariance, left[..., None])[..., 0]
-        known = (covariance @ self._inverse[which, :kept, :kept] * covariance).sum(axis=2)
+        inverse = self._inverse[which][:, _PLACE_IN_PACKED[:kept, :kept]]
+        known = (covariance @ inverse * covariance).sum(axis=2)
         # The fading is part of a link's variance, since it differs in the next step.
         share = np.maximum(1.0 - known, self.kind.fading)
         return mean.T, deviation * np.sqrt(share).T
@@ -203,13 +223,14 @@ class RadioMap:
         a restored map is the same to the bit.
         """
         if self._inverse is None:
-            self._inverse = np.zeros((*self.excess.shape, self.excess.shape[1]))
+            most = self.excess.shape[1]
+            self._inverse = np.zeros((len(self.excess), most * (most + 1) // 2))
         sizes = np.minimum(-(-self.count[ids] // _SIZE) * _SIZE, self.excess.shape[1])
         for size in np.unique(sizes[sizes > 0]).tolist():
             some = ids[sizes == size]
             used = (np.arange(size) < self.count[some, None]).astype(np.float64)
-            inverse = np.linalg.inv(self._covariances(some, size))
-            self._inverse[some, :size, :size] = inverse
+            inverse: FloatArray = np.linalg.inv(self._covariances(some, size))
+            self._inverse[some, : size * (size + 1) // 2] = _packed(inverse)
             both = np.stack((self.excess[some, :size] * used, used), axis=2)
             solved = inverse @ both
             self._measured[some, :size], self._ones[some, :size] = solved[..., 0], solved[..., 1]
@@ -221,25 +242,45 @@ class RadioMap:
     def _covariances(self, ids: IntArray, kept: int) -> FloatArray:
         """``K``, ``(n, kept, kept)``; the rows without a measurement are the identity's."""
         used = np.arange(kept) < self.count[ids, None]
-        at = self.places[ids, :kept]
-        east, north = (at[:, :, None, axis] - at[:, None, :, axis] for axis in (0, 1))
-        matrix = self.kind.covariance(np.sqrt(east * east + north * north)) * (used[:, :, None] & used[:, None, :])
+        matrix = self.kind.covariance(self._apart(ids, kept)) * (used[:, :, None] & used[:, None, :])
         diagonal = 1.0 + self.kind.fading * (self.noise[ids, :kept] - 1.0)
         matrix[:, np.arange(kept), np.arange(kept)] = np.where(used, diagonal, 1.0)
         return np.asarray(matrix)
 
+    def _apart(self, ids: IntArray, kept: int) -> FloatArray:
+        """Distances between the places of each sensor's measurements, ``(n, kept, kept)``, metres."""
+        at = self.places[ids, :kept]
+        east, north = (at[:, :, None, axis] - at[:, None, :, axis] for axis in (0, 1))
+        return np.asarray(np.sqrt(east * east + north * north))
+
     def _compare(self) -> None:
         """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
         every = np.flatnonzero(self.count)
-        kept = int(self.count.max())
-        likelihoods = []
-        for kind in KINDS:
-            self.kind = kind
-            self._factor(every)
-            spread = float(np.linalg.slogdet(self._covariances(every, kept))[1].sum())
-            likelihoods.append(-float(self.count.sum()) * np.log(self.deviation_db) - 0.5 * spread)
-        self.kind = KINDS[int(np.argmax(likelihoods))]
+        self.kind = KINDS[int(np.argmax(self._likelihoods(every)))]
         self._factor(every)
+
+    def _likelihoods(self, ids: IntArray) -> FloatArray:
+        """The log marginal likelihood of these sensors' measurements by each of the kinds, without a constant.
+
+        One array has all kinds' matrices: thirteen times as many small operations would take several times as long.
+        """
+        kept = int(self.count.max())
+        used = np.arange(kept) < self.count[ids, None]
+        both_used, apart = used[:, :, None] & used[:, None, :], self._apart(ids, kept)
+        noise, places = self.noise[ids, :kept] - 1.0, np.arange(kept)
+        # (kinds, n, kept, kept)
+        matrices = _SENSOR_SHARES + _PLACE_SHARES * np.exp(-apart / _RANGES_M)[_RANGE_OF_KIND]
+        matrices *= both_used
+        matrices[..., places, places] = np.where(used, 1.0 + _FADINGS * noise, 1.0)
+        excess = self.excess[ids, :kept] * used
+        solved = np.linalg.solve(matrices, np.stack((excess, used.astype(np.float64)), axis=2))
+        measured, ones = solved[..., 0], solved[..., 1]
+        offset = measured.sum(axis=(1, 2)) / (ones.sum(axis=(1, 2)) + _OFFSET_WEIGHT)
+        squares = (excess - offset[:, None, None]) * (measured - offset[:, None, None] * ones)
+        count = float(self.count.sum())
+        total = _PRIOR_WEIGHT * _PRIOR_DB**2 + np.maximum((squares * used).sum(axis=(1, 2)), 0.0)
+        spread = np.linalg.slogdet(matrices)[1].sum(axis=1)
+        return np.asarray(-0.5 * count * np.log(total / (_PRIOR_WEIGHT + count)) - 0.5 * spread)
 
     def state_dict(self) -> dict[str, Any]:
         """The measurements, as copies; the rest follows from them."""

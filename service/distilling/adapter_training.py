@@ -56,6 +56,9 @@ class Student:
                 self.model: Any = get_peft_model(base, config)
             else:
                 self.model = PeftModel.from_pretrained(base, begin, is_trainable=True)
+        if device == "cpu":
+            # torch's fused attention takes a quarter of a step on a CPU: its backward pass is slow for short prompts.
+            self.model.base_model.model.set_attn_implementation("eager")
         self.model.to(device)
         self._device = torch.device(device)
         self._letter_ids: Any = self._tokenizer.convert_tokens_to_ids(list(LETTERS))
