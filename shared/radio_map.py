@@ -229,7 +229,7 @@ class RadioMap:
         for size in np.unique(sizes[sizes > 0]).tolist():
             some = ids[sizes == size]
             used = (np.arange(size) < self.count[some, None]).astype(np.float64)
-            inverse: FloatArray = np.linalg.inv(self._covariances(some, size))
+            inverse = np.asarray(np.linalg.inv(self._covariances(some, size)), dtype=np.float64)
             self._inverse[some, : size * (size + 1) // 2] = _packed(inverse)
             both = np.stack((self.excess[some, :size] * used, used), axis=2)
             solved = inverse @ both
