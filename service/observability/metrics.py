@@ -40,7 +40,9 @@ class Metrics:
             buckets=_OVERHEAD_BUCKETS,
         )
         self._add_llm()
-        self.tokens_saved = Counter("aicvds_tokens_saved", "Prompt tokens saved by attention and masks", registry=r)
+        self.tokens_saved = Counter(
+            "aicvds_tokens_saved", "Prompt tokens saved by attention, masks and short rows", registry=r
+        )
         self._add_outcomes()
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)
         self.tasks = Gauge("aicvds_tasks", "Tasks of the event loop", registry=r)

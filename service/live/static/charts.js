@@ -34,9 +34,9 @@ const CHARTS = {
   },
   tokens: {
     unit: "tokens",
-    series: [["without attention", "--c2", [6, 4]], ["prompt", "--c1", []]],
+    series: [["every sensor", "--c2", [6, 4]], ["prompt", "--c1", []]],
     rows: (steps) => [steps.map(([, s]) => s.uncompressed / s.count), steps.map(([, s]) => s.prompt / s.count)],
-    text: ([full, prompt]) => `Tokens a decision: ${shown(prompt.at(-1), 0)} in the last step's prompts, ${shown(full.at(-1), 0)} without attention and masks.`,
+    text: ([full, prompt]) => `Tokens a decision: ${shown(prompt.at(-1), 0)} in the last step's prompts, ${shown(full.at(-1), 0)} with full rows of every sensor.`,
   },
 };
 

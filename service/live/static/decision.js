@@ -58,7 +58,7 @@ function times(decision) {
 function tokens(answer) {
   const t = answer.tokens;
   const rows = [["prompt", `${t.prompt}: ${t.static} static, ${t.experiences} experiences, ${t.state} state`],
-    ["without attention and masks", String(t.uncompressed)], ["saved", String(t.saved)], ["counted with", t.tokenizer]];
+    ["with full rows of every sensor", String(t.uncompressed)], ["saved", String(t.saved)], ["counted with", t.tokenizer]];
   if (t.server_prompt !== null) rows.push(["by the LLM's own count", `${t.server_prompt}, of which ${t.cached ?? 0} cached; ${t.completion ?? 0} answered`]);
   if (t.cost_usd) rows.push(["price", `$${t.cost_usd.toPrecision(3)}`]);
   return make("section", {}, make("h3", {}, "Tokens"), pairs(rows));
