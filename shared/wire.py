@@ -234,9 +234,9 @@ class Tokens(Wire):
     """Token accounting of one decision.
 
     The edge counts ``static``, ``experiences``, ``state`` and their sum ``prompt`` with ``tokenizer``.
-    ``state_uncompressed`` is the state block with a full row for every reported sensor, ``uncompressed`` the whole prompt
-    with that block, and ``saved`` the difference. ``completion``, ``cached`` and ``server_prompt`` come from the LLM
-    server's ``usage``, in the model's own tokens, chat template included; ``null`` without one.
+    ``state_uncompressed`` is the state block with a full row for every reported sensor, ``uncompressed`` the whole
+    prompt with that block, and ``saved`` the difference. ``completion``, ``cached`` and ``server_prompt`` come from
+    the LLM server's ``usage``, in the model's own tokens, chat template included; ``null`` without one.
     """
 
     tokenizer: str

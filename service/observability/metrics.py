@@ -41,7 +41,7 @@ class Metrics:
         )
         self._add_llm()
         self.tokens_saved = Counter(
-            "aicvds_tokens_saved", "Prompt tokens saved by attention, masks and short rows", registry=r
+            "aicvds_tokens_saved", "Tokens saved by attention, masks and short rows", registry=r
         )
         self._add_outcomes()
         self.deadline_missed = Counter("aicvds_deadline_missed", "Decisions answered past their deadline", registry=r)

@@ -38,8 +38,8 @@ def show(summary: Summary, console: Console) -> None:
     if summary.llm_asked and tokens.prompt_mean is not None:
         cached = "" if tokens.cached_pct is None else f"; {tokens.cached_pct:.0f} % read from the LLM's prefix cache"
         console.print(
-            f"Prompt: {tokens.prompt_mean:.0f} tokens a decision, {tokens.uncompressed_mean:.0f} with full rows of every "
-            f"sensor; the state block has {tokens.state_mean:.0f}, instead of "
+            f"Prompt: {tokens.prompt_mean:.0f} tokens a decision, {tokens.uncompressed_mean:.0f} with full rows of "
+            f"every sensor; the state block has {tokens.state_mean:.0f}, instead of "
             f"{tokens.state_uncompressed_mean:.0f}{cached}",
             soft_wrap=True,
         )
