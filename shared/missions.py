@@ -88,6 +88,11 @@ class MissionStatus(Wire):
         exclude_if=lambda value: value is None,
         description="the orders to visit sensors, ended ones first, at most 100 of these; omitted where none was given",
     )
+    readings: int | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="sensors' own readings that changed the belief; omitted where there was none",
+    )
 
 
 class WeightArray(Wire):

@@ -98,6 +98,37 @@ class Records:
         self._arrivals, self._exposure = state["arrivals"], state["exposure"]
 
 
+def take_readings(
+    ids: NDArray[np.int64],
+    steps: NDArray[np.int64],
+    queue: FloatArray,
+    battery: FloatArray,
+    records: Records,
+    belief: FleetBelief,
+) -> NDArray[np.bool_]:
+    """Add readings that sensors sent by another network to their records and to the belief; returns which are news.
+
+    A reading is news if it is newer than the sensor's last beacon, reading and visit: the belief has taken a visit's
+    packets from an older queue.
+
+    Args:
+        ids: shape ``(n,)``, each sensor once.
+        steps: shape ``(n,)``, negative before the mission's first step.
+        queue: shape ``(n,)``, packets at the start of that step.
+        battery: shape ``(n,)``, joules; NaN where the reading does not tell.
+    """
+    latest = np.maximum(belief.heard[ids], belief.visited[ids])
+    since = belief.since[ids]
+    before = steps < 0
+    news = np.where(before, (latest < 0) & ((since >= 0) | (steps > since)), steps > latest)
+    battery = np.where(np.isnan(battery), belief.battery[ids], battery)
+    first, now = news & before, news & ~before
+    belief.begin(ids[first], steps[first], queue[first], battery[first])
+    belief.hear(ids[now], belief.places[ids[now]], steps[now], queue[now], battery[now])
+    records.hear(ids[now], steps[now], queue[now])
+    return np.asarray(news)
+
+
 def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
     """Add a UAV's full report to the sensors' records and to the belief; returns what its gains show."""
     ids = np.asarray(uav.sensors.id)

@@ -22,8 +22,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 log = logging.getLogger(__name__)
 
-# `decide`: request decisions, report outcomes, read. `admin`: make, guide and delete missions.
-Scope = Literal["decide", "admin"]
+# `decide`: request decisions, report outcomes, read. `admin`: make, guide and delete missions. `readings`: report what
+# sensors say of themselves.
+Scope = Literal["decide", "admin", "readings"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 _PREFIX = "aicvds_"

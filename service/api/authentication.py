@@ -22,6 +22,7 @@ _OPEN = frozenset(("/healthz", "/readyz", "/"))
 # The page's scripts and styles; the page requests its data with a key.
 _OPEN_PREFIX = "/static/"
 _ATTENTION = re.compile(r"/missions/[^/]+/attention")
+_READINGS = re.compile(r"/missions/[^/]+/readings")
 # The ASGI scope's entry with the scopes of the request's key.
 SCOPES = "aicvds.scopes"
 # The ASGI scope's entry for streams: a function that returns whether the key is still known.
@@ -33,6 +34,8 @@ def scope_of(method: str, path: str) -> Scope | None:
     if method in READING:
         # UAVs that prune their reports need the weights, so the scope `decide` is required.
         return "decide" if _ATTENTION.fullmatch(path) else None
+    if _READINGS.fullmatch(path):
+        return "readings"
     return "admin" if path.startswith("/missions") else "decide"
 
 

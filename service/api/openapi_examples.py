@@ -154,6 +154,23 @@ REQUESTS: dict[tuple[str, str], dict[str, Example]] = {
         "reject": {"summary": "It is not", "value": {"answer": "reject"}},
         "note": {"summary": "A new note: read by the LLM, and obeyed once it is confirmed", "value": {"note": NOTE}},
     },
+    ("post", "/missions/{mission_id}/readings"): {
+        "uplink": {
+            "summary": "A sensor's uplink of 12 s ago, and the message that brought it",
+            "value": {
+                "readings": [{"sensor_id": 3, "queue": 17.0, "battery": 41.5, "age_s": 12.0, "message_id": "a7-1834"}]
+            },
+        },
+        "step": {
+            "summary": "Two sensors' queues at the start of step 7",
+            "value": {
+                "readings": [
+                    {"sensor_id": 3, "queue": 17.0, "step": 7},
+                    {"sensor_id": 8, "queue": 0.0, "step": 7},
+                ]
+            },
+        },
+    },
 }
 
 # Of the answers that are no problem; 200 all of them.
@@ -174,6 +191,7 @@ ANSWERS: dict[tuple[str, str], Any] = {
     ("get", "/missions/{mission_id}/attention"): ATTENTION,
     ("get", "/missions/{mission_id}/guidance"): GUIDANCE,
     ("post", "/missions/{mission_id}/guidance"): GUIDANCE,
+    ("post", "/missions/{mission_id}/readings"): {"results": ["merged"], "step": 7},
     ("get", "/healthz"): {"status": "ok"},
     ("get", "/readyz"): {
         "ready": True,

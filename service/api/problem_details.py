@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 from service.errors import Refused, Unavailable
 from shared.faults import problem_of
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
+from shared.readings import ReadingsRequest, SensorReading
 from shared.scenario import Scenario
 from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Problem, PromptStyle, SensorColumns
 
@@ -29,6 +30,7 @@ _MOST_NAME = 80
 _REQUESTS = (
     *(BatchRequest, DecideRequest, FeedbackRequest, SensorColumns),
     *(MissionSpec, PromptStyle, Scenario, GuidanceAnswer, Guidance, SensorWish),
+    *(ReadingsRequest, SensorReading),
 )
 # The names of all fields that a request may have: one of them may be meant by a name that is none.
 _NAMES = sorted({name for model in _REQUESTS for name in model.model_fields})

@@ -17,6 +17,7 @@ from service.llm.server_pool import ServerPool
 from service.observability.metrics import Metrics
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionAttention, MissionStatus
+from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.wire import (
     BatchRequest,
     BatchResponse,
@@ -144,6 +145,14 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     engine.live.changed(mission_id)
     await engine.durable("answer")
     return mission.guidance.report(mission_id)
+
+
+@router.post(
+    "/missions/{mission_id}/readings", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["missions"]
+)
+async def post_readings(mission_id: MissionId, body: ReadingsRequest, engine: TheEngine) -> ReadingsResponse:
+    """What sensors said of themselves over another network: merged into the fleet's belief, by its age."""
+    return await engine.read(mission_id, body)
 
 
 @router.get("/healthz", tags=["operation"])

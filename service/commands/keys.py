@@ -27,7 +27,8 @@ class Add:
     file: Path
     """The file of keys, made if missing; AICVDS_KEYS names it to the edge, which notices changes within a second."""
     scopes: tuple[Scope, ...] = ("decide",)
-    """decide: request decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both."""
+    """decide: request decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both.
+    readings: report what sensors say of themselves over another network."""
     per_minute: int = 6000
     """Requests a minute; more are refused with 429 and Retry-After."""
 

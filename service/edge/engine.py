@@ -30,6 +30,7 @@ from service.observability.tracing import Traces
 from service.prompting.token_accounting import TokenCounter, with_usage
 from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
+from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.reasons import Reason
 from shared.wire import (
     BatchRequest,
@@ -143,6 +144,25 @@ class Engine:
         finally:
             asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
         return FeedbackResponse(decision_id=request.decision_id, result=result)
+
+    async def read(self, mission_id: str, request: ReadingsRequest) -> ReadingsResponse:
+        """Merge sensors' own readings; what is acknowledged as merged is on disk.
+
+        Raises:
+            NotFound: there is no such mission.
+            Refused: as :meth:`Readings.placed`; nothing is recorded.
+            Unavailable: the store fails, or is slow; the client is to send the readings again.
+        """
+        mission = await self.missions.get(mission_id)
+        self.missions.refuse_if_failing("readings")
+        results = mission.read(request.readings)
+        self._metrics.record_readings(results)
+        if "merged" in results:
+            try:
+                await self.durable("readings")
+            finally:
+                asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
+        return ReadingsResponse(results=results, step=mission.belief.newest)
 
     async def durable(self, field: str) -> None:
         """Wait until every event so far is on disk; raises ``Unavailable`` where that takes too long."""

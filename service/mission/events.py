@@ -8,6 +8,7 @@ from typing import Any
 from service.learning.trust import Advice
 from service.mission.decisions import Pending
 from service.mission.idempotency import Answered
+from service.mission.readings import Reading
 from shared.wire import Outcome, UavState
 
 
@@ -51,7 +52,14 @@ class Guided:
     state: dict[str, Any]
 
 
-Event = Reported | Decided | Settled | Guided | Answered
+@dataclass(frozen=True, slots=True)
+class Read:
+    """Readings of sensors, each with the step that it was placed in, changed the belief."""
+
+    readings: list[Reading]
+
+
+Event = Reported | Decided | Settled | Guided | Answered | Read
 
 
 def ignore_event(event: Event) -> None:

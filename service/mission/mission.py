@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,11 +18,12 @@ from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.mission.decisions import PENDING_PER_UAV, Pending, PendingDecisions, Reservation, Reservations
-from service.mission.events import AdviserReport, Decided, Event, Guided, Reported, Settled, ignore_event
+from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled, ignore_event
 from service.mission.idempotency import IdempotentAnswers
 from service.mission.learned_world import learned_world
 from service.mission.planner import Planner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
+from service.mission.readings import Reading, Readings
 from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
 from service.mission.visit_orders import VisitOrders
@@ -31,6 +32,7 @@ from shared.fleetplan import FleetBelief
 from shared.fleetplan.measured import Measured
 from shared.guidance import Guidance, GuidanceAnswer
 from shared.missions import MissionStatus, VisitDeadline
+from shared.readings import ReadingResult, SensorReading
 from shared.records import Records, take_report
 from shared.scenario import Scenario, scenario_named
 from shared.wire import Belief, Features, MissionSpec, Mode, Outcome, UavState
@@ -94,6 +96,7 @@ class Mission:
         self.belief = FleetBelief(self.scenario)
         self.measured: dict[int, Measured] = {}
         self.reports = Reports(mission_id, self.scenario, self.belief, self.pending)
+        self.readings = Readings(self.scenario, self.belief, self.records)
         planned = spec.planner == "on" and can_plan(self.scenario)
         self.planner = Planner(self.scenario, self.belief) if planned else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
@@ -131,8 +134,25 @@ class Mission:
         if self.planner is not None:
             self.planner.begin(step)
         self.measured[uav.uav_id] = take_report(uav, step, self.records, self.belief)
+        self.readings.reported(step)
         self.record(Reported(step, uav))
         return self.reservations.attempt(step, uav.uav_id)
+
+    def read(self, given: Sequence[SensorReading]) -> list[ReadingResult]:
+        """Merge the sensors' own readings into the belief; raises as :meth:`Readings.placed`."""
+        placed = self.readings.placed(given)
+        results: list[ReadingResult] = ["early"] * len(given)
+        if placed is not None:
+            results = self.take_readings(placed)
+        return results
+
+    def take_readings(self, placed: Sequence[Reading]) -> list[ReadingResult]:
+        """Take readings that have their steps; those that change the belief are an event."""
+        results = self.readings.take(placed)
+        merged = [reading for reading, result in zip(placed, results, strict=True) if result == "merged"]
+        if merged:
+            self.record(Read(merged))
+        return results
 
     def commit(self, decision: Pending, attempt: int = 1, advice: AdviserReport | None = None) -> None:
         """Reserve the sensor, presume its visit, and wait for the outcome.
@@ -209,6 +229,7 @@ class Mission:
             "guidance": self.guidance.state_dict(),
             "visit_orders": self.visit_orders.state_dict(),
             "trust": {model: trust.state_dict() for model, trust in self.trust.items()},
+            "readings": self.readings.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -224,9 +245,11 @@ class Mission:
         for model, trust in state["trust"].items():
             self.trust[model].load_state_dict(trust)
         self.restore_guidance(state["guidance"])
-        # Checkpoints of earlier versions have none: theirs count from the next decision.
+        # Checkpoints of earlier versions have neither: their orders count from the next decision.
         if "visit_orders" in state:
             self.visit_orders.load_state_dict(state["visit_orders"])
+        if "readings" in state:
+            self.readings.load_state_dict(state["readings"])
 
     def restore_guidance(self, state: dict[str, Any]) -> None:
         """Restore the operator's guidance from its ``state_dict``."""
@@ -264,4 +287,5 @@ class Mission:
             visits={int(s): int(visits[s]) for s in np.flatnonzero(visits >= 0)},
             learned=learned_world(self.belief),
             deadlines=self.deadlines() or None,
+            readings=self.readings.merged or None,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from importlib.metadata import version
 
@@ -11,6 +11,7 @@ from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 
 from shared.fleetplan.measured import Measured
+from shared.readings import ReadingResult
 from shared.wire import DecideResponse
 
 _DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
@@ -101,6 +102,14 @@ class Metrics:
         self.radio_failures = Counter(
             "aicvds_radio_failures", "Transmissions that failed although their links held", registry=r
         )
+        self.readings = Counter(
+            "aicvds_readings", "Sensors' own readings by what became of them", ["result"], registry=r
+        )
+
+    def record_readings(self, results: Collection[ReadingResult]) -> None:
+        """Count what became of sensors' own readings."""
+        for result in results:
+            self.readings.labels(result).inc()
 
     def record_llm(self, statuses: Mapping[str, int], breakers_open: int) -> None:
         """Set the states of the LLM servers.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.config.settings import Settings
-from service.mission.events import Decided, Event, Guided, Reported, Settled
+from service.mission.events import Decided, Event, Guided, Read, Reported, Settled
 from service.mission.idempotency import Answered
 from service.mission.mission import Mission
 from service.storage.store import StoredMission
@@ -41,3 +41,5 @@ def _replay(mission: Mission, event: Event) -> None:
             mission.restore_guidance(state)
         case Answered():
             mission.idempotent_answers.remember(event)
+        case Read(readings):
+            mission.take_readings(readings)

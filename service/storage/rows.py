@@ -16,8 +16,9 @@ import sqlalchemy as sa
 
 from service.learning.trust import Advice
 from service.mission.decisions import Pending
-from service.mission.events import AdviserReport, Decided, Event, Guided, Reported, Settled
+from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled
 from service.mission.idempotency import Answered
+from service.mission.readings import Reading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, missions
 from shared.wire import Outcome, UavState
@@ -29,7 +30,7 @@ _REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink"}
 # The fields of an outcome that change a mission's state.
 _OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}
 
-Kind = Literal["reported", "decided", "settled", "guided", "answered"]
+Kind = Literal["reported", "decided", "settled", "guided", "answered", "read"]
 # SQL for the database's driver, and the rows of its parameters.
 Statement = tuple[str, list[Any]]
 
@@ -116,6 +117,8 @@ def encode(event: Event) -> tuple[Kind, bytes]:
             return "guided", pack(state)
         case Answered(key, digest, answer):
             return "answered", pack([key, digest, answer])
+        case Read(readings):
+            return "read", pack(readings)
 
 
 def decode(kind: str, data: bytes) -> Event:
@@ -134,6 +137,8 @@ def decode(kind: str, data: bytes) -> Event:
                 return Guided(body)
             case "answered":
                 return Answered(*body)
+            case "read":
+                return Read([Reading(*reading) for reading in body])
     except (AttributeError, IndexError, KeyError, TypeError) as damaged:
         raise ValueError(f"damaged event {kind}: {damaged}") from damaged
     raise ValueError(f"unknown event {kind}")

@@ -35,7 +35,7 @@ class FleetBelief:
     Attributes:
         places: shape ``(J, 2)``, metres; NaN for a sensor that no report has named.
         base: shape ``(J,)``, packets at the start of step ``since``, less the packets collected in that step.
-        since: shape ``(J,)``, steps.
+        since: shape ``(J,)``, steps; negative for a queue that was read before the mission's first step.
         heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
         battery: shape ``(J,)``, joules.
         visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
@@ -66,8 +66,8 @@ class FleetBelief:
 
     @property
     def base_variance(self) -> FloatArray:
-        """The variance of ``base``, shape ``(J,)``: 0 for a sensor that was heard."""
-        return np.where(self.heard < 0, self._drawn_variance, 0.0)
+        """The variance of ``base``, shape ``(J,)``: 0 for a sensor that was heard, or read before the first step."""
+        return np.where((self.heard < 0) & (self.since >= 0), self._drawn_variance, 0.0)
 
     def hear(self, ids: IntArray, places: FloatArray, beacon: IntArray, queue: FloatArray, battery: FloatArray) -> None:
         """Take the beacons that are newer than the known ones.
@@ -92,6 +92,10 @@ class FleetBelief:
         news = ids[newer]
         self.base[news], self.battery[news] = queue[newer], battery[newer]
         self.since[news] = self.heard[news] = beacon[newer]
+
+    def begin(self, ids: IntArray, step: IntArray, queue: FloatArray, battery: FloatArray) -> None:
+        """Take the queues ``(n,)`` that sensors ``(n,)`` had in steps ``(n,)`` before the mission's first one."""
+        self.base[ids], self.since[ids], self.battery[ids] = queue, step, battery
 
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
         """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""

@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
+from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.wire import (
     INCOMPLETE,
     MAX_ROUND_TRIP_MS,
@@ -176,6 +177,10 @@ class Calls:
     def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> Call[GuidanceStatus]:
         """``POST /missions/{id}/guidance``."""
         return self._request("POST", f"/missions/{mission_id}/guidance", GuidanceStatus, given)
+
+    def read(self, mission_id: str, readings: ReadingsRequest) -> Call[ReadingsResponse]:
+        """``POST /missions/{id}/readings``."""
+        return self._request("POST", f"/missions/{mission_id}/readings", ReadingsResponse, readings)
 
     def feedback(self, outcome: FeedbackRequest) -> Call[FeedbackResponse]:
         """``POST /feedback``."""

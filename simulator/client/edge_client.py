@@ -11,6 +11,7 @@ import httpx
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
+from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.wire import (
     BatchRequest,
     BatchResponse,
@@ -132,6 +133,10 @@ class EdgeClient:
         """Request the decisions for all UAVs of a step."""
         return self._run(self._calls.decide_batch(request))
 
+    def read(self, mission_id: str, readings: ReadingsRequest) -> ReadingsResponse:
+        """Report what sensors said of themselves over another network than the UAVs' radios."""
+        return self._run(self._calls.read(mission_id, readings))
+
     def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
         """Send an outcome without a request for a decision."""
         return self._run(self._calls.feedback(outcome))
@@ -233,6 +238,10 @@ class AsyncEdgeClient:
     async def decide_batch(self, request: BatchRequest) -> BatchResponse:
         """Request the decisions for all UAVs of a step."""
         return await self._run(self._calls.decide_batch(request))
+
+    async def read(self, mission_id: str, readings: ReadingsRequest) -> ReadingsResponse:
+        """Report what sensors said of themselves over another network than the UAVs' radios."""
+        return await self._run(self._calls.read(mission_id, readings))
 
     async def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
         """Send an outcome without a request for a decision."""

@@ -19,6 +19,7 @@ from simulator.experiments import (
     obedience,
     scenarios,
     scheduler,
+    sensor_uplinks,
     tokens,
     top_k,
     unknown_worlds,
@@ -44,6 +45,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         aoi,
         scenarios,
         unknown_worlds,
+        sensor_uplinks,
     )
 }
 ALL = "all"

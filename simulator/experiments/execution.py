@@ -17,6 +17,7 @@ from simulator.flying.flight import Flight, fly
 from simulator.flying.informed import InformedPilot
 from simulator.flying.pilots import Choice, EdgePilot, LocalPilot, Pilot
 from simulator.flying.run import new_mission_id
+from simulator.flying.sensor_uplinks import SensorUplinks
 from simulator.records.decision import Decision
 from simulator.world import Observation
 
@@ -100,7 +101,9 @@ def fly_with_edge(edge: EdgeAt, planned: Planned) -> FlightRecord:
         except EdgeError:
             edge.alive()
             raise
-        flight = fly(planned.site, pilot, planned.seed, on_decision=check)
+        plan = decides.sensor_uplinks
+        uplinks = None if plan is None else SensorUplinks(ground, mission_id, scenario, planned.seed, plan).send
+        flight = fly(planned.site, pilot, planned.seed, on_decision=check, on_decided=uplinks)
     edge.alive()
     return _record(planned, flight, edge.model).model_copy(update=guided)
 

@@ -92,9 +92,10 @@ def flight_key(scheme: Scheme, identity: str | None, site: Site, seed: int) -> s
     """
     arrivals = None if site.arrivals is None else hashlib.sha256(site.arrivals.tobytes()).hexdigest()
     decides: dict[str, Any] = scheme.decides.model_dump(mode="json")
-    if decides.get("operator") is None:
-        # So the keys of flights without an operator are those of versions without operators.
-        decides.pop("operator", None)
+    for newer in ("operator", "sensor_uplinks"):
+        # So the keys of flights without one are those of versions that had none.
+        if decides.get(newer) is None:
+            decides.pop(newer, None)
     if identity is not None:
         decides["identity"] = identity
     whole = {

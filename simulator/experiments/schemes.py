@@ -8,6 +8,7 @@ from pydantic import Field
 
 from shared.wire import MissionSpec
 from simulator.experiments.operators import Operator
+from simulator.flying.sensor_uplinks import UplinkPlan
 from simulator.records.record import Record
 
 # So long that the speed of this machine does not change an edge's decisions.
@@ -33,7 +34,8 @@ class OverEdge(Record):
     ``backing`` is ``off`` (no LLM), ``asked`` (the LLM of ``--llm``), ``adapted`` (the embedded LLM with the adapter of
     ``AICVDS_LLM_ADAPTER``, by default the package's), ``chance`` (an LLM that answers uniform draws), ``worst`` (the
     emptiest queue at the highest velocity) or a GGUF file's path. ``deadline_ms`` of ``None`` is the
-    edge's default. ``operator`` guides the fleet, if set.
+    edge's default. ``operator`` guides the fleet, if set. With ``sensor_uplinks`` some sensors report to the edge
+    themselves.
     """
 
     kind: Literal["edge"] = "edge"
@@ -41,6 +43,7 @@ class OverEdge(Record):
     backing: Backing = NAMED_BY_OPTION
     deadline_ms: int | None = GENEROUS_DEADLINE_MS
     operator: Operator | None = None
+    sensor_uplinks: UplinkPlan | None = None
 
 
 class Clairvoyant(Record):
@@ -122,6 +125,7 @@ def over_edge(
     backing: Backing = NAMED_BY_OPTION,
     deadline_ms: int | None = GENEROUS_DEADLINE_MS,
     operator: Operator | None = None,
+    sensor_uplinks: UplinkPlan | None = None,
     **spec: Any,
 ) -> Scheme:
     """An edge whose mission has the given ``spec`` fields; by default k is 5 and the mode is ``llm``.
@@ -131,7 +135,9 @@ def over_edge(
     """
     whole = MissionSpec.model_validate({"mode": "llm", "top_k": 5, **spec})
     given = whole.model_dump(mode="json", exclude_defaults=True, exclude={"scenario", "seed"})
-    decides = OverEdge(spec=given, backing=backing, deadline_ms=deadline_ms, operator=operator)
+    decides = OverEdge(
+        spec=given, backing=backing, deadline_ms=deadline_ms, operator=operator, sensor_uplinks=sensor_uplinks
+    )
     return Scheme(name=name, label=label, decides=decides)
 
 
@@ -155,9 +161,9 @@ def value() -> Scheme:
     return over_edge("value_reach", "AIC-VDS, mode value", mode="value", backing=OFF)
 
 
-def edge_planner() -> Scheme:
+def edge_planner(name: str = "edge_planner", label: str = "edge's planner (LLM down)", **options: Any) -> Scheme:
     """The edge's planner, which decides while the LLM is down."""
-    return over_edge("edge_planner", "edge's planner (LLM down)", mode="policy", backing=OFF)
+    return over_edge(name, label, mode="policy", backing=OFF, **options)
 
 
 def edge_policy() -> Scheme:

@@ -21,6 +21,7 @@ from simulator.records.summary import FlightFacts
 from simulator.records.track import Instant, Track
 from simulator.sites.site import Site
 from simulator.world import Info, Observation, PipelineWorld, StepTally
+from simulator.world.sensors import Sensors
 
 
 @dataclass
@@ -88,6 +89,7 @@ def fly(
     log: DecisionLog | None = None,
     on_decision: Callable[[Choice], None] | None = None,
     on_step: Callable[[Flight], None] | None = None,
+    on_decided: Callable[[int, Sensors], None] | None = None,
 ) -> Flight:
     """Fly one mission; a KeyboardInterrupt ends it after the last whole step, with ``interrupted`` true.
 
@@ -98,6 +100,7 @@ def fly(
         log: gets the decisions of each whole step.
         on_decision: called after every decision.
         on_step: called after every step with the flight so far.
+        on_decided: called before each step is flown, once every UAV has its decision, with the step and the sensors.
     """
     scenario = site.scenario
     flight = Flight(scenario, seed)
@@ -107,13 +110,15 @@ def fly(
         observations, _ = world.reset(seed=seed)
         flight.sensor_xy = np.array(observations["uav_0"]["sensor_position"], dtype=float)
         flight.track.append(_instant(world, observations, {}))
-        for _step in range(scenario.steps):
+        for step in range(scenario.steps):
             choices: dict[int, Choice] = {}
             for agent, uav in world.live.items():
                 taken = frozenset(choice.sensor for choice in choices.values())
                 choices[uav] = pilot.decide(uav, observations[agent], taken)
                 if on_decision is not None:
                     on_decision(choices[uav])
+            if on_decided is not None:
+                on_decided(step, world.sensors)
             actions = {f"uav_{i}": np.array([c.sensor, c.velocity], dtype=np.int64) for i, c in choices.items()}
             before = observations
             observations, _, left, _, infos = world.step(actions)

@@ -37,7 +37,11 @@ def test_a_world_that_equals_the_formula_tells_nothing(edge: Edge, report: Repor
     assert "learned" not in client.put("/missions/test", json={}).json()
     assert client.post("/decide", json=measured(report(), [0.0] * 4)).status_code == 200
     # The keys of an earlier version, so that its clients read it.
-    assert client.get("/missions/test").json().keys() == MissionStatus.model_fields.keys() - {"learned", "deadlines"}
+    assert client.get("/missions/test").json().keys() == MissionStatus.model_fields.keys() - {
+        "learned",
+        "deadlines",
+        "readings",
+    }
 
 
 def test_the_status_tells_what_differs(edge: Edge, report: Report) -> None:

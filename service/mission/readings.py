@@ -1,0 +1,120 @@
+"""Sensors' own readings: each is checked, placed in a step of its mission by its age, and merged once."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.errors import Refused
+from shared.fleetplan import FleetBelief
+from shared.readings import ReadingResult, SensorReading
+from shared.records import Records, take_readings
+from shared.scenario import Scenario
+
+
+class Reading(NamedTuple):
+    """A sensor's reading at the start of a step, negative before the mission's first; ``battery`` in J, if known."""
+
+    sensor_id: int
+    step: int
+    queue: float
+    battery: float | None
+    message_id: str | None
+
+
+class Readings:
+    """The readings of one mission's sensors.
+
+    Attributes:
+        merged: the number of readings that changed the belief.
+    """
+
+    def __init__(self, scenario: Scenario, belief: FleetBelief, records: Records) -> None:
+        self._scenario = scenario
+        self._belief = belief
+        self._records = records
+        self.merged = 0
+        # A duplicate is of the newest message of its sensor, or outdated.
+        self._messages: dict[int, str] = {}
+        # The newest step and when its first report came. An age counts back from then.
+        self._step, self._began_at = -1, 0.0
+
+    def reported(self, step: int) -> None:
+        """Note the moment at which a UAV first reports a step."""
+        if step > self._step:
+            self._step, self._began_at = step, time.monotonic()
+
+    def placed(self, given: Sequence[SensorReading]) -> list[Reading] | None:
+        """The readings with their steps; None before the mission's first report.
+
+        A reading within step n, after the fleet's first report of it, counts as of the start of step n: the queue has
+        the arrivals since then too, and a visit of step n takes its packets later.
+
+        Raises:
+            Refused: an unknown sensor, a queue past its capacity, or a step later than the mission's newest.
+        """
+        scenario, newest = self._scenario, self._belief.newest
+        for index, reading in enumerate(given):
+            at = f"readings[{index}]"
+            if reading.sensor_id >= scenario.sensors:
+                raise Refused(
+                    f"{at}.sensor_id", f"sensor {reading.sensor_id} is unknown: there are {scenario.sensors}, from 0"
+                )
+            if reading.queue > scenario.queue_capacity:
+                raise Refused(
+                    f"{at}.queue", f"{reading.queue:g} packets exceed the capacity of {scenario.queue_capacity}"
+                )
+            if newest is not None and reading.step is not None and reading.step > newest:
+                raise Refused(f"{at}.step", f"step {reading.step} is later than {newest}, the mission's newest")
+        if newest is None:
+            return None
+        # After a restart the newest step is taken to begin now.
+        since_began_s = time.monotonic() - self._began_at if self._step == newest else 0.0
+        return [
+            Reading(
+                sensor_id=reading.sensor_id,
+                step=self._step_of(reading, newest, since_began_s),
+                queue=reading.queue,
+                battery=reading.battery,
+                message_id=reading.message_id,
+            )
+            for reading in given
+        ]
+
+    def _step_of(self, reading: SensorReading, newest: int, since_began_s: float) -> int:
+        if reading.step is not None:
+            return reading.step
+        assert reading.age_s is not None
+        return newest + min(0, math.floor((since_began_s - reading.age_s) / self._scenario.step_s))
+
+    def take(self, readings: Sequence[Reading]) -> list[ReadingResult]:
+        """Merge the readings into records and belief; returns what became of each."""
+        fresh = [r.message_id is None or self._messages.get(r.sensor_id) != r.message_id for r in readings]
+        unknown = [reading for reading, new in zip(readings, fresh, strict=True) if new]
+        news = take_readings(
+            np.array([r.sensor_id for r in unknown], dtype=np.int64),
+            np.array([r.step for r in unknown], dtype=np.int64),
+            np.array([r.queue for r in unknown], dtype=np.float64),
+            # numpy makes NaN of None.
+            np.array([r.battery for r in unknown], dtype=np.float64),
+            self._records,
+            self._belief,
+        )
+        self.merged += int(news.sum())
+        for reading, merged in zip(unknown, news.tolist(), strict=True):
+            if merged and reading.message_id is not None:
+                self._messages[reading.sensor_id] = reading.message_id
+        taken = iter(news.tolist())
+        return [("merged" if next(taken) else "outdated") if new else "duplicate" for new in fresh]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"merged": self.merged, "messages": dict(self._messages)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a ``state_dict``."""
+        self.merged, self._messages = state["merged"], dict(state["messages"])
