@@ -16,12 +16,15 @@ def banner(settings: Settings, url: str, missions: int) -> str:
         url: the edge's address.
         missions: that the store has.
     """
+    # Every interface's address is none that a browser can open.
+    reached = url.replace("//0.0.0.0", "//127.0.0.1").replace("//[::]", "//[::1]")
+    key = "" if settings.keys is None else "AICVDS_API_KEY=… "
     rows = {
-        "page": f"{url}/",
+        "page": f"{reached}/",
         "decides": decides(settings),
         "store": store(settings, missions),
         "keys": "none needed" if settings.keys is None else f"as in {settings.keys}",
-        "next": f"aicvds simulate --edge {url} --out runs/mission",
+        "next": f"{key}aicvds simulate --edge {reached} --out runs/mission",
     }
     return "\n".join(["aicvds serve: ready", *(f"  {name:<8} {text}" for name, text in rows.items())])
 
@@ -33,6 +36,8 @@ def decides(settings: Settings) -> str:
     if settings.llm_url is not None:
         return f"mode {settings.mode}, LLM {settings.llm_model or 'as listed'} at {settings.llm_url}"
     name = "SmolLM2-135M" if settings.llm_gguf is None else settings.llm_gguf.name
+    if settings.embedded_adapter is not None:
+        name += f" with {settings.embedded_adapter.name}"
     return f"mode {settings.mode}, embedded LLM {name}; the LLM-free policy until it is loaded (/readyz says when)"
 
 

@@ -169,7 +169,10 @@ def embedded(settings: Settings) -> Iterator[Finding]:
     except ModelMissing as error:
         yield Finding("LLM", str(error).partition(":")[0], "aicvds model fetch")
         return
-    yield Finding("LLM", f"embedded, {file} ({file.stat().st_size / 1e6:.0f} MB), {settings.embedded_threads} threads")
+    adapter = settings.embedded_adapter
+    with_adapter = "no adapter" if adapter is None else f"adapter {adapter}"
+    size = f"{file.stat().st_size / 1e6:.0f} MB"
+    yield Finding("LLM", f"embedded, {file} ({size}), {with_adapter}, {settings.embedded_threads} threads")
 
 
 def planner(settings: Settings) -> Finding:

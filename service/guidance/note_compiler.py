@@ -96,7 +96,7 @@ class NoteCompiler:
                     return
                 compiled = await compile_note(note, mission.scenario, self._llm)
             if _waits_for(mission, note):
-                mission.propose_guidance(compiled, self._llm.model)
+                mission.propose_guidance(compiled, self._llm.bare_model)
                 self._on_change(mission.mission_id)
             return
         except (BadOrders, Impossible, NoDecision) as error:
@@ -107,7 +107,7 @@ class NoteCompiler:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             reason = f"{type(error).__name__}: see the log"
         if _waits_for(mission, note):
-            mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.model)
+            mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.bare_model)
             self._on_change(mission.mission_id)
 
     async def _wait_for_llm(self) -> None:

@@ -65,6 +65,7 @@ class EmbeddedServer:
             files = gguf.name if adapter is None else f"{gguf.name} with {adapter.name}"
             raise LoadFailed(f"llama.cpp cannot load {files}: {error}") from error
         self.base_url = f"{self._server.listening_address}/v1"
+        self.bare_model = gguf.stem
         self.model = gguf.stem if adapter is None else f"{gguf.stem}+{adapter.stem}"
 
     @contextmanager

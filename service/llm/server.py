@@ -69,7 +69,7 @@ class LlmServer:
 
     Attributes:
         status: replaced as a whole when the state changes.
-        model: name of the model, once it is known.
+        model, bare_model: name of the model, once it is known, with its adapter and without.
         constraint: the kind of constraint that the server obeys.
         logprobs: whether the server gives the probabilities of tokens.
         max_uavs_per_call: number of UAVs that one call may decide for.
@@ -84,7 +84,7 @@ class LlmServer:
         self._embedded: EmbeddedServer | None = None
         # Brings the server up, or waits for its recovery.
         self._task: asyncio.Task[None] | None = None
-        self.model = settings.llm_model
+        self.model = self.bare_model = settings.llm_model
         self.constraint: Constraint = "none"
         self.logprobs = False
         self.max_uavs_per_call = 1
@@ -213,10 +213,12 @@ class LlmServer:
         if self._client is None or self.status.llm != "ready":
             raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
         try:
-            if self._embedded is None:
+            embedded, system = self._embedded, body["messages"][0]["content"]
+            if embedded is None:
                 return replace(await self._client.complete(body), model=self.model)
-            with self._embedded.request(body["messages"][0]["content"], self._warm_up.static) as fields:
-                return replace(await self._client.complete(body | fields), model=self.model)
+            with embedded.request(system, self._warm_up.static) as fields:
+                answer = await self._client.complete(body | fields)
+            return replace(answer, model=self.bare_model if "lora" in fields else self.model)
         except Unreachable as gone:
             if self.status.llm == "ready":
                 self.status = ServerStatus("unavailable", str(gone))
@@ -286,9 +288,10 @@ class LlmServer:
             )
             self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
+            self.bare_model = self.bare_model or self._embedded.bare_model
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
             if self.model is None:
-                self.model = next(iter(await self._client.models()), None)
+                self.model = self.bare_model = next(iter(await self._client.models()), None)
             found = await probe(self._client, self.model)
             self.constraint, self.logprobs = found.constraint, found.logprobs
             self.max_uavs_per_call = found.max_uavs_per_call

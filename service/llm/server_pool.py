@@ -49,6 +49,11 @@ class ServerPool:
         return self.active.model
 
     @property
+    def bare_model(self) -> str | None:
+        """The active server's model, without an adapter."""
+        return self.active.bare_model
+
+    @property
     def max_uavs_per_call(self) -> int:
         """Number of UAVs that one call of the active server may decide for."""
         return self.active.max_uavs_per_call

@@ -54,7 +54,10 @@ def compare(options: Compare, console: Console) -> int:
     from simulator.reporting.comparison import caution, names, read_run, render_comparison, rows
 
     runs = [read_run(folder) for folder in options.runs]
-    table = Table("", *names(runs))
+    table = Table("")
+    for name in names(runs):
+        # A name's end may be all in which two runs differ.
+        table.add_column(name, overflow="fold")
     for name, cells in rows(runs).items():
         table.add_row(name, *cells)
     console.print(table)

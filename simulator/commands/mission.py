@@ -39,6 +39,8 @@ class Create:
     """The mission's ID. Default: a new one, such as pipeline_world-0-1f6c09ab."""
     mode: Annotated[Mode | None, arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None
     """Who decides. Default: the edge's mode."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Waypoints of the mission, 1 to 10000. Default: the world's (30 in every scenario)."""
     note: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint="")] = None
     """The operator's note in plain words. The edge obeys it once it is confirmed."""
     seed: Annotated[int, arg(metavar="N")] = 0
@@ -65,7 +67,7 @@ def create(options: Create, console: Console) -> int:
     check_seed(options.seed)
     check_mission(options.mission)
     check_note(options.note)
-    site = chosen_site(options.scenario, options.world)
+    site = chosen_site(options.scenario, options.world, options.steps)
     from simulator.client import EdgeClient
     from simulator.client.observation_report import decide_request
 
@@ -76,11 +78,14 @@ def create(options: Create, console: Console) -> int:
         made = client.put_mission(mission_id, spec)
     observations, _ = site.world().reset(seed=options.seed)
     request = decide_request(0, observations["uav_0"], mission_id)
-    print(f"# Mission {mission_id}: {site.scenario.sensors} sensors, {site.scenario.uavs} UAVs, mode {made.mode}.")
+    world = site.scenario
+    fleet = "1 UAV" if world.uavs == 1 else f"{world.uavs} UAVs"
+    print(f"# Mission {mission_id}: {world.sensors} sensors, {fleet}, {world.steps} steps, mode {made.mode}.")
     print(f"# Watch it at {edge}/?mission={mission_id}")
     print("# Ask for a decision:")
     print(curl(f"{edge}/decide", pasted(request), key is not None))
-    print("# Report its outcome, with the decision_id of the answer:")
+    print("# Report its outcome, with the decision_id of the answer. The cost is 1 if the transmission failed, and for")
+    print("# every sensor the packets that it lost in the step, divided by its queue's capacity:")
     print(curl(f"{edge}/feedback", '{"decision_id": "…", "cost": 0.2}', key is not None))
     if options.note is not None:
         guidance = f"{edge}/missions/{mission_id}/guidance"

@@ -74,7 +74,8 @@ class Simulate:
     """Seed of the world, 0 to 4294967295: it draws the sensors, queues, arrivals and starts that are not given. The
     same seed gives the same world."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Waypoints to fly, 1 to 10000. Default: the world's (30 in every scenario)."""
+    """Waypoints to fly, 1 to 10000, but no more than a mission that is at the edge has. Default: the world's (30 in
+    every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
     (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner, extra `planner`),
@@ -86,8 +87,9 @@ class Simulate:
     """The mission's ID at the edge: of a new mission, or of one that was made there for this world and has not flown.
     Default: a new one, such as paper-0-1f6c09ab."""
     note: Annotated[str | None, arg(metavar="TEXT", help_behavior_hint="")] = None
-    """The operator's note in plain words, at most 280 characters. The edge obeys it once it is confirmed, on the
-    mission page or by POST /missions/ID/guidance."""
+    """The operator's note in plain words, at most 280 characters. The flight begins at once; the edge obeys the note
+    once it is confirmed, on the mission page or by POST /missions/ID/guidance. To confirm it before take-off, make
+    the mission with `aicvds mission create --note`."""
     uplink: Annotated[Uplink, arg(metavar="full|delta|pruned")] = "full"
     """The part of each report to send: full, the sensors that changed (delta, with the same decisions), or the k
     sensors that attention on board selects (pruned)."""

@@ -110,6 +110,8 @@ def conduct(
         created = begun_mission(ground, job, pilot.spec)
         watched = f"{job.edge}/?mission={job.mission_id}"
         console.print(f"Mission {job.mission_id}; watch it at {watched}", markup=False, highlight=False, soft_wrap=True)
+        if job.note is not None:
+            console.print("The edge obeys the note once you confirm it on that page.", highlight=False, soft_wrap=True)
         fresh_folder(job.out)
         with naming_out(job.out):
             requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, created))
@@ -139,8 +141,11 @@ def begun_mission(ground: EdgeClient, job: Job, spec: MissionSpec) -> MissionSta
     name = f"--mission {job.mission_id}: the edge has this mission"
     if there.decisions:
         raise UsageError(f"{name}, with {there.decisions} decisions already; choose another ID, or DELETE it there")
-    if there.scenario != job.site.scenario:
+    if there.scenario.model_copy(update={"steps": job.site.scenario.steps}) != job.site.scenario:
         raise UsageError(f"{name}, for another world ({there.scenario.name}); give that --scenario or --world")
+    # A flight may end earlier.
+    if there.scenario.steps < job.site.scenario.steps:
+        raise UsageError(f"{name}, of {there.scenario.steps} steps; give at most --steps {there.scenario.steps}")
     if job.mode is not None and there.mode != job.mode:
         raise UsageError(f"{name}, in mode {there.mode}; leave out --mode {job.mode}, or choose another ID")
     if job.note is not None and there.note != job.note:

@@ -63,7 +63,7 @@ ROWS: dict[str, Callable[[Run], str]] = {
     "world": lambda run: f"{run.summary.scenario}, seed {run.summary.seed}",
     "steps flown": lambda run: f"{run.summary.steps_flown} of {run.summary.steps}",
     "policy, mode": lambda run: run.summary.policy + (f", {run.summary.mode}" if run.summary.mode else ""),
-    "LLM": lambda run: run.summary.model or "–",
+    "LLM": lambda run: run.summary.model or "–" if run.summary.mode in (None, "guided", "llm") else "–",
     "decisions": lambda run: deciders_text(run.summary),
     "lost packets": lambda run: number(run.lost, 0),
     "nobody can lose fewer than": lambda run: number(run.summary.bound.lower_bound if run.summary.bound else None, 0),

@@ -18,7 +18,16 @@ from simulator.records.track import Track
 from simulator.reporting import figures
 from simulator.reporting.figure_style import PaperFigure
 from simulator.reporting.playback import Playback, playback
-from simulator.reporting.wording import ADVISERS, bound_text, llm_notice, number, percent, policy_labels, verdict
+from simulator.reporting.wording import (
+    ADVISERS,
+    bound_text,
+    llm_notice,
+    number,
+    orders_text,
+    percent,
+    policy_labels,
+    verdict,
+)
 
 COSTLIEST_DECISIONS = 15
 
@@ -78,6 +87,7 @@ def render_report(
         labels=labels,
         verdict=verdict(summary),
         bound=bound_text(summary),
+        orders=orders_text(summary),
         advisers={name: ADVISERS.get(name, name) for name in summary.trust},
         notice=llm_notice(summary),
         sources=summary.by_source.present(),

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from simulator.records.summary import Summary
-from simulator.reporting.wording import bound_text, deciders_text, llm_notice, policy_labels
+from simulator.reporting.wording import bound_text, deciders_text, llm_notice, orders_text, policy_labels
 
 
 def show(summary: Summary, console: Console) -> None:
@@ -28,6 +28,8 @@ def show(summary: Summary, console: Console) -> None:
         console.print(bound, markup=False, highlight=False, soft_wrap=True)
     if summary.policy == "edge":
         console.print(f"{summary.decisions} decisions: {deciders_text(summary)}", markup=False)
+    if (orders := orders_text(summary)) is not None:
+        console.print(orders, markup=False, highlight=False, soft_wrap=True)
     if summary.operator is not None and summary.operator.deadlines:
         console.print(f"Visit deadlines: {summary.operator.met} met, {summary.operator.missed} missed")
     tokens, trips = summary.tokens, summary.rtt_ms

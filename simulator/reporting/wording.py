@@ -108,6 +108,15 @@ def bound_text(summary: Summary) -> str | None:
     return said
 
 
+def orders_text(summary: Summary) -> str | None:
+    """Whether the operator's orders were in force; ``None`` where the operator gave neither orders nor a note."""
+    if summary.operator is None:
+        return None
+    if not summary.operator.orders:
+        return "No order of the operator was in force at the end: none was confirmed, or the last were withdrawn."
+    return f"The fleet obeyed the operator's orders, which may cost packets: {summary.operator.orders}"
+
+
 def _packets(count: int) -> str:
     return f"{count:,} packet{'' if count == 1 else 's'}"
 

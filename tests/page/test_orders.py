@@ -90,7 +90,7 @@ def test_a_confirmed_note_shows_the_same_deadlines_everywhere(edge: str, visit: 
     report = (out / "report.html").read_text(encoding="utf-8")
     assert f"<td>visit deadlines met / missed</td><td>{met} / {missed}</td>" in report
     assert f"<td>sensor 3, every 3 steps</td><td>0</td><td>29</td><td>{met}</td><td>{missed}</td>" in report
-    assert NOTE in report and "In force at the end: Visit sensor 3 at least once in every 3 steps." in report
+    assert NOTE in report and "which may cost packets: Visit sensor 3 at least once in every 3 steps." in report
     assert shown(visit, edge, "patrol") == counted
 
 

@@ -111,10 +111,20 @@ def test_a_named_mission_has_its_note_and_its_address(
     assert stub.missions["patrol"] is made and stub.notes == {"patrol": "Visit sensor 2 every fourth step."}
 
 
+def test_a_flight_may_end_before_its_mission_does(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub.missions["patrol"] = MissionSpec(scenario=SCENARIOS["paper"])
+    arguments = ["--edge", stub.url, "--mission", "patrol", "--steps", "1", "--out", str(tmp_path), "--overwrite"]
+    assert simulate.main(arguments) == 0
+    assert "seed 0, 1 steps" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "flown", "message"),
     [
-        (["--steps", "2"], 0, "for another world (paper)"),
+        (["--steps", "4"], 0, "of 3 steps; give at most --steps 3"),
+        (["--scenario", "stress", "--steps", "3"], 0, "for another world (paper)"),
         (["--steps", "1", "--mode", "value"], 0, "in mode llm; leave out --mode value"),
         (["--steps", "1"], 3, "with 3 decisions already; choose another ID"),
     ],
@@ -122,7 +132,7 @@ def test_a_named_mission_has_its_note_and_its_address(
 def test_a_mission_that_does_not_fit_is_refused(
     stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], flown: int, message: str
 ) -> None:
-    stub.missions["patrol"] = MissionSpec(scenario=SCENARIOS["paper"].model_copy(update={"steps": 1}))
+    stub.missions["patrol"] = MissionSpec(scenario=SCENARIOS["paper"].model_copy(update={"steps": 3}))
     stub.flown["patrol"] = flown
     assert simulate.main(["--edge", stub.url, "--mission", "patrol", "--out", str(tmp_path), *arguments]) == 2
     assert message in capsys.readouterr().err

@@ -7,8 +7,9 @@ import pytest
 from shared.scenario import Scenario
 from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import LocalPilot
+from simulator.records.operator import Operator
 from simulator.records.summary import BySource, LossBound, Summary, summarise
-from simulator.reporting.wording import bound_text, deciders_text, llm_notice, number, percent, verdict
+from simulator.reporting.wording import bound_text, deciders_text, llm_notice, number, orders_text, percent, verdict
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
@@ -40,6 +41,17 @@ def test_the_verdict_ranks(flight: Flight) -> None:
         assert rank in sentence and sentence.count(".") == 1
     assert "the same" in verdict(summary.model_copy(update={"lost_packets": {"eof": 2, "wqcs": 2}}))
     assert "Nothing was flown" in verdict(summary.model_copy(update={"steps_flown": 0}))
+
+
+def test_the_operators_orders_are_named_beside_the_losses(flight: Flight) -> None:
+    summary = summary_of(flight, None)
+    assert orders_text(summary) is None
+    note = "Visit sensor 3."
+    unconfirmed, obeyed = (Operator(note=note, orders=orders, deadlines=[]) for orders in (None, note))
+    said = orders_text(summary.model_copy(update={"operator": unconfirmed}))
+    assert said is not None and said.startswith("No order of the operator was in force at the end")
+    said = orders_text(summary.model_copy(update={"operator": obeyed}))
+    assert said == "The fleet obeyed the operator's orders, which may cost packets: Visit sensor 3."
 
 
 def guided(**changes: object) -> Summary:
