@@ -58,7 +58,7 @@ class Metrics:
 
     def _add_llm(self) -> None:
         r = self.registry
-        self.llm_requests = Counter("aicvds_llm_requests", "Calls of the LLM", ["outcome"], registry=r)
+        self.llm_requests = Counter("aicvds_llm_requests", "Queries of mode llm by outcome", ["outcome"], registry=r)
         self.llm_breaker_opened = Counter(
             "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened", registry=r
         )

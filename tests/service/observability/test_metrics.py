@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from service.observability.metrics import Metrics
 from tests.waiting import until
 
 Report = Callable[..., dict[str, Any]]
@@ -61,3 +64,16 @@ def test_without_an_llm_no_breaker_is_open(edge: Edge) -> None:
         f'aicvds_llm_servers{{status="{status}"}}': float(status == "off")
         for status in ("loading", "ready", "unavailable", "off")
     }
+
+
+def test_the_docs_name_every_metric_with_its_labels() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "operations.md").read_text(encoding="utf-8")
+    named = {
+        row[1].strip(" `"): (row[2].strip(), re.findall(r"`(\w+)`", row[3]))
+        for row in (line.split("|") for line in page.splitlines() if line.startswith("| `aicvds_"))
+    }
+    ends = {"counter": "_total", "info": "_info"}
+    collectors: list[Any] = [
+        c for c in Metrics().registry._collector_to_names if getattr(c, "_name", "").startswith("aicvds")
+    ]
+    assert named == {c._name + ends.get(c._type, ""): (c._type, list(c._labelnames)) for c in collectors}
