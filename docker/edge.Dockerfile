@@ -19,7 +19,7 @@ COPY pyproject.toml ./
 # edit of the source. Torch's C++ headers and test programs are a fifth of it, and the image compiles nothing. OR-Tools
 # requires pandas.
 RUN touch README.md LICENSE \
- && pip install --constraint constraints.txt '.[service,planner,otel,postgres]' \
+ && pip install --constraint constraints.txt '.[service,planner,mqtt,otel,postgres]' \
  && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test pandas/tests
 
 # Only these files, so that an edit elsewhere does not download the model again.

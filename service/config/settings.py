@@ -27,12 +27,12 @@ def _default_store() -> str:
     return str(home / "aicvds" / "missions.db")
 
 
-# Variables of `aicvds simulate` and docker-compose.yml, often in the same .env file.
+# Variables of `aicvds simulate`, `aicvds mqtt` and docker-compose.yml, often in the same .env file.
 _SIMULATORS = {
     f"AICVDS_{name}"
     for name in (
         *("API_KEY", "AWAIT_LLM", "BIND", "BUILD_NETWORK", "KEYS_DIR", "PORT", "RUNS", "SCENARIO", "SEED", "USER"),
-        "WAIT_S",
+        *("LORAWAN_DIR", "MQTT_BROKER", "MQTT_PASSWORD", "READINGS_KEY", "WAIT_S"),
     )
 }
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds the containers, flies the paper's mission in them, and checks what came of it. Needs a Docker engine, Compose
 # (either one) and python3; fails without them. Prometheus and PostgreSQL are Debian's packages in images made here, unless
-# PROMETHEUS_IMAGE and POSTGRES_IMAGE name others. What needs other images (profiles grafana, llama, vllm, ollama) is only
+# PROMETHEUS_IMAGE and POSTGRES_IMAGE name others. What needs other images (profiles grafana, llama, vllm, ollama, mqtt) is only
 # read.
 #   compose.sh          all of it
 #   compose.sh build    the images alone, which the engine then has for the whole run
@@ -116,7 +116,7 @@ DOCKERFILE
   say "Debian's PostgreSQL is built"
 fi
 compose --profile postgres down --volumes --remove-orphans >/dev/null 2>&1 || true
-for profile in grafana llama vllm ollama postgres; do quietly compose --profile "$profile" config; done
+for profile in grafana llama vllm ollama postgres mqtt; do quietly compose --profile "$profile" config; done
 say "Compose accepts the file with every profile"
 quietly compose build
 say "edge and simulator are built"

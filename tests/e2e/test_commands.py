@@ -57,6 +57,7 @@ KEYED = [
 # Their command lines are parsed and no more; by how they begin.
 PARSED = {
     "aicvds doctor": "its result is this machine's; tests/service/commands/test_doctor.py runs it",
+    "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
     "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
     "aicvds explore": "minutes; tests/e2e/test_pretrain.py runs it small",
     "aicvds distill": "an hour; tests/service/distilling/test_distill.py runs it small",

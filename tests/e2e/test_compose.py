@@ -40,7 +40,7 @@ def test_without_a_profile_there_are_the_edge_the_simulator_and_prometheus() -> 
         "prometheus",
     }
     profiles = {profile for service in SERVICES.values() for profile in service.get("profiles", ())}
-    assert profiles == {"grafana", "llama", "vllm", "ollama", "postgres"}
+    assert profiles == {"grafana", "llama", "vllm", "ollama", "postgres", "mqtt"}
     assert all(f"#   {profile} " in TEXT for profile in profiles)
 
 
@@ -56,8 +56,8 @@ def test_a_service_is_of_one_version_and_sees_no_more_than_it_needs(name: str) -
             assert (ROOT / source).exists() and mount.endswith(":ro")
     for port in service.get("ports", ()):
         assert port.startswith("${AICVDS_BIND:-127.0.0.1}:")
-    # Every LLM server and store is named to the edge as the comment at the top says.
-    if service.get("profiles", ["grafana"]) != ["grafana"] and name != "ollama-pull":
+    # Every LLM server, store and broker is named as the comment at the top says, or by a default.
+    if service.get("profiles", ["grafana"]) != ["grafana"] and name not in ("ollama-pull", "uplinks"):
         assert f"//{name}:" in TEXT or f"@{name}/" in TEXT
 
 

@@ -27,7 +27,13 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
 
 @pytest.mark.parametrize(
     "name, missing, extra",
-    [("bound", "ortools.sat", "planner"), ("bound", "pettingzoo", "simulator"), ("train", "torchrl", "marl")],
+    [
+        ("bound", "ortools.sat", "planner"),
+        ("bound", "pettingzoo", "simulator"),
+        ("train", "torchrl", "marl"),
+        ("mqtt", "paho", "mqtt"),
+        ("mqtt", "httpx", "mqtt"),
+    ],
 )
 def test_a_module_of_an_extra_that_is_not_installed_names_the_extra(
     name: str, missing: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
