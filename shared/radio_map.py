@@ -78,18 +78,11 @@ _FADINGS = np.array([kind.fading for kind in KINDS])[:, None, None]
 _RANGES_M, _RANGE_OF_KIND = np.unique([kind.range_m for kind in KINDS], return_inverse=True)
 _RANGES_M = _RANGES_M[:, None, None, None]
 
-# A packed symmetric matrix has its upper triangle column by column, so that a leading block of it comes first. By row
-# and column, the place in it.
+# A packed symmetric matrix has its upper triangle column by column, in half the memory, so that a leading block of it
+# comes first. By row and column, the place in it.
 _ROWS, _COLUMNS = np.tril_indices(_MOST_OF_ONE)[::-1]
 _PLACE_IN_PACKED = np.zeros((_MOST_OF_ONE, _MOST_OF_ONE), dtype=np.int64)
 _PLACE_IN_PACKED[_ROWS, _COLUMNS] = _PLACE_IN_PACKED[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
-
-
-def _packed(matrices: FloatArray) -> FloatArray:
-    """Symmetric matrices ``(n, k, k)`` in half the memory, ``(n, k (k + 1) / 2)``."""
-    size = matrices.shape[1]
-    few = size * (size + 1) // 2
-    return np.asarray(matrices[:, _ROWS[:few], _COLUMNS[:few]])
 
 
 class RadioMap:
@@ -129,7 +122,7 @@ class RadioMap:
         self._compared = _COMPARE_FIRST
         self.exact = True
         self.offset_db, self.deviation_db = 0.0, _PRIOR_DB
-        # By sensor, K^-1 as :func:`_packed` has it, K^-1 r and K^-1 1. None until a gain differs from the formula.
+        # By sensor, K^-1 packed, K^-1 r and K^-1 1. None until a gain differs from the formula.
         self._inverse: FloatArray | None = None
         self._measured: FloatArray = np.zeros((sensors, kept))
         self._ones: FloatArray = np.zeros((sensors, kept))
@@ -229,8 +222,9 @@ class RadioMap:
         for size in np.unique(sizes[sizes > 0]).tolist():
             some = ids[sizes == size]
             used = (np.arange(size) < self.count[some, None]).astype(np.float64)
-            inverse = np.asarray(np.linalg.inv(self._covariances(some, size)), dtype=np.float64)
-            self._inverse[some, : size * (size + 1) // 2] = _packed(inverse)
+            inverse = np.linalg.inv(self._covariances(some, size))
+            few = size * (size + 1) // 2
+            self._inverse[some, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
             both = np.stack((self.excess[some, :size] * used, used), axis=2)
             solved = inverse @ both
             self._measured[some, :size], self._ones[some, :size] = solved[..., 0], solved[..., 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -134,7 +135,8 @@ class Mission:
         if self.planner is not None:
             self.planner.begin(step)
         self.measured[uav.uav_id] = take_report(uav, step, self.records, self.belief)
-        self.readings.reported(step)
+        if step > self.readings.began[0]:
+            self.readings.began = step, time.monotonic()
         self.record(Reported(step, uav))
         return self.reservations.attempt(step, uav.uav_id)
 

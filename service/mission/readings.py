@@ -31,6 +31,8 @@ class Readings:
 
     Attributes:
         merged: the number of readings that changed the belief.
+        began: the newest step that a UAV has reported, and when it first did, a time of ``time.monotonic``. An age
+            counts back from then.
     """
 
     def __init__(self, scenario: Scenario, belief: FleetBelief, records: Records) -> None:
@@ -40,13 +42,7 @@ class Readings:
         self.merged = 0
         # A duplicate is of the newest message of its sensor, or outdated.
         self._messages: dict[int, str] = {}
-        # The newest step and when its first report came. An age counts back from then.
-        self._step, self._began_at = -1, 0.0
-
-    def reported(self, step: int) -> None:
-        """Note the moment at which a UAV first reports a step."""
-        if step > self._step:
-            self._step, self._began_at = step, time.monotonic()
+        self.began = -1, 0.0
 
     def placed(self, given: Sequence[SensorReading]) -> list[Reading] | None:
         """The readings with their steps; None before the mission's first report.
@@ -73,7 +69,8 @@ class Readings:
         if newest is None:
             return None
         # After a restart the newest step is taken to begin now.
-        since_began_s = time.monotonic() - self._began_at if self._step == newest else 0.0
+        step, at_s = self.began
+        since_began_s = time.monotonic() - at_s if step == newest else 0.0
         return [
             Reading(
                 sensor_id=reading.sensor_id,

@@ -28,7 +28,7 @@ def flown(step: int) -> Mission:
 
 def at(m: Mission, seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the clock show so many seconds since the newest step began."""
-    now = m.readings._began_at + seconds
+    now = m.readings.began[1] + seconds
     monkeypatch.setattr(time, "monotonic", lambda: now)
 
 
