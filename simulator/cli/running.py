@@ -12,7 +12,7 @@ from typing import TypeVar
 import tyro
 from rich.console import Console
 
-from simulator.errors import EdgeError, EdgeRefused, EdgeUnreachable, UsageError
+from simulator.errors import EdgeError, EdgeRefused, EdgeUnreachable, UsageError, VehicleError
 
 INTERRUPTED = 130
 Options = TypeVar("Options")
@@ -44,6 +44,9 @@ def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
         return 2
     except EdgeError as error:
         print(f"{prog}: {error}{_remedy(error)}", file=sys.stderr)
+        return 1
+    except VehicleError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
         return 1
     except OSError as error:
         print(f"{prog}: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", file=sys.stderr)

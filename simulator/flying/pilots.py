@@ -125,7 +125,7 @@ class EdgePilot:
         except EdgeError as error:
             self.last_error = str(error)
             sensor, velocity = self._fallback.decide(uav, observation, taken)
-            return Choice(int(sensor), int(velocity), "onboard", _reason(error))
+            return Choice(int(sensor), int(velocity), "onboard", reason_on_board(error))
         self._pending.pop(uav, None)
         if request.outcome is not None and not exchange.response.stored:
             self._undurable.append(request.outcome)
@@ -183,7 +183,8 @@ class EdgePilot:
         self._undurable.clear()
 
 
-def _reason(error: EdgeError) -> str:
+def reason_on_board(error: EdgeError) -> str:
+    """The reason of a decision on board after this failure of asking the edge."""
     if isinstance(error, EdgeUnreachable):
         return "edge_unreachable"
     return "edge_refused" if isinstance(error, EdgeRefused) else "edge_protocol"

@@ -158,7 +158,7 @@ def summarise(flown: FlightFacts, decisions: Sequence[Decision], tallies: Mappin
         lost_packets={name: int(sum(t.lost_packets for t in tally)) for name, tally in tallies.items()},
         loss_events={name: int(sum(t.failures + t.overflows for t in tally)) for name, tally in tallies.items()},
         failures=sum(d.failed for d in decisions),
-        late=sum(_is_late(d) for d in from_edge),
+        late=sum(is_late(d) for d in from_edge),
         tokens=_tokens([d.tokens for d in from_edge if d.tokens is not None]),
         rtt_ms=round_trips(decisions),
         uplink_bytes_mean=mean([d.request_bytes for d in from_edge]),
@@ -182,7 +182,8 @@ def _mean_trust(weights: list[dict[str, float]]) -> dict[str, float]:
     return dict(sorted(means.items(), key=lambda item: -item[1]))
 
 
-def _is_late(decision: Decision) -> bool:
+def is_late(decision: Decision) -> bool:
+    """Whether its round trip took longer than its deadline + 50 ms."""
     if decision.rtt_ms is None or decision.deadline_ms is None:
         return False
     return decision.rtt_ms > decision.deadline_ms + LATE_SLACK_MS

@@ -72,7 +72,7 @@ def output_until(process: subprocess.Popen[str], pattern: str) -> re.Match[str]:
 
 
 @contextmanager
-def serving_edge(**env: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """``aicvds serve`` on a free port, with a far deadline unless told; yields its URL and process."""
-    with started("serve", "--port", "0", **{"AICVDS_DEADLINE_MS": "60000", **env}) as process:
+def serving_edge(port: str = "0", **env: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``aicvds serve`` on a free port unless told, with a far deadline unless told; yields its URL and process."""
+    with started("serve", "--port", port, **{"AICVDS_DEADLINE_MS": "60000", **env}) as process:
         yield output_until(process, r"listening on (http://[\d.:]+)")[1], process

@@ -33,7 +33,6 @@ BIN = ".venv/bin/"
 FLOWN = {
     f"{BIN}aicvds simulate --edge {EDGE} --scenario paper --seed 0 --out runs/mission": "--steps 2",
     f"{BIN}aicvds replay runs/mission --edge {EDGE} --format json --top-k 3 --out runs/again": "",
-    f"{BIN}python -m examples.uav_loop --edge {EDGE}": "--steps 3",
     f"{BIN}aicvds simulate --world examples/pipeline_world --edge {EDGE}": "--steps 2",
     f"{BIN}aicvds simulate --world examples/pipeline_world --policy eof --out runs/pipeline_world": "--steps 2",
     f"{BIN}aicvds simulate --policy eof --no-bound --out runs/eof": "--steps 2",
@@ -58,6 +57,7 @@ KEYED = [
 PARSED = {
     "aicvds doctor": "its result is this machine's; tests/service/commands/test_doctor.py runs it",
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
+    "aicvds fly": "it waits for vehicles; tests/simulator/vehicles and tests/e2e/test_fly.py fly it",
     "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
     "aicvds explore": "minutes; tests/e2e/test_pretrain.py runs it small",
     "aicvds distill": "an hour; tests/service/distilling/test_distill.py runs it small",

@@ -1,0 +1,169 @@
+"""The flight of real UAVs: telemetry in, decisions out as speeds along their missions' paths, outcomes back.
+
+All UAVs of a flight are at the same waypoint: every ``step_s`` seconds of the mission each reports, decides, and is
+told its speed for the next ``step_s`` seconds. At their end it collects from the decided sensor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from simulator.errors import VehicleError
+from simulator.flying.flight import exchange_fields
+from simulator.flying.pilots import Choice
+from simulator.records.decision import Decision
+from simulator.sites.site import Site
+from simulator.vehicles.field_pilot import FieldPilot
+from simulator.vehicles.field_uav import FieldUav
+from simulator.vehicles.mission_clock import Clock, MissionClock
+from simulator.vehicles.radio import Radio, Spot
+
+
+@dataclass
+class Flown:
+    """A flight so far.
+
+    Attributes:
+        decisions: with their outcomes, in the order of step and UAV.
+        late: decisions that came after their step.
+        untold: waypoints at which a UAV was told nothing, by the reason.
+        disobeyed: texts of the commands that a vehicle did not carry out.
+    """
+
+    decisions: list[Decision] = field(default_factory=list)
+    late: int = 0
+    untold: Counter[str] = field(default_factory=Counter)
+    disobeyed: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """A decision that is being flown."""
+
+    uav: FieldUav
+    choice: Choice
+    spot: Spot
+
+
+class FieldFlight:
+    """Flies UAVs on their missions for a world's steps.
+
+    Args:
+        site: a world on the globe.
+        uavs: in the air, on their missions.
+        radio: of all of them.
+        pilot: decides for them.
+        clock: of the mission.
+        on_decision: called with each decision once its outcome is known.
+        on_event: called with a UAV's index and a text when it is told nothing, is told something again, or disobeys.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        uavs: Sequence[FieldUav],
+        radio: Radio,
+        pilot: FieldPilot,
+        clock: Clock | None = None,
+        on_decision: Callable[[Decision], None] = lambda decision: None,
+        on_event: Callable[[int, str], None] = lambda uav, text: None,
+    ) -> None:
+        self.flown = Flown()
+        self._scenario, self._uavs, self._radio, self._pilot = site.scenario, uavs, radio, pilot
+        self._clock = clock or MissionClock()
+        self._on_decision, self._on_event = on_decision, on_event
+        self._away: dict[int, str | None] = {}
+
+    async def fly(self) -> Flown:
+        """Fly the steps, or until every UAV has landed. A cancelled flight ends like a flown one, and then raises."""
+        legs: list[_Leg] = []
+        step_s, began = self._scenario.step_s, self._clock.now()
+        try:
+            await self._look(step_s)
+            for step in range(self._scenario.steps):
+                if step == 0:
+                    await self._listen(0)
+                legs = await self._decide(step)
+                if self._clock.now() > began + (step + 1) * step_s:
+                    self.flown.late += len(legs)
+                await self._clock.until(began + (step + 1) * step_s)
+                await self._look(step_s)
+                await self._collect(legs, step)
+                legs = []
+                if all(uav.landed for uav in self._uavs):
+                    break
+        finally:
+            # Where the flight is cut short, the outcome of what is being flown stays unknown.
+            await self._end()
+        return self.flown
+
+    async def _look(self, seconds: float) -> None:
+        await asyncio.gather(*(uav.look(seconds) for uav in self._uavs))
+
+    async def _decide(self, step: int) -> list[_Leg]:
+        """Decide for the UAVs that fly their missions, and tell them."""
+        flying = {uav.index: uav for uav in self._uavs if uav.away is None}
+        for uav in self._uavs:
+            if uav.away is not None:
+                self.flown.untold[uav.away] += 1
+            if uav.away != self._away.get(uav.index):
+                self._on_event(uav.index, uav.away or "it flies its mission")
+            self._away[uav.index] = uav.away
+        choices = await self._pilot.decide({index: uav.observation(step) for index, uav in flying.items()})
+        legs = [_Leg(flying[index], choice, flying[index].spot(step)) for index, choice in choices.items()]
+        await asyncio.gather(*(self._command(leg) for leg in legs))
+        return legs
+
+    async def _command(self, leg: _Leg) -> None:
+        try:
+            await leg.uav.command(leg.choice.velocity)
+        except VehicleError as error:
+            self.flown.disobeyed.append(str(error))
+            self._on_event(leg.uav.index, str(error))
+
+    async def _collect(self, legs: Sequence[_Leg], step: int) -> None:
+        """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record what came of it."""
+        collected = {}
+        for leg in legs:
+            if leg.uav.away == "the link is lost":
+                leg.uav.expect(leg.choice.velocity, self._scenario.step_s)
+            collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
+        lost = await self._listen(step + 1)
+        for leg in legs:
+            got, index = collected[leg.uav.index], leg.uav.index
+            cost = float(got.failed) + lost[index] / self._scenario.queue_capacity
+            self._pilot.learn(index, leg.choice, cost, got.failed)
+            decision = Decision(
+                step=step,
+                uav_id=index,
+                position=leg.spot.position,
+                sensor_id=leg.choice.sensor,
+                velocity=leg.choice.velocity,
+                source=leg.choice.source,
+                reason=leg.choice.reason,
+                failed=got.failed,
+                collected=got.packets,
+                lost_packets=lost[index],
+                cost=cost,
+                **exchange_fields(leg.choice.exchange),
+            )
+            self.flown.decisions.append(decision)
+            self._on_decision(decision)
+
+    async def _listen(self, step: int) -> dict[int, int]:
+        """Hear the sensors in range of each UAV; returns the packets that they lost since that UAV last heard them."""
+        heard = {uav.index: await self._radio.beacons(uav.spot(step)) for uav in self._uavs}
+        return {uav.index: uav.heard.hear(step, heard[uav.index]) for uav in self._uavs}
+
+    async def _end(self) -> None:
+        """Let the UAVs go on with their missions, and send the last outcomes."""
+        for uav in self._uavs:
+            if uav.away is None:
+                try:
+                    await uav.hand_back()
+                except VehicleError as error:
+                    self.flown.disobeyed.append(str(error))
+        await self._pilot.land()

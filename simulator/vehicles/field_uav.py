@@ -1,0 +1,127 @@
+"""One UAV of a flight: its vehicle, its path, what it heard, and whether it may be told anything now."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from shared.scenario import Point
+from shared.trajectory import trajectories
+from simulator.sites.site import Site
+from simulator.vehicles.heard_beacons import HeardBeacons
+from simulator.vehicles.path_follower import PathFollower
+from simulator.vehicles.radio import Spot
+from simulator.vehicles.vehicle import Vehicle, VehicleState
+from simulator.world import Observation
+
+# Farther from its trajectory than this a UAV is told nothing.
+OFF_PATH_M = 100.0
+# Below this height above its take-off place a UAV has not taken off, or lands.
+AIRBORNE_M = 5.0
+# The mode comes with the heartbeat, once a second: after a command of its own the flight reads the old one so long.
+MODE_LAG_S = 2.5
+
+
+class FieldUav:
+    """A UAV on its mission.
+
+    A UAV that somebody else flies is told nothing: the pilot, a failsafe, or an autopilot that has landed it. The same
+    holds for one that is lost, off its path or outside the fence.
+
+    Attributes:
+        index: among the world's trajectories.
+        waits: whether it was told to wait in place, by this flight.
+        away: why it is told nothing now; ``None`` while it flies its mission.
+        landed: whether it has ended its mission for good.
+    """
+
+    def __init__(self, index: int, vehicle: Vehicle, site: Site) -> None:
+        self.index, self.vehicle = index, vehicle
+        self.waits = False
+        self.landed = False
+        self.away: str | None = "no telemetry yet"
+        self._site = site
+        self._follower = PathFollower(trajectories(site.scenario)[index], float(site.scenario.max_velocity))
+        self._here: Point = (0.0, 0.0)
+        self._degrees: Point = (0.0, 0.0)
+        # Since the last position that was near its trajectory.
+        self._unseen_s = 0.0
+        self._mode_changed_s = -math.inf
+        self.heard = HeardBeacons(np.array(site.scenario.sites))
+
+    async def look(self, seconds: float) -> None:
+        """Take the newest telemetry, that many seconds after the last."""
+        self._unseen_s += seconds
+        state = await self.vehicle.state()
+        self.away = self._obstacle(state)
+        if self.away is None and state.mode == "mission" and not self._mode_is_old:
+            # The pilot may have resumed the mission too.
+            self.waits = False
+
+    def spot(self, step: int) -> Spot:
+        """Where it is, as far as its telemetry goes."""
+        return Spot(self.index, step, self._here, self._degrees)
+
+    def observation(self, step: int) -> Observation:
+        """What it knows."""
+        return self.heard.observation(step, self._here, self._follower.progress_m or 0.0)
+
+    def expect(self, velocity: int, seconds: float) -> None:
+        """Reckon with the position that it should have now; for a UAV whose telemetry has stopped."""
+        assert self._site.frame is not None, "a site with vehicles has a place on the globe"
+        self._here = self._follower.ahead(velocity * seconds)
+        longitude, latitude = self._site.frame.degrees([self._here])[0].tolist()
+        self._degrees = longitude, latitude
+
+    async def command(self, velocity: int) -> None:
+        """Fly at this velocity along the mission, or wait in place at 0 m/s.
+
+        Raises:
+            VehicleError: the vehicle did not do it.
+        """
+        if velocity == 0:
+            if not self.waits:
+                await self.vehicle.hold()
+                self.waits, self._mode_changed_s = True, time.monotonic()
+            return
+        await self.vehicle.set_speed(float(velocity))
+        await self.hand_back()
+
+    async def hand_back(self) -> None:
+        """Let it go on with its mission if this flight made it wait; raises :class:`VehicleError`."""
+        if self.waits:
+            await self.vehicle.resume()
+            self.waits, self._mode_changed_s = False, time.monotonic()
+
+    @property
+    def _mode_is_old(self) -> bool:
+        return time.monotonic() - self._mode_changed_s < MODE_LAG_S
+
+    def _obstacle(self, state: VehicleState) -> str | None:
+        """Why the UAV is told nothing, or ``None``."""
+        if not state.connected or state.position is None:
+            return "the link is lost"
+        if not state.armed or state.mode == "landing":
+            self.landed = True
+            return "it lands" if state.armed else "it is not armed"
+        if state.mode != "mission" and not (state.mode == "hold" and (self.waits or self._mode_is_old)):
+            # Whoever flies it now decides when its mission goes on.
+            self.waits = False
+            return "it does not fly its mission"
+        if state.height_m < AIRBORNE_M:
+            return "it is on the ground"
+        return self._misplaced(state.position)
+
+    def _misplaced(self, degrees: Point) -> str | None:
+        assert self._site.frame is not None, "a site with vehicles has a place on the globe"
+        x, y = self._site.frame.metres([degrees])[0].tolist()
+        self._here, self._degrees = (x, y), degrees
+        if not all(fence.allows(self._here) for fence in self._site.fences):
+            return "it is outside the fence"
+        gap = self._follower.follow(self._here, self._unseen_s)
+        if gap > OFF_PATH_M:
+            return "it is off its path"
+        self._unseen_s = 0.0
+        return None

@@ -1,0 +1,103 @@
+"""A mission of scenario `pipeline` that three vehicles fly over MAVLink, while the edge is killed and comes back."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from simulator.commands.replay import logged_mission
+from simulator.records.decision import Decision
+from simulator.records.decision_log import read_decisions
+from simulator.sites.plans.plan_folder import export_plans
+from tests.e2e.processes import serving_edge, started
+from tests.simulator.edge_stub import free_port
+from tests.simulator.vehicles.airframe import once
+from tests.simulator.vehicles.pymavlink_peer import SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
+from tests.simulator.vehicles.worlds import mission_in, pipeline_folder, starts_m
+from tests.waiting import PATIENCE_S
+
+SEED, STEPS, UAVS = 0, 30, 3
+OUTAGE_S = 20.0
+# Beside the two commands, MAVSDK asks for telemetry's rates, for messages once, and for the autopilot's version.
+HARMLESS = {SPEED, SET_MODE, 511, 512, 520}
+
+
+class Printed(threading.Thread):
+    """What a command has printed so far."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        super().__init__(daemon=True)
+        assert process.stdout is not None
+        self._lines = process.stdout
+        self.text = ""
+        self.start()
+
+    def run(self) -> None:
+        for line in self._lines:
+            self.text += line
+
+    def until(self, text: str, seconds: float) -> None:
+        """Wait until it is there; that many seconds longer than a busy machine needs."""
+        ends = time.monotonic() + seconds + PATIENCE_S
+        while text not in self.text:
+            assert time.monotonic() < ends and self.is_alive(), self.text
+            time.sleep(0.05)
+
+
+def flown_with_an_outage(tmp_path: Path, speedup: float) -> tuple[list[Decision], list[PymavlinkPeer], str]:
+    """The decisions, the vehicles, and what the command printed; the edge is gone from the middle on, for 20 s."""
+    world = pipeline_folder(tmp_path / "pipeline_laps", SEED)
+    plans = export_plans(world, tmp_path / "plans", overwrite=False)
+    ports, log = [free_port() for _ in plans], tmp_path / "out"
+    store = {"AICVDS_MODE": "policy", "AICVDS_STORE": f"sqlite:///{tmp_path}/missions.db"}
+    with ExitStack() as stack:
+        peers = [
+            stack.enter_context(pymavlink_peer(mission_in(plan), port, uav + 1, start_m=start, speedup=speedup))
+            for uav, (plan, port, start) in enumerate(zip(plans, ports, starts_m(world, SEED), strict=True))
+        ]
+        first = stack.enter_context(ExitStack())
+        url, edge = first.enter_context(serving_edge(**store))
+        connections = [f"udpin://127.0.0.1:{port}" for port in ports]
+        command = ["fly", "--mavlink", *connections, "--world", str(world), "--edge", url, "--mission", "laps"]
+        command += ["--seed", str(SEED), "--steps", str(STEPS), "--speedup", str(speedup), "--out", str(log)]
+        process = stack.enter_context(started(*command))
+        printed = Printed(process)
+        printed.until(f"step {STEPS // 2 - 2}, UAV 2", STEPS * 10 / speedup)
+        edge.kill()
+        gone = time.monotonic()
+        first.close()
+        time.sleep(max(0.0, gone + OUTAGE_S - time.monotonic()))
+        stack.enter_context(serving_edge(port=url.rsplit(":", 1)[1], **store))
+        assert process.wait(STEPS * 10 / speedup + PATIENCE_S) == 0, printed.text
+        printed.join()
+    return read_decisions(log / "decisions.jsonl"), peers, printed.text
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_every_waypoint_is_decided_though_the_edge_is_gone_for_twenty_seconds(tmp_path: Path) -> None:
+    decisions, peers, told = flown_with_an_outage(tmp_path, speedup=2.0)
+    assert [(d.step, d.uav_id) for d in decisions] == [(step, uav) for step in range(STEPS) for uav in range(UAVS)]
+    # The outage begins within step 14 and lasts four steps, and the edge starts again in some more.
+    assert all(d.source == "onboard" for d in decisions if 15 <= d.step < 18), told
+    assert {d.source for d in decisions if d.step >= 25} >= {"policy"}, "the edge decides again"
+    assert len(logged_mission(tmp_path / "out").decisions) == STEPS * UAVS
+    check_wire(peers, decisions)
+
+
+def check_wire(peers: list[PymavlinkPeer], decisions: list[Decision]) -> None:
+    """No message that any vehicle got has a position; the speeds are the decided ones."""
+    for uav, peer in enumerate(peers):
+        kinds = {message.get_type() for _, message in peer.received}
+        assert kinds <= {"COMMAND_LONG", "PING", "MISSION_REQUEST_LIST", "MISSION_REQUEST_INT", "MISSION_ACK"}
+        commands: list[Any] = [m for _, m in peer.received if m.get_type() == "COMMAND_LONG"]
+        assert {m.command for m in commands} <= HARMLESS
+        speeds = [m.param2 for m in commands if m.command == SPEED]
+        assert once(speeds) == once(float(d.velocity) for d in decisions if d.uav_id == uav and d.velocity > 0)
+        assert all(int(m.param3) in (3, 4) for m in commands if m.command == SET_MODE)

@@ -1,0 +1,84 @@
+"""A body that flies a mission's waypoints by the clock, whatever speaks for it on the wire."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import groupby
+from typing import TypeVar
+
+EARTH_M = 6_371_008.8
+HEIGHT_M = 100.0
+GROUND_M = 1850.0
+
+
+Told = TypeVar("Told")
+
+
+def once(commands: Iterable[Told]) -> list[Told]:
+    """The commands without repetitions: MAVSDK sends a command again until it is acknowledged."""
+    return [command for command, _ in groupby(commands)]
+
+
+@dataclass(frozen=True)
+class Item:
+    """A mission item as it is on the wire."""
+
+    command: int
+    latitude: float
+    longitude: float
+    parameters: tuple[float, float] = (0.0, 0.0)
+
+
+class Airframe:
+    """Flies round its waypoints (command 16) and back to the first, at a speed that is set.
+
+    It computes on a sphere and with its own projection, and shares nothing with what it tests.
+
+    Attributes:
+        speed: m/s.
+        mode: `mission` flies; every other one stays in place.
+        flown_m: metres along the path since its beginning.
+        trace: every position that it reported, latitude and longitude.
+    """
+
+    def __init__(self, items: list[Item], start_m: float = 0.0, speedup: float = 1.0, speed: float = 5.0) -> None:
+        places = [(item.latitude, item.longitude) for item in items if item.command == 16]
+        self._north, self._east = math.radians(places[0][0]), math.radians(places[0][1])
+        ring = [self._metres(*place) for place in (*places, places[0])]
+        self._legs = list(zip(ring, ring[1:], strict=False))
+        self.length_m = sum(math.dist(*leg) for leg in self._legs)
+        self.speed, self.mode, self.armed, self.flown_m = speed, "mission", True, start_m
+        self.drift_m = 0.0
+        self.trace: list[tuple[float, float]] = []
+        self._speedup, self._at_s = speedup, time.monotonic()
+        self._lock = threading.Lock()
+
+    def position(self) -> tuple[float, float]:
+        """Latitude and longitude now."""
+        with self._lock:
+            now = time.monotonic()
+            if self.mode == "mission":
+                self.flown_m += self.speed * (now - self._at_s) * self._speedup
+            self._at_s = now
+            x, y = self._at(self.flown_m % self.length_m)
+            north = self._north + (y + self.drift_m) / EARTH_M
+            place = math.degrees(north), math.degrees(self._east + x / (EARTH_M * math.cos(self._north)))
+            self.trace.append(place)
+            return place
+
+    def _metres(self, latitude: float, longitude: float) -> tuple[float, float]:
+        north, east = math.radians(latitude) - self._north, math.radians(longitude) - self._east
+        return east * EARTH_M * math.cos(self._north), north * EARTH_M
+
+    def _at(self, along: float) -> tuple[float, float]:
+        for (x1, y1), (x2, y2) in self._legs:
+            length = math.dist((x1, y1), (x2, y2))
+            if along <= length:
+                share = along / length if length else 0.0
+                return x1 + share * (x2 - x1), y1 + share * (y2 - y1)
+            along -= length
+        return self._legs[-1][1]

@@ -1,0 +1,192 @@
+"""The flight of real UAVs, against a real edge; vehicles, clock and sensors are simulated."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from shared.trajectory import trajectories
+from shared.wire import DecideRequest
+from simulator.client import AsyncEdgeClient, EdgeClient
+from simulator.errors import UsageError
+from simulator.records.decision import Decision
+from simulator.sites.files.world_folder import site_from_folder
+from simulator.sites.site import Site
+from simulator.vehicles.field_flight import FieldFlight, Flown
+from simulator.vehicles.field_pilot import FieldPilot
+from simulator.vehicles.field_uav import FieldUav
+from simulator.vehicles.radio import Beacon, Collected, Spot, radio_named
+from simulator.vehicles.simulated_radio import SimulatedRadio
+from tests.conftest import Edge
+from tests.simulator.edge_stub import free_port
+from tests.simulator.sites.files.made_folder import EXAMPLE
+from tests.simulator.vehicles.stub_vehicle import SimulatedClock, StubVehicle
+from tests.waiting import PATIENCE_S
+
+STEPS = 12
+
+
+class Trial:
+    """Three stub vehicles over the example's sensors."""
+
+    def __init__(self, wind: float = 1.0) -> None:
+        self.site: Site = site_from_folder(EXAMPLE, STEPS)
+        self.clock = SimulatedClock()
+        self.vehicles = [StubVehicle(self.site, uav, self.clock, wind) for uav in range(3)]
+        self.uavs = [FieldUav(uav, vehicle, self.site) for uav, vehicle in enumerate(self.vehicles)]
+        self.radio = SimulatedRadio(self.site, seed=0)
+        self.events: list[tuple[int, str]] = []
+        self.requests: list[DecideRequest] = []
+        self.last_error: str | None = None
+
+    async def fly(self, url: str, on_decision: object = None, attempts: int = 2) -> Flown:
+        def decided(decision: Decision) -> None:
+            if callable(on_decision):
+                on_decision(decision)
+
+        async with AsyncEdgeClient(url, timeout_s=PATIENCE_S, attempts=attempts) as client:
+            pilot = FieldPilot(client, "field", self.site.scenario, PATIENCE_S)
+            pilot.on_request = self.requests.append
+            flight = FieldFlight(
+                self.site, self.uavs, self.radio, pilot, self.clock, decided, lambda uav, text: self.tell(uav, text)
+            )
+            flown = await flight.fly()
+            self.last_error = pilot.last_error
+            return flown
+
+    def tell(self, uav: int, text: str) -> None:
+        self.events.append((uav, text))
+
+
+def nobody() -> str:
+    return f"http://127.0.0.1:{free_port()}"
+
+
+async def test_the_edge_decides_every_waypoint_and_hears_every_outcome(edge: Edge) -> None:
+    trial, url = Trial(), str(edge(mode="policy").base_url)
+    flown = await trial.fly(url)
+    assert [(d.step, d.uav_id, d.source) for d in flown.decisions] == [
+        (step, uav, "policy") for step in range(STEPS) for uav in range(3)
+    ]
+    with EdgeClient(url) as operator:
+        status = operator.mission("field")
+    assert (status.decisions, status.feedback) == (3 * STEPS, 3 * STEPS)
+    assert sum(d.collected for d in flown.decisions) > 0 and flown.late == 0 and not flown.untold
+    for uav, vehicle in enumerate(trial.vehicles):
+        own = [d for d in flown.decisions if d.uav_id == uav]
+        assert [told for told in vehicle.told if isinstance(told, float)] == [d.velocity for d in own if d.velocity]
+        assert vehicle.mode == "mission"
+        for decision in own:
+            assert trajectories(trial.site.scenario)[uav].locate(decision.position)[1] < 0.1
+
+
+async def test_an_edge_that_forgot_the_mission_decides_on(edge: Edge) -> None:
+    trial, url = Trial(), str(edge(mode="policy").base_url)
+    with EdgeClient(url, timeout_s=PATIENCE_S) as operator:
+
+        def forget(decision: Decision) -> None:
+            if (decision.step, decision.uav_id) == (4, 2):
+                operator.delete_mission("field")
+
+        flown = await trial.fly(url, forget)
+        status = operator.mission("field")
+    assert {(d.source, d.reason) for d in flown.decisions} == {("policy", "mode_policy")}, trial.last_error
+    assert status.scenario == trial.site.scenario
+    assert status.decisions == status.feedback == 3 * (STEPS - 5)
+
+
+async def test_without_an_edge_they_decide_on_board_and_no_two_alike() -> None:
+    trial = Trial()
+    flown = await trial.fly(nobody(), attempts=1)
+    assert {(d.source, d.reason) for d in flown.decisions} == {("onboard", "edge_unreachable")}
+    assert len(flown.decisions) == len(trial.requests) == 3 * STEPS
+    for step in range(STEPS):
+        assert len({d.sensor_id for d in flown.decisions if d.step == step}) == 3
+
+
+async def test_against_the_wind_the_progress_is_the_true_one() -> None:
+    trial = Trial(wind=0.5)
+    flown = await trial.fly(nobody(), attempts=1)
+    assert len(flown.decisions) == 3 * STEPS
+    for request in trial.requests:
+        path = trajectories(trial.site.scenario)[request.uav_id]
+        # EOF flies at 7 m/s, of which half is left.
+        assert request.progress_m is not None
+        # A lap ends where it begins.
+        assert math.remainder(request.progress_m - 35.0 * request.step, path.length_m) == pytest.approx(0.0, abs=1.0)
+        assert path.at(request.progress_m) == pytest.approx(request.position, abs=1.0)
+
+
+async def test_who_lands_is_told_nothing_more_and_the_others_fly_on() -> None:
+    trial = Trial()
+    trial.vehicles[1].lands_at_s = 35.0
+    flown = await trial.fly(nobody(), attempts=1)
+    assert [d.step for d in flown.decisions if d.uav_id == 1] == [0, 1, 2, 3]
+    assert flown.untold == {"it lands": STEPS - 4} and (1, "it lands") in trial.events
+    assert len([d for d in flown.decisions if d.uav_id != 1]) == 2 * STEPS
+
+
+async def test_who_is_off_its_path_or_outside_the_fence_is_told_nothing() -> None:
+    trial = Trial()
+    trial.vehicles[0].shift_m = 150.0
+    flown = await trial.fly(nobody(), attempts=1)
+    assert trial.vehicles[0].told == [] and flown.untold == {"it is off its path": STEPS}
+
+
+async def test_a_pilot_who_takes_a_waiting_uav_over_keeps_it() -> None:
+    trial = Trial()
+    uav, vehicle = trial.uavs[0], trial.vehicles[0]
+    await uav.look(0.0)
+    await uav.command(0)
+    vehicle.mode = "other"
+    await uav.look(10.0)
+    assert uav.away == "it does not fly its mission"
+    await uav.hand_back()
+    assert vehicle.told == ["hold"]
+    vehicle.mode = "mission"
+    await uav.look(10.0)
+    assert uav.away is None
+
+
+async def test_a_command_that_is_not_carried_out_is_told() -> None:
+    trial = Trial()
+    trial.vehicles[2].deaf = True
+    flown = await trial.fly(nobody(), attempts=1)
+    assert len(flown.disobeyed) == STEPS and (2, "stub 2 did not do 7.0: TIMEOUT") in trial.events
+    assert len(flown.decisions) == 3 * STEPS
+
+
+async def test_a_mission_of_another_world_is_not_joined(edge: Edge) -> None:
+    url, site = str(edge(mode="policy").base_url), site_from_folder(EXAMPLE, STEPS)
+    async with AsyncEdgeClient(url, timeout_s=PATIENCE_S) as client:
+        assert (await FieldPilot(client, "m", site.scenario, PATIENCE_S).join()).scenario == site.scenario
+        assert (await FieldPilot(client, "m", site.scenario, PATIENCE_S).join()).decisions == 0
+        other = site_from_folder(EXAMPLE, STEPS + 1).scenario
+        with pytest.raises(UsageError, match="--mission m: the edge has this mission for another world"):
+            await FieldPilot(client, "m", other, PATIENCE_S).join()
+        with pytest.raises(UsageError, match="in mode policy; leave out --mode"):
+            await FieldPilot(client, "m", site.scenario, PATIENCE_S, mode="llm").join()
+
+
+PAGE = Path(__file__).parents[3] / "docs" / "your-uav.md"
+
+
+async def test_the_radio_shown_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    [shown] = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "own_gateway.py").write_text(shown, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    site = site_from_folder(EXAMPLE)
+    radio = radio_named("own_gateway:Gateway", site, seed=0)
+    spot = Spot(0, 0, (0.0, 0.0), (0.0, 0.0))
+    assert await radio.beacons(spot) == {0: Beacon(12, 41.5, -93.0, 3)}
+    assert await radio.collect(spot, 0) == Collected(12, failed=False)
+    for name, why in (
+        ("own_gateway", "write simulated, or MODULE:NAME"),
+        ("no_such:Radio", "No module named 'no_such'; it is looked for in the working directory"),
+        ("own_gateway:Radio", "has no attribute 'Radio'"),
+    ):
+        with pytest.raises(UsageError, match=why):
+            radio_named(name, site, seed=0)
