@@ -64,7 +64,6 @@ class Intake:
         self._devices = {device.dev_eui.lower(): _Known(device) for device in configuration.device}
         self._lock = threading.Lock()
         self._waiting: dict[tuple[str, int], Waiting] = {}
-        self.news = threading.Event()
 
     def take(self, payload: bytes, now: datetime | None = None) -> Taken:
         """Take a message, whatever it is; returns and counts what became of it."""
@@ -72,8 +71,6 @@ class Intake:
             taken = self._take(payload, now or datetime.now(UTC))
             self._counts.waiting.set(len(self._waiting))
         self._counts.uplinks.labels(taken).inc()
-        if taken == "accepted":
-            self.news.set()
         return taken
 
     def _take(self, payload: bytes, now: datetime) -> Taken:
@@ -139,15 +136,18 @@ class Intake:
         if there is None or there.at < reading.at:
             self._waiting[key] = reading
 
-    def due(self) -> dict[str, list[Waiting]]:
-        """The waiting readings by mission; they wait no longer."""
+    def due(self, now: datetime | None = None) -> dict[str, list[Waiting]]:
+        """The waiting readings by mission; they wait no longer. Those that have become too old are dropped."""
+        now = now or datetime.now(UTC)
         with self._lock:
             waiting, self._waiting = self._waiting, {}
-            self.news.clear()
             self._counts.waiting.set(0)
         by_mission: dict[str, list[Waiting]] = {}
         for reading in waiting.values():
-            by_mission.setdefault(reading.mission_id, []).append(reading)
+            if (now - reading.at).total_seconds() > self._configuration.network.max_age_s:
+                self._counts.readings.labels("too_old").inc()
+            else:
+                by_mission.setdefault(reading.mission_id, []).append(reading)
         return by_mission
 
     def put_back(self, readings: list[Waiting]) -> None:
@@ -167,5 +167,8 @@ def _number(fields: Mapping[str, Any], name: str) -> float | None:
         value = value.get(part)
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
     return number if math.isfinite(number) else None

@@ -103,5 +103,10 @@ class Subscription:
             log.warning("the connection to %s is lost: %s; it is tried again", self._broker.url, reason)
 
     def _received(self, client: Client, _: Any, message: MQTTMessage) -> None:
-        taken = self._intake.take(bytes(message.payload))
+        try:
+            taken = self._intake.take(bytes(message.payload))
+        except Exception:
+            # An error would end the client's thread, and no further message would come.
+            log.exception("a message of %s could not be taken", message.topic)
+            return
         log.debug("%s: %s", message.topic, taken)

@@ -204,3 +204,29 @@ def test_what_is_wrong_is_named_before_anything_starts(tmp_path: Path) -> None:
     refused = run("mqtt", str(path))
     assert refused.returncode == 2
     assert refused.stderr.strip().endswith("lorawan.toml: device: sensor 10 of wide appears more than once")
+
+
+def test_an_edge_that_is_killed_has_what_it_merged_and_gets_what_came_meanwhile(tmp_path: Path, report: Report) -> None:
+    port, store = free_port(), tmp_path / "missions.db"
+    served = ("serve", "--port", str(port), "--mode", "policy", "--store", str(store))
+    url = f"http://127.0.0.1:{port}"
+    with ExitStack() as stack:
+        there = stack.enter_context(broker(tmp_path, "allow_anonymous true"))
+        client = stack.enter_context(httpx.Client(base_url=url, timeout=PATIENCE_S, trust_env=False))
+        forwarding = stack.enter_context(started("mqtt", str(file(tmp_path, there.port)), "--edge", url))
+        output_until(forwarding, "subscribed at")
+        topic = TOPICS["chirpstack"].format("kp-0")
+        with started(*served, AICVDS_PLANNER="off") as edge:
+            output_until(edge, "listening on")
+            client.put("/missions/wide", json={"scenario": {"name": "wide", "sensors": 20}})
+            client.post("/decide", json=report(mission_id="wide"))
+            there.publish(topic, chirpstack_up(queue=41, at=ago(95)))
+            until(lambda: merged(client) == 1)
+            edge.kill()
+        there.publish(topic, chirpstack_up(queue=44, f_cnt=2, at=ago(65)))
+        there.publish(topic, chirpstack_up(queue=47, f_cnt=3, at=ago(35)))
+        output_until(forwarding, "takes no readings")
+        with started(*served, AICVDS_PLANNER="off") as edge:
+            output_until(edge, "listening on")
+            # One from before, and of the two that came meanwhile the newer one.
+            until(lambda: merged(client) == 2)

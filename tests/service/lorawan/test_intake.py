@@ -53,8 +53,9 @@ def take(taking: Intake, message: dict[str, Any], later_s: float = 1.0) -> Taken
     return taking.take(packed(message), NOW + timedelta(seconds=later_s))
 
 
-def waiting(taking: Intake) -> list[Waiting]:
-    return [reading for readings in taking.due().values() for reading in readings]
+def waiting(taking: Intake, later_s: float = 60.0) -> list[Waiting]:
+    due = taking.due(NOW + timedelta(seconds=later_s))
+    return [reading for readings in due.values() for reading in readings]
 
 
 @pytest.mark.parametrize(
@@ -151,6 +152,8 @@ def test_a_frame_counter_that_begins_again_is_no_duplicate() -> None:
         ({"object": {"queue": True}}, "no_queue"),
         ({"object": {"queue": -1}}, "no_queue"),
         ({"object": {"queue": float("nan")}}, "no_queue"),
+        ({"object": {"queue": 10**400}}, "no_queue"),
+        ({"object": {"queue": 1e308 * 10}}, "no_queue"),
         ({"object": {"queue": {"queue": 3}}}, "no_queue"),
         ({"time": "2026-11-23T12:30:00Z"}, "future"),
         ({"time": "2026-11-23T09:00:00Z"}, "too_old"),
@@ -198,6 +201,14 @@ def test_a_reading_that_is_put_back_gives_way_to_a_newer_one() -> None:
     take(taking, chirpstack_up(queue=9, f_cnt=2, at=NOW + timedelta(seconds=5)), 6)
     taking.put_back(old)
     assert sorted(reading.queue for reading in waiting(taking)) == [2.0, 9.0]
+
+
+def test_a_reading_that_waited_too_long_is_dropped() -> None:
+    taking = intake()
+    assert take(taking, chirpstack_up()) == "accepted"
+    assert take(taking, chirpstack_up(device=1, at=NOW + timedelta(seconds=50))) == "accepted"
+    assert [reading.sensor_id for reading in waiting(taking, 3601.0)] == [11]
+    assert taking._counts.registry.get_sample_value("aicvds_mqtt_readings_total", {"result": "too_old"}) == 1
 
 
 @pytest.mark.parametrize("server", ["chirpstack", "the-things-stack"])

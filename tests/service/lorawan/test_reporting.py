@@ -9,10 +9,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.lorawan.intake import Intake
+from service.lorawan.intake import Intake, Waiting
 from service.lorawan.reporting import Reporting
 from tests.service.lorawan.messages import chirpstack_up, packed
-from tests.service.lorawan.test_intake import intake, waiting
+from tests.service.lorawan.test_intake import intake
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -32,6 +32,10 @@ def reporting(taking: Intake, edge: str = "http://edge", handler: Handler | None
     return Reporting(edge, None, taking, taking._counts, transport)
 
 
+def waiting(taking: Intake) -> list[Waiting]:
+    return [reading for readings in taking.due().values() for reading in readings]
+
+
 def counted(taking: Intake) -> dict[str, float]:
     return {
         sample.labels["result"]: sample.value
@@ -49,8 +53,7 @@ def test_readings_enter_the_mission_of_a_real_edge(edge: Edge, report: Report, m
     sending = reporting(taking, str(client.base_url).rstrip("/"))
     # Devices 0 and 1 are sensors 10 and 11, so the world has twelve.
     assert sending.report() > 0 and counted(taking) == {"no_mission": 2}
-    scenario = client.get("/openapi.json") and {"name": "wide", "sensors": 12}
-    assert client.put("/missions/default", json={"scenario": scenario}).status_code == 200
+    assert client.put("/missions/default", json={"scenario": {"name": "wide", "sensors": 12}}).status_code == 200
     sending.report()
     assert counted(taking) == {"no_mission": 2, "early": 2}
     client.post("/decide", json=report(mission_id="default", step=20))
