@@ -86,8 +86,9 @@ class FieldUav:
                 await self.vehicle.hold()
                 self.waits, self._mode_changed_s = True, time.monotonic()
             return
-        await self.vehicle.set_speed(float(velocity))
+        # Some autopilots forget the speed when the mode changes.
         await self.hand_back()
+        await self.vehicle.set_speed(float(velocity))
 
     async def hand_back(self) -> None:
         """Let it go on with its mission if this flight made it wait; raises :class:`VehicleError`."""

@@ -136,6 +136,34 @@ async def test_who_is_off_its_path_or_outside_the_fence_is_told_nothing() -> Non
     assert trial.vehicles[0].told == [] and flown.untold == {"it is off its path": STEPS}
 
 
+async def test_the_simulated_sensors_are_those_of_simulate() -> None:
+    """With every sensor in range of one UAV that collects, packets, queues and losses go as in the simulated world."""
+    site = site_from_folder(EXAMPLE, STEPS)
+    world, radio = site.world(), SimulatedRadio(site, seed=3)
+    observations, _ = world.reset(seed=3)
+    for step in range(STEPS):
+        here = world.fleet.positions
+        heard = [await radio.beacons(Spot(uav, step, tuple(here[uav]), (0.0, 0.0))) for uav in range(3)]
+        for uav in range(3):
+            seen = observations[f"uav_{uav}"]
+            now = [j for j in range(site.scenario.sensors) if seen["last_heard"][j] == step]
+            assert sorted(heard[uav]) == now
+            for j in now:
+                beacon = heard[uav][j]
+                assert beacon.queue == seen["queue"][j]
+                assert beacon.battery_j == pytest.approx(seen["battery"][j])
+                assert beacon.channel_gain_db == pytest.approx(seen["channel_gain"][j])
+        chosen = [step % site.scenario.sensors, (step + 5) % site.scenario.sensors, step % site.scenario.sensors]
+        actions = {f"uav_{uav}": [chosen[uav], 14] for uav in range(3)}
+        observations, _, _, _, infos = world.step(actions)
+        for uav in range(3):
+            x, y = world.fleet.positions[uav].tolist()
+            got = await radio.collect(Spot(uav, step, (x, y), (0.0, 0.0)), chosen[uav])
+            assert (got.packets, got.failed) == (infos[f"uav_{uav}"]["collected"], infos[f"uav_{uav}"]["failed"])
+    await radio.beacons(Spot(0, STEPS, (0.0, 0.0), (0.0, 0.0)))
+    assert radio.lost == world.sensors.lost.sum()
+
+
 async def test_a_pilot_who_takes_a_waiting_uav_over_keeps_it() -> None:
     trial = Trial()
     uav, vehicle = trial.uavs[0], trial.vehicles[0]

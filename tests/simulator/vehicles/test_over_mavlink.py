@@ -36,7 +36,6 @@ from tests.waiting import PATIENCE_S, until
 QUICK = ("--speedup", "20", "--patience-s", "0.45", "--deadline-ms", "400")
 # Beside the two commands, MAVSDK asks for telemetry's rates, for messages once, and for the autopilot's version.
 HARMLESS = {SPEED, SET_MODE, 511, 512, 520}
-LINK_STALE_S = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +136,7 @@ def test_the_wire_by_pymavlink_positions_speeds_and_a_lost_link(
     # A decision as the link dies is made from the last position that came.
     assert max(gap_m(d, peer.airframe.trace) for d in decisions) < 1
     missing = sorted(set(range(36)) - {d.step for d in decisions})
-    assert 2 <= len(missing) <= 20 and missing == list(range(missing[0], missing[-1] + 1))
+    assert len(missing) >= 2 and missing == list(range(missing[0], missing[-1] + 1))
 
 
 async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> None:
@@ -161,7 +160,7 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
             await uav.command(9)
             assert (peer.airframe.mode, peer.airframe.speed) == ("mission", 9.0)
             told = once((m.command, m.param2 if m.command == SPEED else m.param3) for _, m in peer.commands())
-            assert told == [(SET_MODE, 3.0), (SPEED, 9.0), (SET_MODE, 4.0)]
+            assert told == [(SET_MODE, 3.0), (SET_MODE, 4.0), (SPEED, 9.0)]
             count = len(peer.commands())
             peer.airframe.drift_m = 150.0
             await becomes("it is off its path")
@@ -211,7 +210,7 @@ def test_who_does_not_fly_is_named(missions: list[list[Item]], port: int, tmp_pa
     assert silent.returncode == 1 and "no autopilot was heard for 0.3 s" in silent.stderr
     with pymavlink_peer(missions[0], port) as peer:
         peer.airframe.armed = False
-        flown = run_here(*arguments(port, "http://127.0.0.1:9", tmp_path, "--wait-s", "1.5"))
+        flown = run_here(*arguments(port, "http://127.0.0.1:9", tmp_path, "--wait-s", "3"))
         assert flown.returncode == 1
         assert "waiting for UAV 0: it is not armed" in flown.stderr and "arm it, take off and start" in flown.stderr
         assert peer.commands() == []
