@@ -65,7 +65,7 @@ class Replay:
     """
 
     run: Annotated[Positional[Path], arg(metavar="DIR")]
-    """Folder of `aicvds simulate --edge`."""
+    """Folder of `aicvds simulate --edge` or `aicvds fly`."""
     edge: Annotated[str | None, arg(metavar="URL", help_behavior_hint="")] = None
     """The edge's address, such as http://127.0.0.1:8000. Required."""
     mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None

@@ -9,6 +9,7 @@ import numpy as np
 
 from shared.scenario import Point
 from shared.trajectory import trajectories
+from simulator.errors import VehicleError
 from simulator.sites.site import Site
 from simulator.vehicles.heard_beacons import HeardBeacons
 from simulator.vehicles.path_follower import PathFollower
@@ -55,7 +56,7 @@ class FieldUav:
         """Take the newest telemetry, that many seconds after the last."""
         self._unseen_s += seconds
         state = await self.vehicle.state()
-        self.away = self._obstacle(state)
+        self.away = self._taken(state) or self._misplaced(state.position)
         if self.away is None and state.mode == "mission" and not self._mode_is_old:
             # The pilot may have resumed the mission too.
             self.waits = False
@@ -79,8 +80,11 @@ class FieldUav:
         """Fly at this velocity along the mission, or wait in place at 0 m/s.
 
         Raises:
-            VehicleError: the vehicle did not do it.
+            VehicleError: the vehicle did not do it, or is not to be told: somebody took it over during the decision.
         """
+        why = self._taken(await self.vehicle.state())
+        if why is not None:
+            raise VehicleError(f"{self.vehicle.name} was not told to fly at {velocity} m/s: {why}")
         if velocity == 0:
             if not self.waits:
                 await self.vehicle.hold()
@@ -100,8 +104,8 @@ class FieldUav:
     def _mode_is_old(self) -> bool:
         return time.monotonic() - self._mode_changed_s < MODE_LAG_S
 
-    def _obstacle(self, state: VehicleState) -> str | None:
-        """Why the UAV is told nothing, or ``None``."""
+    def _taken(self, state: VehicleState) -> str | None:
+        """Why the UAV is told nothing wherever it is, or ``None``."""
         if not state.connected or state.position is None:
             return "the link is lost"
         if not state.armed or state.mode == "landing":
@@ -113,10 +117,12 @@ class FieldUav:
             return "it does not fly its mission"
         if state.height_m < AIRBORNE_M:
             return "it is on the ground"
-        return self._misplaced(state.position)
+        return None
 
-    def _misplaced(self, degrees: Point) -> str | None:
+    def _misplaced(self, degrees: Point | None) -> str | None:
+        """Why the UAV is told nothing at this position, or ``None``."""
         assert self._site.frame is not None, "a site with vehicles has a place on the globe"
+        assert degrees is not None, "without a position the link counts as lost"
         x, y = self._site.frame.metres([degrees])[0].tolist()
         self._here, self._degrees = (x, y), degrees
         if not all(fence.allows(self._here) for fence in self._site.fences):

@@ -11,7 +11,7 @@ import pytest
 from shared.trajectory import trajectories
 from shared.wire import DecideRequest
 from simulator.client import AsyncEdgeClient, EdgeClient
-from simulator.errors import UsageError
+from simulator.errors import UsageError, VehicleError
 from simulator.records.decision import Decision
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.site import Site
@@ -177,6 +177,10 @@ async def test_a_pilot_who_takes_a_waiting_uav_over_keeps_it() -> None:
     vehicle.mode = "mission"
     await uav.look(10.0)
     assert uav.away is None
+    vehicle.mode = "other"
+    with pytest.raises(VehicleError, match="stub 0 was not told to fly at 0 m/s: it does not fly its mission"):
+        await uav.command(0)
+    assert vehicle.told == ["hold"]
 
 
 async def test_a_command_that_is_not_carried_out_is_told() -> None:
