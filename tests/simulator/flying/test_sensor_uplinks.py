@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import cast
 
 import httpx
 import numpy as np
 import pytest
 
 from shared.readings import ReadingsRequest, ReadingsResponse
+from shared.records import Records, take_readings
 from shared.scenario import scenario_named
 from shared.wire import MissionSpec
 from simulator.client import EdgeClient
 from simulator.flying.flight import fly
-from simulator.flying.pilots import EdgePilot
+from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.flying.sensor_uplinks import SensorUplinks, UplinkPlan
+from simulator.policies.mpc import RecedingHorizon
+from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.site import Site
 from simulator.world.sensors import Sensors
 
 Edge = Callable[..., httpx.Client]
+WORLD = site_from_folder(Path(__file__).parents[3] / "examples" / "pipeline_world")
 SCENARIO = scenario_named("paper").model_copy(update={"steps": 6})
 
 
@@ -53,3 +59,46 @@ def test_half_of_the_sensors_report_every_third_step(edge: Edge, monkeypatch: py
     # Of those that no UAV heard in the same step, the edge learns something.
     status = http.get("/missions/test").json()
     assert 0 < status["readings"] <= len(sent)
+
+
+class Hearing(RecedingHorizon):
+    """Keeps the fleet's belief of what it hears, and flies the same way whatever that is."""
+
+    def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
+        return -1, 7
+
+
+class Sink:
+    """Takes readings into a belief, as an edge does."""
+
+    def __init__(self, policy: Hearing) -> None:
+        self._policy, self._records = policy, Records(WORLD.scenario)
+
+    def read(self, mission_id: str, request: ReadingsRequest) -> None:
+        ids, steps, queue, battery = zip(
+            *((r.sensor_id, r.step, r.queue, r.battery) for r in request.readings), strict=True
+        )
+        take_readings(
+            np.array(ids), np.array(steps), np.array(queue), np.array(battery), self._records, self._policy.belief
+        )
+
+
+def error_of_what_no_uav_hears(share: float) -> float:
+    """Mean error of the expected queues, packets, of the sensors that no UAV hears in a step."""
+    policy = Hearing()
+    pilot = LocalPilot("mpc", WORLD.scenario, 0, policy)
+    uplinks = SensorUplinks(cast(EdgeClient, Sink(policy)), "test", WORLD.scenario, 0, UplinkPlan(share=share, every=3))
+    errors: list[float] = []
+
+    def decided(step: int, sensors: Sensors) -> None:
+        unheard = policy.belief.heard < step
+        errors.extend(np.abs(policy.belief.queue(step) - sensors.queue)[unheard])
+        uplinks.send(step, sensors)
+
+    fly(WORLD, pilot, 0, on_decided=decided)
+    return float(np.mean(errors))
+
+
+def test_readings_of_half_of_the_sensors_take_a_fifth_off_the_fleets_error() -> None:
+    without, half, every = (error_of_what_no_uav_hears(share) for share in (0.0, 0.5, 1.0))
+    assert half < 0.8 * without and every < 0.6 * without
