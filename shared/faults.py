@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
 from typing import Any
 
 _PREFIXES = ("Value error, ", "Assertion failed, ")
+# The field is named before the text: "queue: must be a valid number".
+_SUBJECT = re.compile(r"^[A-Z][a-z]+ should ")
 _PLAIN = {
     "missing": "is missing",
     "dict_type": "must be a JSON object",
@@ -28,7 +31,7 @@ def problem_of(error: Mapping[str, Any], known: Collection[str] = ()) -> str:
     text = _PLAIN.get(error["type"], str(error["msg"]))
     for prefix in _PREFIXES:
         text = text.removeprefix(prefix)
-    return text
+    return _SUBJECT.sub("must ", text)
 
 
 def suggestion(name: str, known: Collection[str]) -> str:

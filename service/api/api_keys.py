@@ -20,6 +20,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from shared.faults import problem_of
+
 log = logging.getLogger(__name__)
 
 # `decide`: request decisions, report outcomes, read. `admin`: make, guide and delete missions. `readings`: report what
@@ -65,7 +67,7 @@ class KeyFile(BaseModel):
         except ValidationError as error:
             fault = error.errors()[0]
             at = ".".join(map(str, fault["loc"])) or "the file"
-            raise BadKeys(f"{path}: {at}: {fault['msg']}") from None
+            raise BadKeys(f"{path}: {at}: {problem_of(fault)}") from None
 
     def write(self, path: Path) -> None:
         """Replace the file atomically, readable only by its owner; raises ``BadKeys``.

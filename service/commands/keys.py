@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from service.api.api_keys import BadKeys, KeyFile, Scope, editing
+from shared.faults import problem_of
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def main(argv: list[str]) -> int:
         print(f"aicvds keys: {error}", file=sys.stderr)
     except ValidationError as error:
         fault = error.errors()[0]
-        print(f"aicvds keys: {fault['loc'][0]}: {fault['msg']}", file=sys.stderr)
+        print(f"aicvds keys: {fault['loc'][0]}: {problem_of(fault)}", file=sys.stderr)
     return 2
 
 

@@ -67,7 +67,7 @@ def test_every_command_explains_itself(command: str) -> None:
 @pytest.mark.parametrize(
     ("args", "env", "said"),
     [
-        (["fly"], {}, "no command 'fly'"),
+        (["sail"], {}, "no command 'sail'"),
         (["serve", "--port", "70000"], {}, "--port 70000"),
         (["serve"], {"AICVDS_TOP_K": "0"}, "AICVDS_TOP_K"),
         (["serve"], {"AICVDS_LLM_URL": "localhost:8080"}, "AICVDS_LLM_URL"),

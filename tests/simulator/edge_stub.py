@@ -194,7 +194,7 @@ def _misbehave(behaviour: Behaviour, body: DecideRequest) -> Response | None:
         case "garbage":
             return Response("42 7, roughly")
         case "invalid":
-            errors = [{"field": "sensors.queue[0]", "problem": "Input should be less than 100000"}]
+            errors = [{"field": "sensors.queue[0]", "problem": "must be less than 100000"}]
             return _problem(422, "sensors.queue[0]: too many", errors=errors)
         case "crash":
             return _problem(500, "the edge failed; its log has the details")

@@ -191,8 +191,8 @@ def test_the_command_makes_lists_and_removes(tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["add", "two words"], "name: String should match pattern"),
-        (["add", "fleet", "--per-minute", "0"], "per_minute: Input should be greater than or equal to 1"),
+        (["add", "two words"], "name: must match pattern"),
+        (["add", "fleet", "--per-minute", "0"], "per_minute: must be greater than or equal to 1"),
         (["add", "fleet", "--scopes"], "scopes: "),
         (["list"], "No such file"),
     ],

@@ -76,6 +76,8 @@ def test_a_body_without_a_content_type_is_a_415_that_says_which(edge: Edge, repo
         ("/missions/m", {"zzzz": 3}, "there is no such field"),
         ("/missions/m", {"note": "a\nb"}, "note: must be one paragraph"),
         ("/missions/m", [], "must be a JSON object"),
+        ("/missions/m", {"seed": "one"}, "seed: must be a valid integer"),
+        ("/missions/m", {"note": 3}, "note: must be a valid string"),
     ],
 )
 def test_a_fault_is_told_in_plain_words(edge: Edge, path: str, body: object, said: str) -> None:

@@ -41,7 +41,7 @@ def test_a_taken_port_and_bad_settings_have_remedies(
     printed = capsys.readouterr().out
     assert "aicvds serve --port 0" in printed
     assert "did you mean AICVDS_TOP_K?" in printed and "unset AICVDS_TOPK" in printed
-    assert "AICVDS_TOP_K: Input should be greater" in printed and "3 in the way" in printed
+    assert "AICVDS_TOP_K: must be greater" in printed and "3 in the way" in printed
 
 
 def test_a_locked_store_names_its_file(tmp_path: Path) -> None:
