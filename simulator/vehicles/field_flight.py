@@ -96,7 +96,7 @@ class FieldFlight:
                 if all(uav.landed for uav in self._uavs):
                     break
         finally:
-            # Where the flight is cut short, the outcome of what is being flown stays unknown.
+            # If the flight is cut short, the outcomes of its last decisions stay unknown.
             await self._end()
         return self.flown
 

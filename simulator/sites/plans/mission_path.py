@@ -126,7 +126,7 @@ def _check_jump(item: MissionItem, items: Sequence[MissionItem], first_number: i
     """Raises ``ValueError`` for a jump that does not begin the whole path again."""
     target = int(item.parameters[0])
     before = [other.number for other in items if first_number is not None and other.number < first_number]
-    # A jump to what is set between take-off and the first waypoint begins the path again too.
+    # A jump to an item between take-off and the first waypoint also begins the path again.
     allowed = {other.number for other in items if other.number in before and other.command > _LAST_NAVIGATION}
     if first_number is None or target not in allowed | {first_number}:
         raise ValueError(f"{item.where}: it jumps to item {target}; only a jump to the first waypoint can be flown")
