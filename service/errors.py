@@ -41,3 +41,19 @@ class Unavailable(Refused):
     """The request is right, and the edge cannot serve it now, or not for sure: to be sent again."""
 
     status = HTTPStatus.SERVICE_UNAVAILABLE
+
+
+class Misdirected(Refused):
+    """Another edge owns the mission: the request is to be sent there.
+
+    Attributes:
+        owner: that edge's URL; None where it gave none.
+        retry_s: seconds until its lease ends, unless it is renewed. From then on any edge may take the mission over.
+    """
+
+    status = HTTPStatus.MISDIRECTED_REQUEST
+
+    def __init__(self, field: str, detail: str, owner: str | None, retry_s: float) -> None:
+        super().__init__(field, detail)
+        self.owner = owner
+        self.retry_s = retry_s

@@ -392,3 +392,8 @@ class Problem(BaseModel):
     status: int
     detail: str
     errors: list[dict[str, str]] = []
+    owner: str | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="of a 421: the URL of the edge that has the mission; the header Location has the whole address",
+    )

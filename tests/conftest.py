@@ -38,7 +38,7 @@ torch.set_num_threads(1)
 # Set where the tests must be complete, as in CI: a test whose program is missing then fails.
 _COMPLETE = "TESTS_COMPLETE"
 # Programs from Debian's packages of the same names; the mark `needs` names a test's program.
-_PROGRAMS = ("chromium", "mosquitto", "prometheus")
+_PROGRAMS = ("chromium", "haproxy", "mosquitto", "prometheus")
 
 Edge = Callable[..., httpx.Client]
 

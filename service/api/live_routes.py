@@ -98,7 +98,10 @@ async def page() -> FileResponse:
 
 @router.get("/missions", tags=["missions"])
 async def list_missions(engine: TheEngine, request: Request) -> MissionList:
-    """All missions: the one that decided last first, those that are only in the store last."""
+    """The missions of this edge: the one that decided last first, those that are only in the store last.
+
+    Of a store that several edges share, the missions of the others are left out.
+    """
     missions = engine.missions
     loaded = {mission.mission_id: mission for mission in missions.loaded}
     lately = [name for name in engine.live.history.missions() if name in loaded]

@@ -230,6 +230,7 @@ PROBLEMS: dict[int, tuple[str | None, str]] = {
     409: ("mission_id", "mission patrol has another spec: DELETE it or choose another ID"),
     413: ("body", "larger than 2000000 bytes"),
     415: ("body", "Content-Encoding 'br': use gzip, zstd or none"),
+    421: ("mission_id", "another edge has mission patrol: send the request there"),
     422: ("mission_id", "must match pattern '^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$'"),
     429: (None, "key fleet-1 has a limit of 600 requests a minute"),
     503: ("mission_id", "the store fails: nothing was recorded, send it again"),
@@ -244,5 +245,6 @@ def problem(status: int) -> Example:
         status=status,
         detail=f"{field}: {fault}" if field else fault,
         errors=[{"field": field, "problem": fault}] if field else [],
+        owner="http://edge-2:8000" if status == HTTPStatus.MISDIRECTED_REQUEST else None,
     )
     return whole.model_dump(mode="json")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
+from urllib.parse import quote
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
-from service.errors import Refused, Unavailable
+from service.errors import Misdirected, Refused, Unavailable
 from shared.faults import problem_of
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.readings import ReadingsRequest, SensorReading
@@ -39,10 +41,16 @@ _RETRY_S = 1
 
 
 def problem_response(
-    status: int, detail: str, errors: Sequence[dict[str, str]] = (), kind: str = "about:blank"
+    status: int,
+    detail: str,
+    errors: Sequence[dict[str, str]] = (),
+    kind: str = "about:blank",
+    owner: str | None = None,
 ) -> Response:
     """An ``application/problem+json`` response of the type ``kind``, which never repeats the request's content."""
-    body = Problem(type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors))
+    body = Problem(
+        type=kind, title=HTTPStatus(status).phrase, status=status, detail=detail, errors=list(errors), owner=owner
+    )
     return Response(body.model_dump_json(), status_code=status, media_type=CONTENT_TYPE)
 
 
@@ -62,8 +70,10 @@ def install(app: FastAPI) -> None:
     """Turn every error of the app into a problem document."""
 
     @app.exception_handler(Refused)
-    async def refused(_: Request, error: Refused) -> Response:
+    async def refused(request: Request, error: Refused) -> Response:
         faults = [{"field": error.field, "problem": error.detail}]
+        if isinstance(error, Misdirected):
+            return _misdirected(request, error, faults)
         response = problem_response(error.status, str(error), faults, error.type)
         if isinstance(error, Unavailable):
             response.headers["Retry-After"] = str(_RETRY_S)
@@ -89,6 +99,16 @@ def install(app: FastAPI) -> None:
     async def unexpected(request: Request, error: Exception) -> Response:
         log.error("%s %s failed", request.method, request.url.path, exc_info=error)
         return problem_response(500, "the edge failed; its log has the details")
+
+
+def _misdirected(request: Request, error: Misdirected, faults: Sequence[dict[str, str]]) -> Response:
+    """A 421 with the request's address at the owner, and the seconds after which any edge may take the mission over."""
+    response = problem_response(error.status, str(error), faults, error.type, error.owner)
+    if error.owner is not None:
+        query = f"?{request.url.query}" if request.url.query else ""
+        response.headers["Location"] = f"{error.owner}{quote(request.url.path)}{query}"
+    response.headers["Retry-After"] = str(max(_RETRY_S, math.ceil(error.retry_s)))
+    return response
 
 
 def _sends_json(request: Request) -> bool:

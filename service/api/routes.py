@@ -61,7 +61,7 @@ KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000,
 @router.post(
     "/decide",
     response_model=DecideResponse,
-    responses=documented(400, 404, 408, 409, 413, 415, 422, 503),
+    responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503),
     tags=["decisions"],
 )
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
@@ -73,7 +73,7 @@ async def decide(body: DecideRequest, request: Request, key: RequestKey = None) 
     return Response(answer.model_dump_json(), media_type="application/json", headers=timing)
 
 
-@router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
+@router.post("/decide/batch", responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503), tags=["decisions"])
 async def decide_batch(
     body: BatchRequest, request: Request, engine: TheEngine, key: RequestKey = None
 ) -> BatchResponse:
@@ -81,42 +81,39 @@ async def decide_batch(
     return BatchResponse(decisions=await engine.decide_batch(body, may_make=may_command(request), key=key))
 
 
-@router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["decisions"])
+@router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503), tags=["decisions"])
 async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
     """What came of a decision. Sent twice, it is applied once; acknowledged, it is on disk."""
     return await engine.feedback(body)
 
 
-@router.put("/missions/{mission_id}", responses=documented(400, 408, 409, 413, 415, 422, 503), tags=["missions"])
+@router.put("/missions/{mission_id}", responses=documented(400, 408, 409, 413, 415, 421, 422, 503), tags=["missions"])
 async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
     """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
     mission = await engine.missions.put(mission_id, body)
     engine.compiler.compile(mission)
-    await engine.durable("mission_id")
+    await engine.durable("mission_id", mission)
     return mission.status()
 
 
-@router.get("/missions/{mission_id}", responses=documented(404, 409, 422, 503), tags=["missions"])
+@router.get("/missions/{mission_id}", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
     """Where a mission stands."""
     return (await engine.missions.get(mission_id)).status()
 
 
-@router.delete("/missions/{mission_id}", status_code=204, responses=documented(404, 409, 422, 503), tags=["missions"])
+@router.delete(
+    "/missions/{mission_id}", status_code=204, responses=documented(404, 409, 421, 422, 503), tags=["missions"]
+)
 async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
     """Forget a mission and what it learned."""
-    try:
-        await engine.missions.delete(mission_id)
-        engine.live.forget(mission_id)
-    finally:
-        # A mission that is already deleted may still be on disk.
-        await engine.durable("mission_id")
+    await engine.delete(mission_id)
 
 
 @router.get(
     "/missions/{mission_id}/attention",
     response_model=MissionAttention,
-    responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 422, 503)},
+    responses={304: {"description": "the same as `If-None-Match` names"}, **documented(404, 409, 421, 422, 503)},
     tags=["missions"],
 )
 async def get_attention(
@@ -127,14 +124,16 @@ async def get_attention(
     return attention_weights.attention_response(mission, known_tags, request.headers.get("Accept-Encoding", ""))
 
 
-@router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 422, 503), tags=["missions"])
+@router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
     """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
     return (await engine.missions.get(mission_id)).guidance.report(mission_id)
 
 
 @router.post(
-    "/missions/{mission_id}/guidance", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["missions"]
+    "/missions/{mission_id}/guidance",
+    responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503),
+    tags=["missions"],
 )
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
     """Confirm or reject what was understood, or give a structure or a new note. Only confirmed orders are obeyed."""
@@ -143,12 +142,14 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     mission.answer_guidance(body)
     engine.compiler.compile(mission)
     engine.live.changed(mission_id)
-    await engine.durable("answer")
+    await engine.durable("answer", mission)
     return mission.guidance.report(mission_id)
 
 
 @router.post(
-    "/missions/{mission_id}/readings", responses=documented(400, 404, 408, 409, 413, 415, 422, 503), tags=["missions"]
+    "/missions/{mission_id}/readings",
+    responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503),
+    tags=["missions"],
 )
 async def post_readings(mission_id: MissionId, body: ReadingsRequest, engine: TheEngine) -> ReadingsResponse:
     """What sensors said of themselves over another network: merged into the fleet's belief, by its age."""
@@ -161,11 +162,19 @@ async def healthz() -> dict[str, str]:
     return {"status": "ok"}
 
 
-@router.get("/readyz", tags=["operation"])
-async def readyz(request: Request) -> Readiness:
-    """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``."""
+@router.get("/readyz", responses={503: {"model": Readiness, "description": "not ready"}}, tags=["operation"])
+async def readyz(request: Request, response: Response) -> Readiness:
+    """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``.
+
+    Not ready (503) is an edge that cannot reach the PostgreSQL which it shares with other edges.
+    """
     llm: ServerPool = request.state.llm
-    return llm.readiness()
+    engine: Engine = request.state.engine
+    readiness = llm.readiness()
+    if engine.missions.intact:
+        return readiness
+    response.status_code = 503
+    return readiness.model_copy(update={"ready": False, "detail": "the store cannot be reached"})
 
 
 @router.get("/metrics", tags=["operation"], response_class=Response)

@@ -123,7 +123,7 @@ def store_of(settings: Settings) -> Finding:
     if "://" in settings.store:
         if find_spec("psycopg") is None:
             return Finding("store", "PostgreSQL, but psycopg is not installed", "pip install 'aic-vds[postgres]'")
-        return Finding("store", "PostgreSQL (not tried: that would take its lock)")
+        return Finding("store", "PostgreSQL (not tried)")
     from service.storage.locks import FileLock, StoreUnusable
 
     file = Path(settings.store).absolute()

@@ -138,6 +138,7 @@ def _application(settings: Settings, url: str, loaded: Callable[[str], None]) ->
     from service.storage.locks import StoreUnusable
     from service.storage.store import Store
 
+    settings = settings.model_copy(update={"advertise_url": settings.advertise_url or _reachable(url)})
     try:
         store = None if settings.store == "none" else Store(settings.store)
         app = create_app(settings, store)
@@ -160,6 +161,11 @@ def _is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def _reachable(url: str) -> str:
+    """The edge's address as other machines know it, if it listens on every interface."""
+    return url.replace("//0.0.0.0", f"//{socket.gethostname()}").replace("//[::]", f"//{socket.gethostname()}")
 
 
 def _say(text: str) -> None:

@@ -110,6 +110,12 @@ class Settings(BaseSettings):
     # The store of the missions: a SQLite file, or postgresql://user:password@host/database. `none`: missions end with
     # the process.
     store: str = Field(default_factory=_default_store, min_length=1, repr=False)
+    # With several edges on one PostgreSQL: this one's address for clients, which the other edges tell them. Unset: from
+    # --host and --port, with this machine's name for every interface's address.
+    advertise_url: str | None = None
+    # Seconds that this edge owns a mission of a PostgreSQL store without renewing that. Another edge can go on with the
+    # missions of a killed one after so long.
+    lease_s: float = Field(5.0, ge=1, le=300)
     # Missions at once, in memory or in the store; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
     # Folder of the model file and the token vocabulary.
@@ -124,6 +130,11 @@ class Settings(BaseSettings):
         if url is None or url == "":
             return None
         return ",".join(_checked_url(one.strip()) for one in url.split(","))
+
+    @field_validator("advertise_url")
+    @classmethod
+    def _reachable_url(cls, url: str | None) -> str | None:
+        return None if url is None else _checked_url(url)
 
     @field_validator("llm_api_key")
     @classmethod

@@ -72,7 +72,7 @@ class Engine:
         self._batches = BatchDecider(self.pipeline, self.queries)
         self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self._feedback = Feedback(metrics, self.journal, self.live)
-        self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile)
+        self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile, self.live.forget)
 
     def hurry(self) -> None:
         """The service is closing: queries to the LLM end within seconds, and pages get no more updates."""
@@ -92,7 +92,10 @@ class Engine:
         await self.pipeline.close()
         self.missions.close()
         await self._feedback.close(self.missions.loaded, _LAST_CHECKPOINTS_S)
-        return await self.journal.close(_LAST_COMMIT_S)
+        ended = await self.journal.close(_LAST_COMMIT_S)
+        if ended:
+            await self.missions.release()
+        return ended
 
     async def decide(self, request: DecideRequest, *, may_make: bool = True, key: str | None = None) -> DecideResponse:
         """One UAV's decision, within its deadline whatever the LLM does.
@@ -103,7 +106,7 @@ class Engine:
 
         Raises:
             Refused: the request does not fit its mission.
-            NotFound, Conflict, Unavailable: as :meth:`MissionRegistry.resolve`.
+            NotFound, Conflict, Misdirected, Unavailable: as :meth:`MissionRegistry.resolve`.
         """
         watch, deadline = self._start(request)
         mission, report = await self.missions.resolve(request, may_make=may_make, key=key, deadline=deadline)
@@ -140,7 +143,7 @@ class Engine:
         self.missions.refuse_if_failing("decision_id")
         result = self._feedback.apply(mission, request)
         try:
-            await self.durable("decision_id")
+            await self.durable("decision_id", mission)
         finally:
             asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
         return FeedbackResponse(decision_id=request.decision_id, result=result)
@@ -159,13 +162,34 @@ class Engine:
         self._metrics.record_readings(results)
         if "merged" in results:
             try:
-                await self.durable("readings")
+                await self.durable("readings", mission)
             finally:
                 asyncio.get_running_loop().call_soon(self._feedback.follow_up, mission)
         return ReadingsResponse(results=results, step=mission.belief.newest)
 
-    async def durable(self, field: str) -> None:
-        """Wait until every event so far is on disk; raises ``Unavailable`` where that takes too long."""
+    async def delete(self, mission_id: str) -> None:
+        """Delete a mission; raises as :meth:`MissionRegistry.delete`."""
+        epoch: int | None = None
+        try:
+            epoch = await self.missions.delete(mission_id)
+            self.live.forget(mission_id)
+        finally:
+            # A mission that is already deleted may still be on disk.
+            await self._on_disk("mission_id")
+        if self.journal.lost_epoch(mission_id, epoch):
+            raise _taken_over()
+
+    async def durable(self, field: str, mission: Mission) -> None:
+        """Wait until every event of the mission so far is on disk.
+
+        Raises:
+            Unavailable: that takes too long, or another edge has taken over the mission.
+        """
+        await self._on_disk(field)
+        if self.journal.lost(mission):
+            raise _taken_over()
+
+    async def _on_disk(self, field: str) -> None:
         if not await self.journal.stored(_STORE_S):
             raise Unavailable(field, "not on disk yet: send it again to be sure")
 
@@ -207,6 +231,8 @@ class Engine:
                 decisions, answers = await self._once(mission, request, key, make)
             began = time.perf_counter()
             stored = await self.journal.stored(min(_STORE_S, deadline.at - began))
+            if self.journal.lost(mission):
+                raise _taken_over()
             waited_ms = round((time.perf_counter() - began) * 1e3, 3)
             for index, answer in enumerate(answers):
                 total = round(answer.latency_ms["total"] + waited_ms, 3)
@@ -279,3 +305,7 @@ class Engine:
         self._traces.decided(answer)
         logs.decided(answer)
         self.live.decided(task.mission, task.uav, decided.prompt, answer)
+
+
+def _taken_over() -> Unavailable:
+    return Unavailable("mission_id", "another edge has taken over the mission, nothing was recorded: send it again")

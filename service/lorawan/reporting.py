@@ -25,6 +25,7 @@ _AGAIN_S = 5.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 30.0
 # Answers to readings that the edge can never take.
 _HOPELESS = frozenset((400, 413, 415, 422))
+_MISDIRECTED = 421
 
 
 class EdgeAway(Exception):
@@ -87,6 +88,9 @@ class Reporting:
         body = ReadingsRequest(readings=[_wire(reading) for reading in readings]).model_dump_json(exclude_none=True)
         try:
             answer = self._http.post(f"/missions/{mission_id}/readings", content=body)
+            if answer.status_code == _MISDIRECTED and "Location" in answer.headers:
+                # Of several edges, another one has the mission.
+                answer = self._http.post(answer.headers["Location"], content=body)
         except httpx.HTTPError as error:
             raise EdgeAway(str(error) or type(error).__name__) from None
         # 409: the mission cannot be loaded from the edge's store, until somebody deletes it.

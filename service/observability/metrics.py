@@ -52,6 +52,11 @@ class Metrics:
             "aicvds_store_seconds", "Time of a commit to the store", registry=r, buckets=_OVERHEAD_BUCKETS
         )
         self.store_failures = Counter("aicvds_store_failures", "Commits that failed; they are tried again", registry=r)
+        self.leases = Gauge("aicvds_leases", "Missions that this edge owns in a shared store", registry=r)
+        self.leases_taken_over = Counter(
+            "aicvds_leases_taken_over", "Missions taken over from another edge, or from an earlier start", registry=r
+        )
+        self.leases_lost = Counter("aicvds_leases_lost", "Missions that another edge has taken over", registry=r)
         # Looking up a child by its labels takes as long as counting; there are few children.
         self._decisions, self._seconds = cache(self.decisions.labels), cache(self.decision_seconds.labels)
         self._tokens = cache(self.llm_tokens.labels)

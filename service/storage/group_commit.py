@@ -3,7 +3,8 @@
 A transaction begins as soon as a request waits for its changes; without one, a quarter of a second after the first
 change. Changes that arrive while a transaction runs form the next one, so that under load a commit serves many answers.
 A failed transaction loses nothing: its changes stay in the queue and are tried again after a pause. Meanwhile decisions
-go on, and a request whose changes must be durable is refused.
+go on, and a request whose changes must be durable is refused. Only the changes of a mission that another edge has taken
+over are dropped.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ import asyncio
 import logging
 import time
 from collections import deque
+from collections.abc import Callable
 from enum import Enum
 from itertools import islice
 
 from service.observability.metrics import Metrics
+from service.storage.leases import LeaseLost
 from service.storage.operations import Change, Checkpoint, Entry
 from service.storage.store import cause
 from service.storage.writer import Writer
@@ -51,11 +54,16 @@ class _State(Enum):
 class GroupCommit:
     """A queue of changes in front of a writer; used on the event loop only.
 
-    Every change has a ticket, a number that grows. All changes up to the ticket ``_written`` are durable.
+    Every change has a ticket, a number that grows. All changes up to the ticket ``_written`` are durable or dropped.
+
+    Args:
+        on_lost: called with the ID of a mission that another edge has taken over, and with the epoch that it lost,
+            before any request is answered that waits for its changes.
     """
 
-    def __init__(self, writer: Writer, metrics: Metrics) -> None:
+    def __init__(self, writer: Writer, metrics: Metrics, on_lost: Callable[[str, int], None]) -> None:
         self._writer = writer
+        self._on_lost = on_lost
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
         self._state = _State.IDLE
@@ -161,6 +169,8 @@ class GroupCommit:
         """The transaction has ended: answer the requests that waited for it, and begin what comes next."""
         if error is None:
             self._succeed()
+        elif isinstance(error, LeaseLost):
+            self._drop(error)
         else:
             self._fail(error)
         self._batch = []
@@ -218,10 +228,21 @@ class GroupCommit:
             self._queue.popleft()
         if self._queue and self._queue[0][0] <= last:
             self._queue = deque(entry for entry in self._queue if id(entry[1]) not in durable)
+        self._recover()
+        self._written = max(self._written, last)
+
+    def _drop(self, error: LeaseLost) -> None:
+        """Take the changes of lost missions from the queue; nothing of the transaction was written."""
+        self._recover()
+        self._queue = deque(e for e in self._queue if (e[1].mission_id, e[1].epoch) not in error.lost)
+        self._written = max(self._written, self._queue[0][0] - 1 if self._queue else self._added)
+        for mission_id, epoch in error.lost:
+            self._on_lost(mission_id, epoch)
+
+    def _recover(self) -> None:
         if self._failure is not None:
             log.warning("the store works again")
         self._failure, self._pause_s = None, _FIRST_PAUSE_S
-        self._written = max(self._written, last)
 
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()

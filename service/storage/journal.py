@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
+from weakref import WeakKeyDictionary
 from zlib import crc32
 
 from service.mission.events import Decided, Event, ignore_event
@@ -20,6 +21,7 @@ from service.storage.group_commit import GroupCommit
 from service.storage.operations import Checkpoint, Deleted, Entry, Made
 from service.storage.rows import pack
 from service.storage.store import Store
+from shared.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +31,8 @@ _EVENTS = 256
 _SENSORS = 100
 # From so many sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
+# Lost leases that are remembered, for requests that are under way.
+_MOST_LOST = 10_000
 
 
 class MissionLog:
@@ -37,14 +41,17 @@ class MissionLog:
     Attributes:
         seq: number of the newest event.
         since_checkpoint: weight of the events since the last checkpoint, in events of a small network.
-        deleted: the mission was deleted. Its late events are dropped: a new mission may have its ID.
+        epoch: of the mission's lease; 0 in a store that is this edge's alone.
+        ended: the mission was deleted, or another edge has taken it over. Its late events are dropped: another mission
+            may have its ID.
     """
 
-    def __init__(self, mission: Mission, seq: int, since_checkpoint: int) -> None:
+    def __init__(self, mission: Mission, seq: int, since_checkpoint: int, epoch: int) -> None:
         self.mission = mission
         self.seq = seq
         self.since_checkpoint = since_checkpoint
-        self.deleted = False
+        self.epoch = epoch
+        self.ended = False
 
 
 class NullJournal:
@@ -52,11 +59,19 @@ class NullJournal:
 
     failing = False
 
-    def begin(self, mission: Mission) -> None:
+    def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Ignore a new mission."""
 
-    def end(self, mission_id: str) -> None:
+    def end(self, mission_id: str, epoch: int = 0) -> None:
         """Ignore a deleted mission."""
+
+    def lost(self, mission: Mission) -> bool:
+        """Return False: there is no other edge."""
+        return False
+
+    def lost_epoch(self, mission_id: str, epoch: int) -> bool:
+        """Return False."""
+        return False
 
     async def stored(self, within_s: float) -> bool:
         """Return True: there is nothing to wait for."""
@@ -71,14 +86,18 @@ class Journal:
     """The journal of the missions of one store; used on the event loop only.
 
     Attributes:
-        stored: as :meth:`GroupCommit.stored`.
+        stored: as :meth:`GroupCommit.stored`. Afterwards :meth:`lost` says whether the changes were dropped instead.
+        on_lost: called with the ID of a mission that another edge has taken over.
     """
 
     def __init__(self, store: Store, metrics: Metrics) -> None:
-        self._commits = GroupCommit(store.writer(), metrics)
+        self._commits = GroupCommit(store.writer(), metrics, self._lose)
         self.stored = self._commits.stored
+        self.on_lost: Callable[[str], None] = lambda _: None
         self._loop = asyncio.get_running_loop()
         self._logs: dict[str, MissionLog] = {}
+        self._lost = BoundedDict[tuple[str, int], bool](_MOST_LOST)
+        self._epochs = WeakKeyDictionary[Mission, int]()
         self._packing = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoints")
         self._packed: set[asyncio.Future[bytes]] = set()
 
@@ -87,41 +106,73 @@ class Journal:
         """Whether the last transaction failed."""
         return self._commits.failing
 
-    def begin(self, mission: Mission) -> None:
+    def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Record a new mission, and every event of it from now on."""
-        self._commits.add(Made(mission.mission_id, mission.requested_spec, mission.spec))
+        self._commits.add(Made(mission.mission_id, mission.requested_spec, mission.spec, epoch))
         # Missions that begin together and fly alike must not all need a checkpoint at the same time.
-        self._record(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS)
+        self._record(MissionLog(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS, epoch))
 
-    def resume(self, mission: Mission, seq: int, replayed: Sequence[Event]) -> None:
+    def resume(self, mission: Mission, seq: int, replayed: Sequence[Event], epoch: int = 0) -> None:
         """Record every event of a restored mission from now on.
 
         Args:
             seq: number of its newest event in the store.
             replayed: its events since its last checkpoint.
+            epoch: of its lease.
         """
-        self._record(mission, seq, sum(map(_weight, replayed)))
+        self._record(MissionLog(mission, seq, sum(map(_weight, replayed)), epoch))
 
-    def _record(self, mission: Mission, seq: int, since_checkpoint: int) -> None:
-        mission_log = MissionLog(mission, seq, since_checkpoint)
+    def _record(self, mission_log: MissionLog) -> None:
+        mission, epoch = mission_log.mission, mission_log.epoch
         self._logs[mission.mission_id] = mission_log
+        self._epochs[mission] = epoch
 
         def record(event: Event) -> None:
-            if mission_log.deleted:
+            if mission_log.ended:
                 return
             mission_log.seq += 1
             mission_log.since_checkpoint += 1 if mission.scenario.sensors < _SENSORS else _weight(event)
-            self._commits.add(Entry(mission.mission_id, mission_log.seq, event))
+            self._commits.add(Entry(mission.mission_id, mission_log.seq, event, epoch))
 
         mission.record = record
 
-    def end(self, mission_id: str) -> None:
+    def end(self, mission_id: str, epoch: int = 0) -> None:
         """Record that a mission is deleted."""
-        if (mission_log := self._logs.pop(mission_id, None)) is not None:
-            mission_log.deleted = True
+        self._close_log(mission_id)
+        self._commits.add(Deleted(mission_id, epoch))
+
+    def drop(self, mission_id: str) -> None:
+        """Record no more events of a mission, which another edge has taken over."""
+        mission_log = self._close_log(mission_id)
+        if mission_log is not None:
+            self._lost[mission_id, mission_log.epoch] = True
+
+    def lost(self, mission: Mission) -> bool:
+        """Whether another edge has taken over the mission: what was not durable before then never will be."""
+        return (mission.mission_id, self._epochs.get(mission, 0)) in self._lost
+
+    def lost_epoch(self, mission_id: str, epoch: int) -> bool:
+        """As :meth:`lost`, of a mission that need not be in memory."""
+        return (mission_id, epoch) in self._lost
+
+    def epoch(self, mission_id: str) -> int | None:
+        """The epoch under which the events of a mission are recorded; None where none are."""
+        mission_log = self._logs.get(mission_id)
+        return None if mission_log is None else mission_log.epoch
+
+    def _close_log(self, mission_id: str) -> MissionLog | None:
+        mission_log = self._logs.pop(mission_id, None)
+        if mission_log is not None:
+            mission_log.ended = True
             # The mission and `record` refer to each other: the mission would stay in memory until a collection.
             mission_log.mission.record = ignore_event
-        self._commits.add(Deleted(mission_id))
+        return mission_log
+
+    def _lose(self, mission_id: str, epoch: int) -> None:
+        """The store has refused a mission's changes, because another edge has the mission."""
+        self._lost[mission_id, epoch] = True
+        if self.epoch(mission_id) == epoch:
+            self.on_lost(mission_id)
 
     def due(self, mission: Mission, least: int = _EVENTS) -> MissionLog | None:
         """The log of a mission that has at least so many events since its last checkpoint, whose count begins anew."""
@@ -161,8 +212,8 @@ class Journal:
         self._take(mission_log, seq, packing.result())
 
     def _take(self, mission_log: MissionLog, seq: int, packed: bytes) -> None:
-        if not mission_log.deleted:
-            self._commits.supersede(Checkpoint(mission_log.mission.mission_id, seq, packed))
+        if not mission_log.ended:
+            self._commits.supersede(Checkpoint(mission_log.mission.mission_id, seq, packed, mission_log.epoch))
 
 
 def _weight(event: Event) -> int:

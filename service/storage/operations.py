@@ -1,4 +1,7 @@
-"""The changes that a store can be asked to make."""
+"""The changes that a store can be asked to make.
+
+Each has the epoch of the lease under which it was made; 0 in a store that is one edge's alone.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ class Made:
     mission_id: str
     asked_for: MissionSpec
     spec: ResolvedSpec
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +29,7 @@ class Entry:
     mission_id: str
     seq: int
     event: Event
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +39,7 @@ class Checkpoint:
     mission_id: str
     seq: int
     state: bytes
+    epoch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +47,7 @@ class Deleted:
     """A mission is deleted."""
 
     mission_id: str
+    epoch: int = 0
 
 
 Change = Made | Entry | Checkpoint | Deleted

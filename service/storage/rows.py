@@ -20,7 +20,7 @@ from service.mission.events import AdviserReport, Decided, Event, Guided, Read, 
 from service.mission.idempotency import Answered
 from service.mission.readings import Reading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
-from service.storage.schema import checkpoints, journal, missions
+from service.storage.schema import checkpoints, journal, leases, missions
 from shared.wire import Outcome, UavState
 
 # The extension type of an array.
@@ -70,6 +70,10 @@ class Statements:
             self._compiled(sa.delete(table).where(table.c.mission_id == of), "of")
             for table in (missions, checkpoints, journal)
         ]
+        if dialect.name == "postgresql":
+            # A deleted mission's lease ends; its row stays, so that its epoch never shrinks.
+            ended = sa.update(leases).where(leases.c.mission_id == of).values(expires_at=sa.func.clock_timestamp())
+            self._deleted.append(self._compiled(ended, "of"))
 
     def of(self, changes: Sequence[Change]) -> list[Statement]:
         """The statements that make the changes in their order; consecutive events share one statement."""

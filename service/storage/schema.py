@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 
 # The newest version in service/storage/migrations/versions.
-SCHEMA = "0002"
+SCHEMA = "0003"
 
 metadata = sa.MetaData()
 missions = sa.Table(
@@ -32,9 +32,15 @@ journal = sa.Table(
     sa.Column("body", sa.LargeBinary, nullable=False),
     sqlite_with_rowid=False,
 )
-terms = sa.Table(
-    "terms",
+# In PostgreSQL only: which edge owns a mission. A row outlives its mission, so that its epoch never shrinks.
+leases = sa.Table(
+    "leases",
     metadata,
-    sa.Column("term", sa.Integer, primary_key=True),
-    sa.Column("began", sa.DateTime, nullable=False, server_default=sa.func.now()),
+    sa.Column("mission_id", sa.String(64), primary_key=True),
+    # One process's life.
+    sa.Column("owner", sa.String(36), nullable=False, index=True),
+    # Where clients reach the owner.
+    sa.Column("address", sa.Text, nullable=False),
+    sa.Column("epoch", sa.BigInteger, nullable=False),
+    sa.Column("expires_at", sa.DateTime(timezone=True), nullable=False),
 )

@@ -1,6 +1,7 @@
 """The store, in which missions outlive the process: SQLite in WAL mode, or PostgreSQL, by SQLAlchemy and alembic.
 
-One edge uses a store at a time. A stored mission is its spec, its last checkpoint and the events since then: the
+One edge uses a SQLite file at a time; several edges share a PostgreSQL database, where each mission has a lease
+(:mod:`service.storage.leases`). A stored mission is its spec, its last checkpoint and the events since then: the
 transaction that writes a checkpoint deletes the events that it covers.
 """
 
@@ -14,18 +15,23 @@ import sqlalchemy as sa
 
 from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
-from service.storage.locks import AdvisoryLock, FileLock, StoreUnusable
+from service.storage.leases import Leases
+from service.storage.locks import FileLock, StoreUnusable
 from service.storage.process_writer import ProcessWriter
 from service.storage.rows import Statements, decode, unpack
-from service.storage.schema import SCHEMA, checkpoints, journal, missions, terms
+from service.storage.schema import SCHEMA, checkpoints, journal, missions
 from service.storage.sqlite_process import BUSY_MS, PRAGMAS
 from service.storage.thread_writer import ThreadWriter
 from service.storage.writer import Writer
 from shared.wire import MissionSpec
 
-# Time limits of PostgreSQL: to connect; for a statement, and for a network without an answer.
+# Time limits of PostgreSQL: to connect; for a statement, and for a network without an answer; for an edge that is
+# paused, or cut off, in the midst of a transaction, which keeps its leases from other edges.
 _CONNECT_S = 5
 _STATEMENT_MS = 5000
+_IDLE_MS = 1500
+# An arbitrary key, which no other program of the same database may use. Earlier versions had this lock while they ran.
+_MIGRATING = 0x41494356
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,20 +60,22 @@ class Store:
         url: path of a SQLite file, or a URL of SQLAlchemy.
 
     Raises:
-        StoreUnusable: the store cannot be reached, is damaged or of a newer version, or another edge uses it.
+        StoreUnusable: the store cannot be reached, is damaged or of a newer version, or another edge uses the file.
+
+    Attributes:
+        leases: of the missions in PostgreSQL; None for a SQLite file, which is this edge's alone.
     """
 
     def __init__(self, url: str) -> None:
-        self._lock: FileLock | AdvisoryLock | None = None
+        self.leases: Leases | None = None
+        self._lock: FileLock | None = None
         try:
             self._engine = _engine(url)
             if self._engine.url.database and self._engine.dialect.name == "sqlite":
                 self._lock = FileLock(self._engine.url.database)
             else:
-                self._lock = AdvisoryLock(self._engine, terms)
+                self.leases = Leases(self._engine)
             self._migrate()
-            if isinstance(self._lock, AdvisoryLock):
-                self._lock.begin_term()
         except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
             self.close()
             raise StoreUnusable(cause(error)) from None
@@ -87,6 +95,11 @@ class Store:
         """The IDs of all missions."""
         with self._engine.connect() as db:
             return list(db.scalars(sa.select(missions.c.mission_id)))
+
+    def has(self, mission_id: str) -> bool:
+        """Whether there is such a mission."""
+        with self._engine.connect() as db:
+            return db.scalar(sa.select(missions.c.mission_id).where(missions.c.mission_id == mission_id)) is not None
 
     def load(self, mission_id: str) -> StoredMission | None:
         """A stored mission, or None; raises ``ValueError`` where it is damaged."""
@@ -111,21 +124,17 @@ class Store:
 
     def writer(self) -> Writer:
         """A writer of this store, which works beside the event loop; to be closed before the store."""
-        assert self._lock is not None
         statements = Statements(self._engine.dialect)
-        if isinstance(self._lock, FileLock):
-            return ProcessWriter(statements, self._lock.file, self._lock.descriptor)
-        return ThreadWriter(statements, self._lock.transaction)
+        if self.leases is not None:
+            return ThreadWriter(statements, self.leases, self._engine)
+        assert self._lock is not None
+        return ProcessWriter(statements, self._lock.file, self._lock.descriptor)
 
     def _migrate(self) -> None:
         """Bring the schema up to date. alembic is slow to import, so an up-to-date store does without it."""
         with self._engine.connect() as db:
-            known = sa.inspect(db).has_table("alembic_version")
-            version = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
-        if version == SCHEMA:
-            return
-        if version is not None and version > SCHEMA:
-            raise StoreUnusable(f"it was made by a newer version of this program (schema {version}, not {SCHEMA})")
+            if _version(db) == SCHEMA:
+                return
         from alembic import command
         from alembic.config import Config
 
@@ -133,8 +142,31 @@ class Store:
         config.set_main_option("script_location", str(Path(__file__).with_name("migrations")))
         config.set_main_option("path_separator", "os")
         with self._engine.begin() as db:
-            config.attributes["connection"] = db
-            command.upgrade(config, "head")
+            if self.leases is not None:
+                self._migrate_alone(db)
+            # Another edge may have done it meanwhile.
+            if _version(db) != SCHEMA:
+                config.attributes["connection"] = db
+                command.upgrade(config, "head")
+
+    def _migrate_alone(self, db: sa.Connection) -> None:
+        """Wait for an edge that migrates the database too, and refuse one that an earlier version uses."""
+        try:
+            db.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATING)))
+        except sa.exc.OperationalError as error:
+            if "lock timeout" not in str(error):
+                raise
+            database = self._engine.url.database
+            raise StoreUnusable(f"an edge of an earlier version uses the database {database}: end it") from None
+
+
+def _version(db: sa.Connection) -> str | None:
+    """The schema's version, None for an empty database; raises ``StoreUnusable`` where this program is older."""
+    known = sa.inspect(db).has_table("alembic_version")
+    version: str | None = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
+    if version is not None and version > SCHEMA:
+        raise StoreUnusable(f"it was made by a newer version of this program (schema {version}, not {SCHEMA})")
+    return version
 
 
 def _engine(url: str) -> sa.Engine:
@@ -161,7 +193,8 @@ def _engine(url: str) -> sa.Engine:
     limits = {
         "connect_timeout": _CONNECT_S,
         "tcp_user_timeout": _STATEMENT_MS,
-        "options": f"-c lock_timeout={BUSY_MS} -c statement_timeout={_STATEMENT_MS}",
+        "options": f"-c lock_timeout={BUSY_MS} -c statement_timeout={_STATEMENT_MS} "
+        f"-c idle_in_transaction_session_timeout={_IDLE_MS}",
     }
     return sa.create_engine(parsed, pool_pre_ping=True, connect_args={**limits, **parsed.query})
 

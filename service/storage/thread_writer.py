@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
 
 import sqlalchemy as sa
 
+from service.storage.leases import Leases
 from service.storage.operations import Change
 from service.storage.rows import Statement, Statements
 from service.storage.writer import Done
@@ -19,14 +20,19 @@ from service.storage.writer import Done
 class ThreadWriter:
     """Writes from a thread: the database is another process already.
 
+    A transaction of a mission that another edge has taken over ends with :class:`LeaseLost`.
+
     Args:
         statements: SQL for the database.
-        begin: makes a transaction that is committed at its end.
+        leases: the missions' leases.
+        engine: makes the connection; it is made again after it broke.
     """
 
-    def __init__(self, statements: Statements, begin: Callable[[], AbstractContextManager[sa.Connection]]) -> None:
+    def __init__(self, statements: Statements, leases: Leases, engine: sa.Engine) -> None:
         self._statements = statements
-        self._begin = begin
+        self._leases = leases
+        self._engine = engine
+        self._connection: sa.Connection | None = None
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         # A daemon: the end of the edge does not wait for a database that hangs.
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
@@ -34,7 +40,9 @@ class ThreadWriter:
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
-        self._jobs.put(partial(self._write, self._statements.of(changes), done, asyncio.get_running_loop()))
+        missions = {(change.mission_id, change.epoch) for change in changes}
+        statements = self._statements.of(changes)
+        self._jobs.put(partial(self._write, missions, statements, done, asyncio.get_running_loop()))
 
     def close(self) -> None:
         """As :class:`Writer` says."""
@@ -44,11 +52,24 @@ class ThreadWriter:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             job()
+        if self._connection is not None:
+            self._connection.close()
 
-    def _write(self, transaction: Sequence[Statement], done: Done, loop: asyncio.AbstractEventLoop) -> None:
+    def _write(
+        self,
+        missions: set[tuple[str, int]],
+        transaction: Sequence[Statement],
+        done: Done,
+        loop: asyncio.AbstractEventLoop,
+    ) -> None:
         failure: Exception | None = None
         try:
-            with self._begin() as db:
+            # A connection of its own: one from the pool would be tried before each transaction.
+            if self._connection is None or self._connection.closed or self._connection.invalidated:
+                self._connection = self._engine.connect()
+            with self._connection.begin():
+                db = self._connection
+                self._leases.fence(db, missions)
                 for sql, rows in transaction:
                     db.exec_driver_sql(sql, rows)
         except Exception as error:

@@ -12,7 +12,7 @@ import random
 import time
 import uuid
 from collections.abc import Callable, Collection, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import TypeVar
@@ -48,18 +48,20 @@ LONGEST_BACKOFF_S = 2.0
 LONGEST_RETRY_AFTER_S = 5.0
 POLL_S = 0.5
 NOT_MODIFIED = 304
+MISDIRECTED = 421
 Answer = TypeVar("Answer", bound=BaseModel)
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Send:
-    """One HTTP request, sent once."""
+    """One HTTP request, sent once; to another edge than the client's if ``base_url`` names one."""
 
     method: str
     path: str
     content: bytes | None = None
     headers: dict[str, str] | None = None
+    base_url: str | None = None
 
 
 @dataclass(frozen=True)
@@ -284,7 +286,23 @@ class Calls:
         raise AssertionError("unreachable: attempts is at least 1")
 
     def _once(self, send: Send) -> Call[httpx.Response]:
-        url = self.base_url + send.path
+        """Send a request, and send it again to the edge that has the mission, where the answer names one."""
+        try:
+            return (yield from self._at_one_edge(send))
+        except _Misdirected as elsewhere:
+            owner, retry_after_s = elsewhere.owner, elsewhere.retry_after_s
+        if owner is None:
+            raise _TryAgain("another edge has the mission, and gave no address", retry_after_s)
+        try:
+            return (yield from self._at_one_edge(replace(send, base_url=owner)))
+        except _Misdirected as again:
+            raise _TryAgain(f"neither this edge nor {owner} has the mission", again.retry_after_s) from None
+        except _TryAgain as again:
+            # An owner that has ended keeps its missions from other edges until their leases end.
+            raise _TryAgain(f"{owner}: {again.cause}", again.retry_after_s or retry_after_s) from again
+
+    def _at_one_edge(self, send: Send) -> Call[httpx.Response]:
+        url = (send.base_url or self.base_url) + send.path
         try:
             answer = yield send
         except httpx.TransportError as error:
@@ -292,11 +310,13 @@ class Calls:
         except httpx.DecodingError as error:
             raise EdgeProtocolError(f"{url} answered with a broken body: {error}") from error
         assert answer is not None, "the runner of a call answers a Send with the response"
+        if answer.status_code == MISDIRECTED:
+            raise _Misdirected(_owner(answer), _retry_after(answer))
         if answer.status_code in RETRIED_STATUS:
             raise _TryAgain(f"{answer.status_code} {_problem(answer).detail}", _retry_after(answer))
         if answer.status_code >= 400 and _is_page(answer):
             what = f"it answers {answer.status_code} with a web page to {send.path}"
-            raise EdgeProtocolError(f"there is no AIC-VDS edge at {self.base_url}: {what}")
+            raise EdgeProtocolError(f"there is no AIC-VDS edge at {url.removesuffix(send.path)}: {what}")
         if answer.status_code >= 400:
             raise EdgeRefused(url, _problem(answer), answer.status_code)
         return answer
@@ -326,6 +346,23 @@ class _TryAgain(Exception):
         super().__init__(cause)
         self.cause = cause
         self.retry_after_s = retry_after_s
+
+
+class _Misdirected(Exception):
+    """The mission belongs to another edge, at ``owner`` if that is known."""
+
+    def __init__(self, owner: str | None, retry_after_s: float | None) -> None:
+        super().__init__(owner)
+        self.owner = owner
+        self.retry_after_s = retry_after_s
+
+
+def _owner(answer: httpx.Response) -> str | None:
+    owner = _problem(answer).owner
+    try:
+        return None if owner is None else edge_url(owner)
+    except EdgeAddressWrong:
+        return None
 
 
 def _problem(answer: httpx.Response) -> Problem:

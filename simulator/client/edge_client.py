@@ -29,7 +29,8 @@ class EdgeClient:
     """A synchronous client of one edge; use it as a context manager.
 
     Connection errors, timeouts and 429/502/503/504 are retried, ``attempts`` attempts in all. The pause before a retry
-    is random, at most 0.1 s, and this limit doubles each time up to 2 s; a ``Retry-After`` is honoured up to 5 s.
+    is random, at most 0.1 s, and this limit doubles each time up to 2 s; a ``Retry-After`` is honoured up to 5 s. Where
+    several edges share their missions, a 421 names the edge that has the mission, and the request goes there at once.
     ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network (see
     :mod:`simulator.client.lossy_transport`); ``seed`` fixes the draws of the pauses. ``uplink`` selects the part of a
     report that is sent: all of it (``full``), the changes (``delta``), or the sensors that the mission's attention,
@@ -82,7 +83,10 @@ class EdgeClient:
                     continue
                 try:
                     answer = self._http.request(
-                        todo.method, self.base_url + todo.path, content=todo.content, headers=todo.headers
+                        todo.method,
+                        (todo.base_url or self.base_url) + todo.path,
+                        content=todo.content,
+                        headers=todo.headers,
                     )
                 except httpx.RequestError as error:
                     todo = call.throw(error)
@@ -188,7 +192,10 @@ class AsyncEdgeClient:
                     continue
                 try:
                     answer = await self._http.request(
-                        todo.method, self.base_url + todo.path, content=todo.content, headers=todo.headers
+                        todo.method,
+                        (todo.base_url or self.base_url) + todo.path,
+                        content=todo.content,
+                        headers=todo.headers,
                     )
                 except httpx.RequestError as error:
                     todo = call.throw(error)

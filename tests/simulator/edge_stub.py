@@ -33,7 +33,9 @@ from shared.wire import (
 from tests.running import serving
 from tests.waiting import Gate
 
-Behaviour = Literal["ok", "busy", "busy_retry_after", "garbage", "invalid", "crash", "html", "slow", "forgot", "wrong"]
+Behaviour = Literal[
+    "ok", "busy", "busy_retry_after", "garbage", "invalid", "crash", "html", "slow", "forgot", "wrong", "elsewhere"
+]
 LLM = Literal["loading", "ready", "unavailable", "off"]
 
 
@@ -41,8 +43,8 @@ LLM = Literal["loading", "ready", "unavailable", "off"]
 class EdgeStub:
     """``script`` has the behaviour for each of the next requests to /decide; afterwards it is ``otherwise``.
 
-    Who is met with ``slow`` waits at the ``gate``. ``decides``, ``feedbacks`` and ``missions`` are what arrived and was
-    understood.
+    Who is met with ``slow`` waits at the ``gate``, and with ``elsewhere`` is sent to the ``owner``. ``decides``,
+    ``feedbacks`` and ``missions`` are what arrived and was understood.
     """
 
     url: str = ""
@@ -50,6 +52,7 @@ class EdgeStub:
     otherwise: Behaviour = "ok"
     readiness: list[tuple[bool, LLM]] = field(default_factory=lambda: [(True, "ready")])
     model: str = "stub-1"
+    owner: str | None = None
     gate: Gate = field(default_factory=Gate)
     request_count: int = 0
     polled: int = 0
@@ -74,8 +77,12 @@ class EdgeStub:
             self.most_at_once = max(self.most_at_once, self.at_once)
             await self.gate.passed()
             self.at_once -= 1
-        refusal = _misbehave(behaviour, body)
+        refusal = self._elsewhere() if behaviour == "elsewhere" else _misbehave(behaviour, body)
         return refusal or Response(self._answer(body, behaviour).model_dump_json())
+
+    def _elsewhere(self) -> Response:
+        body = Problem(title="no", status=421, detail="another edge has it", owner=self.owner)
+        return Response(body.model_dump_json(), 421, {"Retry-After": "3"}, media_type="application/problem+json")
 
     def _answer(self, body: DecideRequest, behaviour: Behaviour) -> DecideResponse:
         sensors = body.sensors.id

@@ -120,6 +120,23 @@ def test_after_an_absence_everything_is_sent_and_the_pause_is_short_again(monkey
     assert sending.report() == 1.0
 
 
+def test_readings_go_to_the_edge_that_has_the_mission() -> None:
+    asked: list[str] = []
+
+    def edges(request: httpx.Request) -> httpx.Response:
+        asked.append(request.url.host)
+        if request.url.host != "owner":
+            return httpx.Response(421, headers={"Location": f"http://owner:8000{request.url.path}"})
+        assert request.headers["Authorization"] == "Bearer k3y"
+        return httpx.Response(200, json={"results": ["merged"], "step": 3})
+
+    taking = taken()
+    sending = Reporting("http://edge", "k3y", taking, taking._counts, httpx.MockTransport(edges))
+    assert sending.report() == 1.0
+    assert counted(taking) == {"merged": 1}
+    assert asked[-1] == "owner" and len(asked) == 2
+
+
 @pytest.mark.parametrize(
     "answer", [httpx.Response(200, text="<html>"), httpx.Response(200, json={"results": [], "step": 1})]
 )

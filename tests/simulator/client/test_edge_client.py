@@ -112,6 +112,42 @@ def test_a_sensor_never_heard_is_sent_as_null(request_: DecideRequest) -> None:
         assert [value is not None for value in column] == heard
 
 
+def test_a_request_goes_to_the_edge_that_has_the_mission_at_once(
+    stub: EdgeStub, request_: DecideRequest, client: Opened, pauses: list[float]
+) -> None:
+    stub.script = ["elsewhere"]
+    with stub_edge() as owner, client(stub.url, api_key="k3y", attempts=1) as edge:
+        stub.owner = owner.url
+        assert edge.decide(request_).attempts == 1
+    assert (stub.decides, pauses) == (owner.decides, [])
+    assert owner.headers[0]["idempotency-key"] == stub.headers[0]["idempotency-key"]
+    assert owner.headers[0]["authorization"] == "Bearer k3y"
+
+
+def test_a_request_follows_once_and_then_waits_for_the_lease(
+    stub: EdgeStub, request_: DecideRequest, client: Opened, pauses: list[float]
+) -> None:
+    stub.script = ["elsewhere"]
+    with stub_edge() as owner, client(stub.url, attempts=2) as edge:
+        owner.script = ["elsewhere"]
+        stub.owner = owner.owner = owner.url
+        assert edge.decide(request_).attempts == 2
+    assert (len(stub.decides), len(owner.decides), pauses) == (2, 1, [3.0])
+
+
+@pytest.mark.parametrize("owner", ["http://127.0.0.1:1", "nowhere", None])
+def test_a_request_whose_owner_is_out_of_reach_waits_for_the_lease(
+    owner: str | None, stub: EdgeStub, request_: DecideRequest, client: Opened, pauses: list[float]
+) -> None:
+    stub.script, stub.owner = ["elsewhere"], owner
+    with client(stub.url, attempts=2) as edge:
+        assert edge.decide(request_).attempts == 2
+    assert pauses == [3.0]
+    stub.script = ["elsewhere"]
+    with client(stub.url, attempts=1) as edge, pytest.raises(EdgeUnreachable, match="tried once"):
+        edge.decide(request_)
+
+
 def test_requests_to_a_busy_edge_are_retried(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
     stub.script = ["busy", "busy"]
     with client(stub.url) as edge:

@@ -1,0 +1,181 @@
+"""Which missions of the store this edge may decide for: all of a store of its own, or those whose leases it has."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.errors import Misdirected
+from service.observability.metrics import Metrics
+from service.storage.leases import Leases, Owner
+from service.storage.store import cause
+
+log = logging.getLogger(__name__)
+
+# Leases are renewed so many times a term; after a failure sooner.
+_ROUNDS, _ROUNDS_FAILING = 3, 10
+
+
+class SoleOwnership:
+    """The store is this edge's alone, or there is none: it owns every mission."""
+
+    shared = False
+    intact = True
+
+    def owns(self, mission_id: str) -> bool:
+        """True."""
+        return True
+
+    def claim(self, mission_id: str) -> int:
+        """Return 0: no lease is needed."""
+        return 0
+
+    def epoch(self, mission_id: str) -> int:
+        """Return 0, the epoch without leases."""
+        return 0
+
+    def forget(self, mission_id: str) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+@dataclass(slots=True)
+class _Held:
+    """A lease of this edge: its epoch, and until when it is surely valid, by this machine's clock."""
+
+    epoch: int
+    until: float
+
+
+class LeasedOwnership:
+    """The missions of a shared store whose leases this edge has.
+
+    A thread renews the leases three times a term. This edge's clock starts before the request to the database, so that
+    a lease ends here before it ends there. An edge that was paused, or cannot reach the database, stops deciding by
+    itself.
+
+    Args:
+        address: where clients reach this edge.
+        term_s: seconds that a lease lasts without renewal.
+        on_round: called on the event loop after each renewal, with the missions that other edges have taken over, and
+            with the IDs of all stored missions that no other edge owns.
+
+    Attributes:
+        shared: other edges may have missions of the store.
+    """
+
+    shared = True
+
+    def __init__(
+        self,
+        leases: Leases,
+        address: str,
+        term_s: float,
+        metrics: Metrics,
+        on_round: Callable[[set[str], list[str]], None],
+    ) -> None:
+        self._leases = leases
+        self._address = address
+        self._term_s = term_s
+        self._metrics = metrics
+        self._on_round = on_round
+        self._held: dict[str, _Held] = {}
+        self._renewed_at = time.monotonic()
+        self._failure: str | None = None
+        self._loop = asyncio.get_running_loop()
+        self._ending = threading.Event()
+        # A daemon: the end of the edge does not wait for a database that hangs.
+        threading.Thread(target=self._keep_renewing, name="leases", daemon=True).start()
+
+    @property
+    def intact(self) -> bool:
+        """Whether the database was reached within the last term; otherwise every lease has ended."""
+        return time.monotonic() < self._renewed_at + self._term_s
+
+    def owns(self, mission_id: str) -> bool:
+        """Whether this edge has the mission's lease now."""
+        held = self._held.get(mission_id)
+        return held is not None and time.monotonic() < held.until
+
+    def epoch(self, mission_id: str) -> int:
+        """The epoch of a lease of this edge, also if it has ended; 0 if it had none."""
+        held = self._held.get(mission_id)
+        return 0 if held is None else held.epoch
+
+    def claim(self, mission_id: str) -> int:
+        """Take the mission's lease if it is free; returns its epoch. It waits for the database.
+
+        Raises:
+            Misdirected: another edge has it.
+            sqlalchemy.exc.SQLAlchemyError: the database fails.
+        """
+        asked_at = time.monotonic()
+        answer = self._leases.acquire(mission_id, self._address, self._term_s)
+        if isinstance(answer, Owner):
+            self._held.pop(mission_id, None)
+            detail = f"another edge has mission {mission_id}: send the request there"
+            raise Misdirected("mission_id", detail, answer.address or None, answer.left_s)
+        held = self._held.get(mission_id)
+        if answer > 1 and (held is None or held.epoch != answer):
+            self._metrics.leases_taken_over.inc()
+            log.info("mission %s is taken over, epoch %d", mission_id, answer)
+        self._held[mission_id] = _Held(answer, asked_at + self._term_s)
+        return answer
+
+    def forget(self, mission_id: str) -> None:
+        """Own a mission no longer that is deleted or taken over."""
+        self._held.pop(mission_id, None)
+
+    def close(self) -> None:
+        """End all leases, so that another edge need not wait for their terms. It waits for the database."""
+        self._ending.set()
+        self._held.clear()
+        if self._failure is not None:
+            return
+        try:
+            self._leases.release()
+        except SQLAlchemyError as error:
+            log.warning("the leases could not be released, and end by themselves: %s", cause(error))
+
+    def _keep_renewing(self) -> None:
+        rounds = _ROUNDS
+        while not self._ending.wait(self._term_s / rounds):
+            try:
+                self._renew()
+                rounds = _ROUNDS
+            except SQLAlchemyError as error:
+                rounds = _ROUNDS_FAILING
+                self._fail(cause(error))
+
+    def _renew(self) -> None:
+        held, asked_at = dict(self._held), time.monotonic()
+        renewed = self._leases.renew(self._term_s)
+        for mission_id, lease in held.items():
+            # A lease that has ended is taken again by the next request for its mission, if nobody else has it by then.
+            valid = renewed.get(mission_id) == lease.epoch
+            lease.until = asked_at + self._term_s if valid else 0.0
+        ended = [mission_id for mission_id, lease in held.items() if not lease.until]
+        taken = self._leases.taken(ended) if ended else set[str]()
+        unowned = self._leases.unowned()
+        self._renewed_at = asked_at
+        if self._failure is not None:
+            log.warning("the leases are renewed again")
+            self._failure = None
+        self._metrics.leases.set(len(held) - len(ended))
+        # The event loop is closed if the edge has ended meanwhile.
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._on_round, taken, unowned)
+
+    def _fail(self, failure: str) -> None:
+        if failure != self._failure:
+            log.error("the leases cannot be renewed, decisions end with their terms: %s", failure)
+        self._failure = failure

@@ -1,0 +1,193 @@
+"""The missions of the store: claimed where other edges may have them, loaded into memory, and listed."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.config.settings import Settings
+from service.edge.ownership import LeasedOwnership, SoleOwnership
+from service.errors import Conflict, Misdirected, Unavailable
+from service.mission.mission import Mission
+from service.observability.metrics import Metrics
+from service.storage.journal import Journal
+from service.storage.recovery import restore_mission
+from service.storage.store import Store, cause
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+
+class StoredMissions:
+    """Moves missions from the store into memory; used on the event loop only.
+
+    Args:
+        missions: those in memory, by ID.
+        on_load: called with each mission that was loaded from the store.
+        on_drop: called with the ID of each mission that another edge has taken over.
+
+    Attributes:
+        ownership: which missions this edge may decide for.
+        listed: IDs of missions that are only in the store. In a shared store, those that no other edge owned at the
+            last renewal: it may have others since, and other edges may have taken these.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        metrics: Metrics,
+        journal: Journal,
+        store: Store,
+        missions: dict[str, Mission],
+        on_load: Callable[[Mission], None],
+        on_drop: Callable[[str], None],
+    ) -> None:
+        self._settings = settings
+        self._metrics = metrics
+        self._journal = journal
+        self._store = store
+        self._missions = missions
+        self._on_load = on_load
+        self._on_drop = on_drop
+        self._under_way: dict[str, asyncio.Task[None]] = {}
+        # A single thread of its own, so that a store that hangs delays no decision, and because torch draws initial
+        # weights from one generator.
+        self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
+        self.ownership: LeasedOwnership | SoleOwnership = SoleOwnership()
+        if store.leases is None:
+            self.listed = set(store.missions())
+        else:
+            self.listed = set(store.leases.unowned())
+            address = settings.advertise_url or ""
+            self.ownership = LeasedOwnership(store.leases, address, settings.lease_s, metrics, self._reconcile)
+        journal.on_lost = self.drop
+
+    async def load(self, mission_id: str, within_s: float) -> None:
+        """Load a mission, if it is in the store, while decisions for others continue.
+
+        Raises:
+            Misdirected: another edge has it.
+            Unavailable: the store cannot be read, or loading takes too long.
+            Conflict: the stored mission is damaged.
+        """
+        if self.ownership.shared or mission_id in self.listed:
+            await self._share(mission_id, self._load, within_s)
+
+    async def claim(self, mission_id: str, within_s: float) -> None:
+        """Take the lease of a mission that is to be made; load the mission, if another edge has made it meanwhile.
+
+        Raises: as :meth:`load`.
+        """
+        while not self.ownership.owns(mission_id):
+            await self._share(mission_id, self._take, within_s)
+
+    async def claim_to_delete(self, mission_id: str) -> None:
+        """Take the lease of a mission in memory or in the store, without loading it; raises as :meth:`load`."""
+        if (other := self._under_way.get(mission_id)) is not None:
+            await asyncio.wait({other})
+        if not self.ownership.owns(mission_id):
+            await self._claim_existing(mission_id)
+
+    def drop(self, mission_id: str) -> None:
+        """Forget a mission that another edge has taken over."""
+        self.ownership.forget(mission_id)
+        self._unload(mission_id)
+
+    def close(self) -> None:
+        """Load no more missions."""
+        self._reading.shutdown(wait=False, cancel_futures=True)
+
+    async def _share(self, mission_id: str, work: Callable[[str], Coroutine[Any, Any, None]], within_s: float) -> None:
+        """Wait for what is under way for a mission, or begin it; requests that come together share its result."""
+        task = self._under_way.get(mission_id)
+        if task is None:
+            task = self._under_way[mission_id] = asyncio.create_task(work(mission_id), name="load-mission")
+            task.add_done_callback(lambda _: self._under_way.pop(mission_id, None))
+        await asyncio.wait({task}, timeout=max(0.0, within_s))
+        if not task.done():
+            raise Unavailable("mission_id", f"mission {mission_id} is being loaded from the store")
+        # Raises the errors of loading. The mission may be deleted since.
+        task.result()
+
+    async def _load(self, mission_id: str) -> None:
+        if await self._claim_existing(mission_id):
+            await self._restore(mission_id)
+
+    async def _take(self, mission_id: str) -> None:
+        await self._claim(mission_id)
+        await self._restore(mission_id)
+
+    async def _claim_existing(self, mission_id: str) -> bool:
+        """Take the lease of a mission that is in memory or in the store; returns whether it is."""
+        if mission_id not in self._missions and not await self._read(self._store.has, mission_id):
+            self.listed.discard(mission_id)
+            return False
+        await self._claim(mission_id)
+        if mission_id not in self._missions:
+            self.listed.add(mission_id)
+        return True
+
+    async def _claim(self, mission_id: str) -> None:
+        """Take a mission's lease, if it is free. The mission stays in memory only if nobody else has had it since."""
+        try:
+            epoch = await self._read(self.ownership.claim, mission_id)
+        except Misdirected:
+            self.drop(mission_id)
+            raise
+        if mission_id in self._missions and self._journal.epoch(mission_id) != epoch:
+            self._unload(mission_id)
+
+    async def _restore(self, mission_id: str) -> None:
+        """Make the mission from what is in the store, in the reader's thread, unless it is in memory."""
+        if mission_id in self._missions:
+            return
+        epoch = self.ownership.epoch(mission_id)
+        try:
+            stored = await self._read(self._store.load, mission_id)
+            if stored is None:
+                self.listed.discard(mission_id)
+                return
+            mission = await self._read(restore_mission, mission_id, stored, self._settings)
+        except ValueError as error:
+            log.error("mission %s is damaged: %s", mission_id, error)
+            raise Conflict("mission_id", f"the stored mission {mission_id} is damaged: DELETE it") from None
+        if not mission.prompt_fits:
+            limit = self._settings.llm_context
+            log.warning(
+                "mission %s: its prompt may exceed AICVDS_LLM_CONTEXT (%d); it continues without the LLM",
+                mission_id,
+                limit,
+            )
+        self._journal.resume(mission, stored.seq, stored.events, epoch)
+        self._missions[mission_id] = mission
+        self.listed.discard(mission_id)
+        self._on_load(mission)
+
+    def _unload(self, mission_id: str) -> None:
+        if self._missions.pop(mission_id, None) is None:
+            return
+        self._journal.drop(mission_id)
+        self._on_drop(mission_id)
+        self._metrics.leases_lost.inc()
+        log.warning("mission %s: another edge has taken it over", mission_id)
+
+    async def _read(self, function: Callable[..., T], *args: Any) -> T:
+        """Run a function in the reader's thread; raises ``Unavailable`` where the store fails."""
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._reading, function, *args)
+        except SQLAlchemyError as error:
+            log.error("the store cannot be read: %s", cause(error))
+            raise Unavailable("mission_id", "the store cannot be read; the log has the details") from None
+
+    def _reconcile(self, taken: set[str], unowned: list[str]) -> None:
+        """The leases were renewed: drop what other edges have taken over, and list what nobody else has."""
+        for mission_id in taken:
+            self.drop(mission_id)
+        self.listed = set(unowned) - self._missions.keys()
+        self._metrics.missions.set(len(self._missions) + len(self.listed))

@@ -1,0 +1,141 @@
+"""Leases: which edge owns a mission of a PostgreSQL store that several edges share.
+
+A lease has an owner, an epoch and an end. The owner is one process's life. The epoch grows when another owner takes the
+lease, and never shrinks. Only the database's clock counts. The transaction that writes the journal locks the leases of
+its missions and compares their epochs (:meth:`Leases.fence`): an owner that was paused or cut off writes nothing into
+what its successor wrote, whatever its own clock says.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import sqlalchemy as sa
+
+# A lease's end is reckoned where its row is locked, not where the statement began, which may have waited for the lock.
+_ACQUIRE = sa.text("""
+    INSERT INTO leases AS held (mission_id, owner, address, epoch, expires_at)
+    VALUES (:mission_id, :owner, :address, 1, clock_timestamp() + :term_s * interval '1 second')
+    ON CONFLICT (mission_id) DO UPDATE
+    SET owner = excluded.owner, address = excluded.address,
+        epoch = held.epoch + (held.owner <> excluded.owner)::int,
+        expires_at = clock_timestamp() + :term_s * interval '1 second'
+    WHERE held.owner = excluded.owner OR held.expires_at <= clock_timestamp()
+    RETURNING epoch
+""")
+_OWNER = sa.text("""
+    SELECT address, extract(epoch FROM expires_at - clock_timestamp())::float8 AS left_s
+    FROM leases WHERE mission_id = :mission_id
+""")
+# Rows are locked in the order of their keys, as the fence does: two transactions never wait for each other.
+_RENEW = sa.text("""
+    WITH held AS (
+        SELECT mission_id FROM leases WHERE owner = :owner AND expires_at > clock_timestamp()
+        ORDER BY mission_id FOR UPDATE
+    )
+    UPDATE leases SET expires_at = clock_timestamp() + :term_s * interval '1 second'
+    FROM held WHERE leases.mission_id = held.mission_id
+    RETURNING leases.mission_id, leases.epoch
+""")
+_RELEASE = sa.text("""
+    WITH held AS (
+        SELECT mission_id FROM leases WHERE owner = :owner AND expires_at > clock_timestamp()
+        ORDER BY mission_id FOR UPDATE
+    )
+    UPDATE leases SET expires_at = clock_timestamp() FROM held WHERE leases.mission_id = held.mission_id
+""")
+_FOREIGN = sa.text("SELECT mission_id FROM leases WHERE mission_id = ANY(:mission_ids) AND owner <> :owner")
+_UNOWNED = sa.text("""
+    SELECT mission_id FROM missions WHERE NOT EXISTS (
+        SELECT 1 FROM leases
+        WHERE leases.mission_id = missions.mission_id AND owner <> :owner AND expires_at > clock_timestamp()
+    )
+""")
+_FENCE = "SELECT mission_id, epoch FROM leases WHERE mission_id = ANY(%s) AND owner = %s ORDER BY mission_id FOR SHARE"
+
+
+class LeaseLost(Exception):
+    """Nothing of a transaction was written, because other owners took over missions of it.
+
+    Attributes:
+        lost: their IDs, with the epochs under which they were to be written.
+    """
+
+    def __init__(self, lost: Collection[tuple[str, int]]) -> None:
+        super().__init__(f"another edge has taken over {', '.join(sorted(mission_id for mission_id, _ in lost))}")
+        self.lost = frozenset(lost)
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """Another edge that owns a mission: its address, and the seconds until its lease ends unless it is renewed."""
+
+    address: str
+    left_s: float
+
+
+class Leases:
+    """The leases of one owner; its methods may be called from any thread, and wait for the database.
+
+    Every method raises ``sqlalchemy.exc.SQLAlchemyError`` where the database fails.
+    """
+
+    def __init__(self, engine: sa.Engine) -> None:
+        self._engine = engine
+        self._owner = str(uuid.uuid4())
+
+    def acquire(self, mission_id: str, address: str, term_s: float) -> int | Owner:
+        """Take a lease that is free, or has ended; returns its epoch, or who has it.
+
+        An owner whose own lease has ended gets it again with the same epoch as long as nobody else has had it.
+
+        Args:
+            address: where clients reach this edge.
+            term_s: seconds until the lease ends.
+        """
+        new = {"mission_id": mission_id, "owner": self._owner, "address": address, "term_s": term_s}
+        with self._engine.begin() as db:
+            epoch = db.scalar(_ACQUIRE, new)
+            if epoch is not None:
+                return int(epoch)
+            row = db.execute(_OWNER, {"mission_id": mission_id}).one()
+        return Owner(row.address, max(0.0, row.left_s))
+
+    def renew(self, term_s: float) -> dict[str, int]:
+        """Prolong every lease of this owner that has not ended; returns their missions with their epochs."""
+        with self._engine.begin() as db:
+            rows = db.execute(_RENEW, {"owner": self._owner, "term_s": term_s}).all()
+        return {row.mission_id: row.epoch for row in rows}
+
+    def release(self) -> None:
+        """End every lease of this owner now; the epochs stay."""
+        with self._engine.begin() as db:
+            db.execute(_RELEASE, {"owner": self._owner})
+
+    def taken(self, mission_ids: Collection[str]) -> set[str]:
+        """Those of the missions that other owners have taken over."""
+        with self._engine.connect() as db:
+            return set(db.scalars(_FOREIGN, {"mission_ids": list(mission_ids), "owner": self._owner}))
+
+    def unowned(self) -> list[str]:
+        """The IDs of all stored missions that no other edge owns."""
+        with self._engine.connect() as db:
+            return list(db.scalars(_UNOWNED, {"owner": self._owner}))
+
+    def fence(self, db: sa.Connection, missions: Collection[tuple[str, int]]) -> None:
+        """Keep the missions' leases from being taken over until the transaction ends.
+
+        A lease that has ended is no obstacle as long as nobody else has taken it.
+
+        Args:
+            missions: IDs and epochs.
+
+        Raises:
+            LeaseLost: another owner has one of the missions, or has had it since that epoch.
+        """
+        names = sorted({mission_id for mission_id, _ in missions})
+        rows = db.exec_driver_sql(_FENCE, (names, self._owner)).all()
+        if lost := set(missions) - {(mission_id, epoch) for mission_id, epoch in rows}:
+            raise LeaseLost(lost)
