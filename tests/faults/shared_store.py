@@ -33,8 +33,8 @@ frontend uavs
   default_backend edges
 backend edges
   option httpchk GET /readyz
-  option redispatch
-  retries 2
+  option redispatch 1
+  retries 3
   retry-on conn-failure empty-response
 """
 _EDGE = "  server edge{port} 127.0.0.1:{port} check inter 500ms fall 2 rise 1\n"

@@ -102,8 +102,12 @@ class Uav(threading.Thread):
     ) -> httpx.Response | None:
         """The answer of an edge that has the mission; None where the request is to be sent again."""
         began = time.monotonic()
-        # The proxy always answers: it is the proxy's answers that are timed.
-        answer = client.post(url, json=body, headers=headers, timeout=60)
+        try:
+            answer = client.post(url, json=body, headers=headers, timeout=60)
+        except httpx.TransportError:
+            # haproxy closes some connections whose edge was killed, and leaves it to the client to try again.
+            self.answers["broken"] += 1
+            return None
         self.slowest_s = max(self.slowest_s, time.monotonic() - began)
         if answer.status_code == 421:
             self.answers["421"] += 1
@@ -164,6 +168,7 @@ class Trial:
             answered=answers["answered"],
             sent_to_the_owner_by_421=answers["421"],
             refused_with_Retry_After=answers["refused"],
+            connections_closed_by_haproxy=answers["broken"],
             slowest_answer_or_refusal_s=f"{slowest:.2f}",
             lease_s=LEASE_S,
             all_missions_decided_again_s=f"{max(self.gaps_s):.2f}",
