@@ -14,7 +14,7 @@ import msgpack
 
 from service.storage import sqlite_process
 from service.storage.operations import Change
-from service.storage.rows import Statements
+from service.storage.rows import PACK_BYTES, Statements
 from service.storage.sqlite_process import LENGTH
 from service.storage.writer import Done, WriteFailed
 
@@ -61,7 +61,7 @@ class ProcessWriter:
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As :class:`Writer` says."""
-        transaction = msgpack.packb(self._statements.of(changes))
+        transaction = msgpack.packb(self._statements.of(changes), buf_size=PACK_BYTES)
         self._frame = LENGTH.pack(len(transaction)) + transaction
         self._repeated = False
         self._submit()

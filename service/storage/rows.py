@@ -23,6 +23,8 @@ from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, leases, missions
 from shared.wire import Outcome, UavState
 
+# The first size of a packer's buffer, which grows as it must.
+PACK_BYTES = 4096
 # The extension type of an array.
 _ARRAY = 1
 # A request also carries an outcome, which is an event of its own, and its encoding, which is of no use later.
@@ -150,7 +152,8 @@ def decode(kind: str, data: bytes) -> Event:
 
 def pack(value: Any) -> bytes:
     """Bytes of nested dicts, lists, numbers, strings and arrays; raises ``TypeError`` for anything else."""
-    packed: bytes = msgpack.packb(value, default=_default)
+    # The default buffer of 256 KB is mapped and unmapped by each call, since malloc's threshold is fixed.
+    packed: bytes = msgpack.packb(value, default=_default, buf_size=PACK_BYTES)
     return packed
 
 
@@ -164,7 +167,9 @@ def unpack(data: bytes) -> Any:
 
 def _default(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return msgpack.ExtType(_ARRAY, msgpack.packb((value.dtype.str, value.shape, value.tobytes())))
+        return msgpack.ExtType(
+            _ARRAY, msgpack.packb((value.dtype.str, value.shape, value.tobytes()), buf_size=PACK_BYTES)
+        )
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} cannot be stored")
