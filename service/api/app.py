@@ -73,6 +73,8 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         version=version("aic-vds"),
         summary="Which sensor to collect from, and how fast to fly",
         lifespan=lifespan,
+        # The edge's own traces have a span for each decision; FastAPI would look for a provider at each request.
+        telemetry={"tracing": False, "metrics": False, "logs": False},
         # Clients made from the schema then have functions of these names.
         generate_unique_id_function=lambda route: route.name,
     )
