@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 
+from service.observability.array_histogram import ArrayHistogram
 from shared.fleetplan.measured import Measured
 from shared.readings import ReadingResult
 from shared.wire import DecideResponse
@@ -98,7 +99,7 @@ class Metrics:
             registry=r,
             buckets=_SHARE_BUCKETS,
         )
-        self.link_excess_db = Histogram(
+        self.link_excess_db = ArrayHistogram(
             "aicvds_link_excess_db",
             "Excess of the path losses that beacons show over the formula's, dB",
             registry=r,
@@ -129,8 +130,7 @@ class Metrics:
 
     def record_measured(self, measured: Measured) -> None:
         """Count what the gains of one report show."""
-        for excess_db in measured.excess_db.tolist():
-            self.link_excess_db.observe(excess_db)
+        self.link_excess_db.observe(measured.excess_db)
         self.radio_failures.inc(measured.radio_failed)
 
     def record_decision(self, decision: DecideResponse) -> None:

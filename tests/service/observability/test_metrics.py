@@ -76,4 +76,5 @@ def test_the_docs_name_every_metric_with_its_labels() -> None:
     collectors: list[Any] = [
         c for c in Metrics().registry._collector_to_names if getattr(c, "_name", "").startswith("aicvds")
     ]
-    assert named == {c._name + ends.get(c._type, ""): (c._type, list(c._labelnames)) for c in collectors}
+    kinds = [(c._name, getattr(c, "_type", "histogram"), getattr(c, "_labelnames", ())) for c in collectors]
+    assert named == {name + ends.get(kind, ""): (kind, list(labels)) for name, kind, labels in kinds}
