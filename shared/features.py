@@ -242,12 +242,14 @@ def augment(
     distance = np.sqrt(np.square(places - position).sum(axis=1))
     if belief is None:
         assert rates is not None
-        rate, expected = rates[ids], channel_gain_db(distance, scenario)
+        rate = rates[ids]
     else:
-        expected = belief.channel.gain_db(np.asarray(position), distance, ids)
         heard = np.ones_like(heard)
         coming = belief.arrivals.coming(step, scenario.overflow_horizon_steps)
         queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], coming[ids]
+    stale = beacon != step
+    if stale.any():
+        gain[stale] = _expected_gains(belief, np.asarray(position), distance[stale], ids[stale], scenario)
     able = heard & (battery > 0)
     overflow = overflow_probability(queue, rate, scenario)
     urgencies = urgency_of(queue, overflow, scenario)
@@ -258,10 +260,10 @@ def augment(
         ids=ids,
         heard=heard,
         able=able,
-        admissible=able & ~np.isin(ids, list(reserved)),
+        admissible=able & ~np.isin(ids, list(reserved)) if reserved else able,
         queue=queue,
         battery=battery,
-        gain=np.where(beacon == step, gain, expected),
+        gain=gain,
         rate=rate,
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
         overflow=overflow,
@@ -271,6 +273,13 @@ def augment(
         drift=None if belief is None else belief.drift,
     )
     return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
+
+
+def _expected_gains(
+    belief: FleetBelief | None, place: FloatArray, distance: FloatArray, ids: NDArray[np.int64], scenario: Scenario
+) -> FloatArray:
+    """The expected gains ``(n,)``, dB, of sensors at distances ``(n,)`` from a UAV's place ``(2,)``."""
+    return channel_gain_db(distance, scenario) if belief is None else belief.channel.gain_db(place, distance, ids)
 
 
 def beacon_columns(sensors: SensorColumns) -> FloatArray:
