@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shared.channel import FloatArray, IntArray
+from shared.shadowing import FADINGS, KINDS, PLACE_SHARES, RANGE_OF_KIND, RANGES_M, SENSOR_SHARES
 
 # Measurements that a map keeps, of all sensors together and of one.
 _MOST_KEPT, _MOST_OF_ONE = 4096, 24
@@ -28,55 +27,11 @@ _EXACT_DB = 0.05
 # The map compares its kinds of shadowing again when this factor more measurements came.
 _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
+# After so many measurements of all sensors, those of the sensors at hand are inverted anew.
+_REFRESH = 500
 # Measurements of a sensor within this distance are of the same place, metres.
 _SAME_PLACE_M = 10.0
-# Matrices of measurements grow by so many rows at once, so that many sensors' are inverted together.
-_SIZE = 8
 
-
-@dataclass(frozen=True)
-class Shadowing:
-    """A kind of shadowing, as shares of the excess loss's variance that sum to 1.
-
-    ``sensor``: the same at every place. ``place``: by the UAV's place, with the correlation
-    ``exp(-distance / range_m)`` (Gudmundson 1991). The rest, ``fading``, differs from step to step.
-    """
-
-    sensor: float
-    place: float
-    range_m: float
-
-    @cached_property
-    def fading(self) -> float:
-        """The share of the variance that no earlier measurement tells anything about."""
-        return 1.0 - self.sensor - self.place
-
-    def covariance(self, apart_m: FloatArray) -> FloatArray:
-        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
-        return self.sensor + self.place * np.exp(-apart_m / self.range_m)
-
-
-# The likelihood of the measurements chooses between them. The first is the assumption before.
-KINDS = (
-    Shadowing(sensor=0.4, place=0.4, range_m=60.0),
-    *(
-        Shadowing(sensor=sensor * (1 - fading), place=(1 - sensor) * (1 - fading), range_m=range_m)
-        for sensor in (0.2, 0.6)
-        for range_m in (50.0, 150.0)
-        for fading in (0.02, 0.2)
-    ),
-    # A sensor's own excess alone, and fading alone.
-    Shadowing(sensor=0.996, place=0.002, range_m=60.0),
-    Shadowing(sensor=0.9, place=0.08, range_m=60.0),
-    Shadowing(sensor=0.4, place=0.2, range_m=60.0),
-    Shadowing(sensor=0.05, place=0.05, range_m=60.0),
-)
-# The kinds' shares, as columns for arrays (kinds, n, kept, kept), and their ranges, each once.
-_SENSOR_SHARES = np.array([kind.sensor for kind in KINDS])[:, None, None, None]
-_PLACE_SHARES = np.array([kind.place for kind in KINDS])[:, None, None, None]
-_FADINGS = np.array([kind.fading for kind in KINDS])[:, None, None]
-_RANGES_M, _RANGE_OF_KIND = np.unique([kind.range_m for kind in KINDS], return_inverse=True)
-_RANGES_M = _RANGES_M[:, None, None, None]
 
 # A packed symmetric matrix has its upper triangle column by column, in half the memory, so that a leading block of it
 # comes first. By row and column, the place in it.
@@ -89,11 +44,14 @@ class RadioMap:
     """Simple kriging of the excess loss, by sensor and by the UAV's place.
 
     The excess loss of a sensor is a Gaussian process over the UAV's places: an offset that all links share, plus the
-    components of a :class:`Shadowing`. The offset, the variance and the kind of shadowing are estimated from the
-    measurements of all sensors (empirical Bayes). A measurement far off its prediction is given a larger variance.
+    components of a :class:`shared.shadowing.Shadowing`. The offset, the variance and the kind of shadowing are
+    estimated from the measurements of all sensors (empirical Bayes). A measurement far off its prediction is given a
+    larger variance.
 
     Prediction at the place x, with the n measurements r of the sensor, their covariance K and their covariances k(x)
-    with the place: mean ``mu + k K^-1 (r - mu)``, variance ``sigma^2 (1 - k K^-1 k)``.
+    with the place: mean ``mu + k K^-1 (r - mu)``, variance ``sigma^2 (1 - k K^-1 k)``. A measurement changes one row of
+    K, and its inverse by that row (the inverse of a partitioned matrix). Another kind of shadowing inverts K anew, and
+    so does every so many measurements, before rounding errors add up.
 
     Args:
         sensors: J. A map of many sensors keeps fewer measurements of each.
@@ -122,7 +80,8 @@ class RadioMap:
         self._compared = _COMPARE_FIRST
         self.exact = True
         self.offset_db, self.deviation_db = 0.0, _PRIOR_DB
-        # By sensor, K^-1 packed, K^-1 r and K^-1 1. None until a gain differs from the formula.
+        # By sensor, K^-1 packed, K^-1 r and K^-1 1, with zeros where a sensor has no measurement. None until a gain
+        # differs from the formula.
         self._inverse: FloatArray | None = None
         self._measured: FloatArray = np.zeros((sensors, kept))
         self._ones: FloatArray = np.zeros((sensors, kept))
@@ -156,26 +115,53 @@ class RadioMap:
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        if not self.exact:
-            mean, deviation = self.predict(here[None], ids)
-            off = np.abs(excess - mean[0]) / np.maximum(deviation[0], _HUBER_LEAST_DB)
-            noise = np.square(np.maximum(off / _HUBER, 1.0))
         slot = self.count[ids]
         full = slot == self.excess.shape[1]
         if full.any():
             slot = np.where(full, self._dropped(ids, here), slot)
+        if not self.exact:
+            noise = self._replace(ids, slot, here, excess)
         self._taken[ids, slot] = self.heard
         self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
         self.count[ids] += ~full
         if self.exact:
             self.deviation_db = 0.0
-            return excess
-        if self.heard >= self._compared:
+        elif self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
             self._compare()
-        else:
+        elif self.heard % _REFRESH < len(ids):
             self._factor(ids)
+        else:
+            self._solve(ids)
         return excess
+
+    def _replace(self, ids: IntArray, slot: IntArray, here: FloatArray, excess: FloatArray) -> FloatArray:
+        """Change ``K^-1`` for new measurements at these slots; returns their noise, by the prediction before them."""
+        size = max(int(self.count[ids].max()), int(slot.max()) + 1)
+        rows, inverse = np.arange(len(ids)), self._inverses(ids, size)
+        away = self.places[ids, :size] - here
+        covariance = self.kind.covariance(np.sqrt(np.square(away).sum(axis=2)))
+        left = self._measured[ids, :size] - self.offset_db * self._ones[ids, :size]
+        known = (covariance[:, None] @ inverse)[:, 0]
+        share = np.maximum(1.0 - (known * covariance).sum(axis=1), self.kind.fading)
+        deviation = np.maximum(self.deviation_db * np.sqrt(share), _HUBER_LEAST_DB)
+        off = np.abs(excess - self.offset_db - (covariance * left).sum(axis=1)) / deviation
+        noise: FloatArray = np.square(np.maximum(off / _HUBER, 1.0))
+        # Without the measurement that leaves the slot, if there is one.
+        own = inverse[rows, slot]
+        weight = own[rows, slot]
+        own /= np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]
+        inverse -= own[:, :, None] * own[:, None, :]
+        inverse[rows, slot], inverse[rows, :, slot] = 0.0, 0.0
+        # With the one that takes it.
+        known = (covariance[:, None] @ inverse)[:, 0]
+        free = 1.0 + self.kind.fading * (noise - 1.0) - (known * covariance).sum(axis=1)
+        inverse += known[:, :, None] * (known / free[:, None])[:, None, :]
+        beside = known / -free[:, None]
+        inverse[rows, slot], inverse[rows, :, slot] = beside, beside
+        inverse[rows, slot, slot] = 1.0 / free
+        self._keep(ids, inverse)
+        return noise
 
     def _dropped(self, ids: IntArray, here: FloatArray) -> IntArray:
         """The measurement that a full record of each sensor drops for one here.
@@ -200,34 +186,44 @@ class RadioMap:
         east, north = (places[None, :, None, axis] - self.places[which, None, :kept, axis] for axis in (0, 1))
         # (n, P, kept)
         covariance = self.kind.covariance(np.sqrt(east * east + north * north))
-        covariance *= (np.arange(kept) < self.count[which, None])[:, None]
         left = self._measured[which, :kept] - offset * self._ones[which, :kept]
         mean = offset + np.matmul(covariance, left[..., None])[..., 0]
-        inverse = self._inverse[which][:, _PLACE_IN_PACKED[:kept, :kept]]
-        known = (covariance @ inverse * covariance).sum(axis=2)
+        known = (covariance @ self._inverses(which, kept) * covariance).sum(axis=2)
         # The fading is part of a link's variance, since it differs in the next step.
         share = np.maximum(1.0 - known, self.kind.fading)
         return mean.T, deviation * np.sqrt(share).T
 
-    def _factor(self, ids: IntArray) -> None:
-        """Invert the covariances of these sensors' measurements, and estimate what all links have in common.
+    def _inverses(self, ids: IntArray, kept: int) -> FloatArray:
+        """``K^-1`` of these sensors, ``(n, kept, kept)``, with zeros where a sensor has no measurement."""
+        assert self._inverse is not None
+        return np.asarray(self._inverse[ids][:, _PLACE_IN_PACKED[:kept, :kept]])
 
-        A matrix's size follows from its own sensor's measurements alone: the last bits of an inverse depend on it, and
-        a restored map is the same to the bit.
-        """
+    def _keep(self, ids: IntArray, inverse: FloatArray) -> None:
+        """Store ``K^-1`` of these sensors, ``(n, kept, kept)``."""
+        assert self._inverse is not None
+        few = inverse.shape[1] * (inverse.shape[1] + 1) // 2
+        self._inverse[ids, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
+
+    def _factor(self, ids: IntArray) -> None:
+        """Invert the covariances of these sensors' measurements, and estimate what all links have in common."""
         if self._inverse is None:
             most = self.excess.shape[1]
             self._inverse = np.zeros((len(self.excess), most * (most + 1) // 2))
-        sizes = np.minimum(-(-self.count[ids] // _SIZE) * _SIZE, self.excess.shape[1])
-        for size in np.unique(sizes[sizes > 0]).tolist():
-            some = ids[sizes == size]
-            used = (np.arange(size) < self.count[some, None]).astype(np.float64)
-            inverse = np.linalg.inv(self._covariances(some, size))
-            few = size * (size + 1) // 2
-            self._inverse[some, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
-            both = np.stack((self.excess[some, :size] * used, used), axis=2)
-            solved = inverse @ both
-            self._measured[some, :size], self._ones[some, :size] = solved[..., 0], solved[..., 1]
+        kept = int(self.count[ids].max(initial=0))
+        if kept:
+            used = np.arange(kept) < self.count[ids, None]
+            inverse: FloatArray = np.linalg.inv(self._covariances(ids, kept)).astype(np.float64, copy=False)
+            self._keep(ids, inverse * (used[:, :, None] & used[:, None, :]))
+        self._solve(ids)
+
+    def _solve(self, ids: IntArray) -> None:
+        """``K^-1 r`` and ``K^-1 1`` of these sensors, and with them the offset and the deviation of all links."""
+        kept = int(self.count[ids].max(initial=0))
+        if kept:
+            both = np.ones((len(ids), kept, 2))
+            both[..., 0] = self.excess[ids, :kept]
+            solved = self._inverses(ids, kept) @ both
+            self._measured[ids, :kept], self._ones[ids, :kept] = solved[..., 0], solved[..., 1]
         offset = self.offset_db = float(self._measured.sum() / (self._ones.sum() + _OFFSET_WEIGHT))
         squares = (self.excess - offset) * (self._measured - offset * self._ones)
         weight = _PRIOR_WEIGHT + int(self.count.sum())
@@ -263,9 +259,9 @@ class RadioMap:
         both_used, apart = used[:, :, None] & used[:, None, :], self._apart(ids, kept)
         noise, places = self.noise[ids, :kept] - 1.0, np.arange(kept)
         # (kinds, n, kept, kept)
-        matrices = _SENSOR_SHARES + _PLACE_SHARES * np.exp(-apart / _RANGES_M)[_RANGE_OF_KIND]
+        matrices = SENSOR_SHARES + PLACE_SHARES * np.exp(-apart / RANGES_M)[RANGE_OF_KIND]
         matrices *= both_used
-        matrices[..., places, places] = np.where(used, 1.0 + _FADINGS * noise, 1.0)
+        matrices[..., places, places] = np.where(used, 1.0 + FADINGS * noise, 1.0)
         excess = self.excess[ids, :kept] * used
         solved = np.linalg.solve(matrices, np.stack((excess, used.astype(np.float64)), axis=2))
         measured, ones = solved[..., 0], solved[..., 1]
@@ -277,8 +273,9 @@ class RadioMap:
         return np.asarray(-0.5 * count * np.log(total / (_PRIOR_WEIGHT + count)) - 0.5 * spread)
 
     def state_dict(self) -> dict[str, Any]:
-        """The measurements, as copies; the rest follows from them."""
+        """The measurements and what was solved of them, as copies."""
         arrays = {name: getattr(self, name).copy() for name in ("places", "excess", "noise", "count")}
+        solved = None if self._inverse is None else [self._inverse.copy(), self._measured.copy(), self._ones.copy()]
         return {
             **arrays,
             "taken": self._taken.copy(),
@@ -286,16 +283,20 @@ class RadioMap:
             "kind": KINDS.index(self.kind),
             "compared": self._compared,
             "exact": self.exact,
+            "solved": solved,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a map, to the bit."""
+        """Restore a map, to the bit. One of an earlier version is without what was solved."""
         for name in ("places", "excess", "noise", "count"):
             setattr(self, name, state[name])
         self._taken = state["taken"]
         self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
         self.exact = state["exact"]
-        if not self.exact:
+        if state.get("solved") is not None:
+            self._inverse, self._measured, self._ones = state["solved"]
+            self._solve(np.zeros(0, dtype=np.int64))
+        elif not self.exact:
             self._factor(np.arange(len(self.count)))
         elif self.heard:
             self.deviation_db = 0.0

@@ -142,6 +142,21 @@ def test_a_restored_map_is_the_same_to_the_bit_however_often_each_sensor_was_hea
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_changing_the_inverses_by_a_row_gives_what_inverting_them_anew_gives(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    found = RadioMap(10)
+    for number in range(200):
+        ids = np.sort(random.choice(10, random.integers(1, 11), replace=False))
+        found.measure(ids, random.uniform(0, 1000, 2), random.normal(0, 8, len(ids)))
+        if number % 20:
+            continue
+        anew = RadioMap(10)
+        anew.load_state_dict({**found.state_dict(), "solved": None})
+        for ours, theirs in zip(found.predict(PLACES, ALL), anew.predict(PLACES, ALL), strict=True):
+            np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
 AROUND = np.array([[math.cos(angle), math.sin(angle)] for angle in np.linspace(0, 2 * math.pi, 12, False)]) * 300.0
 EVERYWHERE = np.stack(np.meshgrid(np.linspace(-400, 400, 9), np.linspace(-400, 400, 9)), axis=-1).reshape(-1, 2)
 
