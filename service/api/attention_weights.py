@@ -17,8 +17,8 @@ def attention_of(mission: Mission) -> MissionAttention:
     learner = mission.learner
     arrays = [
         # The shortest digits of a float32; those of a float64 are twice as many for the same float32.
-        WeightArray(name=name, shape=list(w.shape), values=[float(str(v)) for v in w.detach().numpy().ravel()])
-        for name, w in learner.weights.attention._asdict().items()
+        WeightArray(name=name, shape=list(w.shape), values=[float(str(v)) for v in w.ravel()])
+        for name, w in learner.weights.attention.items()
     ]
     return MissionAttention(
         mission_id=mission.mission_id,

@@ -79,8 +79,7 @@ def _by_value(state: AttendedState) -> Preference:
     """The learned values."""
     values = {}
     for velocities, kept in zip(state.values_of_velocities(state.rows), state.candidates, strict=True):
-        levels = velocities.numpy()
-        values[kept.sensor_id] = kept.score + levels - levels.max()
+        values[kept.sensor_id] = kept.score + velocities - velocities.max()
     return LearnedValues(state.best_by_value(), values)
 
 

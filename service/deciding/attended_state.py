@@ -9,9 +9,7 @@ from time import perf_counter
 from typing import Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from service.deciding.decision_time import Stopwatch
 from service.guidance.step_guidance import StepGuidance
@@ -46,10 +44,10 @@ class AttendedState:
     guidance: StepGuidance | None
     admissible: list[int]
     features: NDArray[np.float32]
-    contexts: Tensor
+    contexts: NDArray[np.float32]
     rows: list[int]
     candidates: list[Candidate]
-    _velocity_values: dict[int, Tensor] = field(default_factory=dict)
+    _velocity_values: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, mission: Mission, uav: UavState, step: int, watch: Stopwatch | None = None) -> Self:
@@ -157,7 +155,7 @@ class AttendedState:
             sample=sample,
         )
 
-    def values_of_velocities(self, rows: Sequence[int]) -> list[Tensor]:
+    def values_of_velocities(self, rows: Sequence[int]) -> list[NDArray[np.float32]]:
         """The learned ``u_jv`` of the sensors in these rows at each velocity level v, ``(V,)`` each."""
         if missing := [row for row in rows if row not in self._velocity_values]:
             contexts = self.contexts[[self.admissible.index(row) for row in missing]]
@@ -169,14 +167,14 @@ class AttendedState:
 
 def _attend(
     mission: Mission, features: NDArray[np.float32], admissible: list[int], guidance: StepGuidance | None
-) -> tuple[list[int], list[float], Tensor]:
+) -> tuple[list[int], list[float], NDArray[np.float32]]:
     """Places in ``admissible`` of the sensors to keep, best first, the scores of all ``(n,)``, and their contexts."""
     if not admissible:
-        return [], [], torch.empty(0)
+        return [], [], np.empty(0, dtype=np.float32)
     scores, contexts = mission.learner.weights.score(features)
     if guidance is not None:
         # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
         added = guidance.worth[:, admissible].max(axis=0) / mission.scenario.queue_capacity
-        scores = scores + torch.from_numpy(added.astype(np.float32))
+        scores = scores + added.astype(np.float32)
     kept = top_k(scores, mission.top_k) if mission.uses_attention else list(range(len(admissible)))
     return kept, scores.tolist(), contexts

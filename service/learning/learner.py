@@ -8,13 +8,10 @@ a tenth of the time of torch's autograd.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from service.learning.modules import Array, Layout, Parameters, Sample, Weights
 
@@ -47,15 +44,15 @@ class Learner:
         Raises:
             FloatingPointError: the gradient is not finite. The weights, which would be lost for good, do not change.
         """
-        before = self.weights.flat
-        gradient, into = _gradient_of(self._layout)
-        gradient.zero_()
-        loss = descend(self._layout.arrays(before), sample, -cost, into=into)
-        if not np.isfinite(gradient.numpy()).all():
+        weights = self.weights
+        gradient, into = _gradient_of(weights.layout)
+        gradient.fill(0)
+        loss = descend(weights.parameters, sample, -cost, into=into)
+        if not np.isfinite(gradient).all():
             raise FloatingPointError("the gradient of a training sample is not finite")
         if self._moments is None:
-            self._moments = Moments(torch.zeros(len(before)), torch.zeros(len(before)))
-        self.weights = Weights(self._layout, adam_step(before, self._moments, gradient, self._learning_rate))
+            self._moments = Moments(np.zeros_like(gradient), np.zeros_like(gradient))
+        self.weights = Weights(weights.layout, adam_step(weights.flat, self._moments, gradient, self._learning_rate))
         # The loss comes first: a reader that sees the new count also sees the new loss.
         self.last_loss = loss
         self.updates += 1
@@ -63,31 +60,28 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Weights and Adam's moments as arrays."""
-        views = self._layout.views
+        arrays = self._layout.arrays
         adam: dict[int, dict[str, Array]] = {}
         if (moments := self._moments) is not None:
-            for index, (mean, square) in enumerate(zip(views(moments.mean), views(moments.square), strict=True)):
-                step = np.array(moments.steps, dtype=np.float32)
-                adam[index] = {"step": step, "exp_avg": mean.numpy().copy(), "exp_avg_sq": square.numpy().copy()}
-        weights = zip(self._layout.names, views(self.weights.flat), strict=True)
+            step = np.array(moments.steps, dtype=np.float32)
+            both = zip(arrays(moments.mean), arrays(moments.square), strict=True)
+            for index, (mean, square) in enumerate(both):
+                adam[index] = {"step": step, "exp_avg": mean.copy(), "exp_avg_sq": square.copy()}
         return {
-            "weights": {name: tensor.numpy().copy() for name, tensor in weights},
+            "weights": {n: p.copy() for n, p in zip(self._layout.names, self.weights.parameters, strict=True)},
             "adam": adam,
             "updates": self.updates,
             "last_loss": self.last_loss,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state; raises ``RuntimeError`` where it belongs to modules of another preset or other levels."""
-
-        def flat(arrays: Iterable[Array]) -> Tensor:
-            return self._layout.flat([torch.from_numpy(array) for array in arrays])
-
-        self.weights = Weights(self._layout, flat(state["weights"].values()))
+        """Restore a state; raises ``ValueError`` where it belongs to modules of another preset or other levels."""
+        flat = self._layout.flat
+        self.weights = Weights(self._layout, flat(list(state["weights"].values())))
         adam = [state["adam"][index] for index in sorted(state["adam"])]
         self._moments = None
         if adam:
-            mean, square = flat(one["exp_avg"] for one in adam), flat(one["exp_avg_sq"] for one in adam)
+            mean, square = flat([one["exp_avg"] for one in adam]), flat([one["exp_avg_sq"] for one in adam])
             self._moments = Moments(mean, square, int(adam[0]["step"]))
         self.updates, self.last_loss = state["updates"], state["last_loss"]
 
@@ -96,25 +90,33 @@ class Learner:
 class Moments:
     """Adam's running means of the gradient and of its square, ``(n,)`` each, after some steps."""
 
-    mean: Tensor
-    square: Tensor
+    mean: Array
+    square: Array
     steps: int = 0
 
 
-@torch.no_grad()
-def adam_step(weights: Tensor, moments: Moments, gradient: Tensor, learning_rate: float) -> Tensor:
+def adam_step(weights: Array, moments: Moments, gradient: Array, learning_rate: float) -> Array:
     """The weights ``(n,)`` after one more step of Adam (Kingma and Ba 2015) down the gradient ``(n,)``.
 
-    The result equals that of ``torch.optim.Adam`` to the bit. That class imports torch's compiler at its first use,
-    during which nothing else of the process runs for seconds, and takes its steps parameter by parameter. This function
-    changes the moments, and overwrites the gradient.
+    The result equals that of ``torch.optim.Adam`` but for the last bits. That class imports torch's compiler at its
+    first use, during which nothing else of the process runs for seconds, and takes its steps parameter by parameter.
+    This function changes the moments, and overwrites the gradient.
     """
     moments.steps += 1
     mean, square = moments.mean, moments.square
-    mean.lerp_(gradient, 1 - _BETA1)
-    square.mul_(_BETA2).addcmul_(gradient, gradient, value=1 - _BETA2)
-    spread = torch.sqrt(square, out=gradient).div_((1 - _BETA2**moments.steps) ** 0.5).add_(_EPS)
-    return torch.addcdiv(weights, mean, spread, value=-learning_rate / (1 - _BETA1**moments.steps))
+    work = gradient - mean
+    work *= np.float32(1 - _BETA1)
+    mean += work
+    gradient *= gradient
+    gradient *= np.float32(1 - _BETA2)
+    square *= np.float32(_BETA2)
+    square += gradient
+    np.sqrt(square, out=gradient)
+    gradient /= np.float32((1 - _BETA2**moments.steps) ** 0.5)
+    gradient += np.float32(_EPS)
+    np.divide(mean, gradient, out=work)
+    work *= np.float32(learning_rate / (1 - _BETA1**moments.steps))
+    return weights - work
 
 
 # A BLAS kernel may raise the flag although its input is finite; the caller checks the gradient.
@@ -162,16 +164,17 @@ def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters
     return float(off_score * off_score + off_value * off_value)
 
 
-def _gradient_of(layout: Layout) -> tuple[Tensor, Parameters]:
-    """This thread's flat gradient for a layout, and its views by parameter.
+def _gradient_of(layout: Layout) -> tuple[Array, Parameters]:
+    """This thread's flat gradient of the layout's size, and its views by parameter.
 
     A new one for each training sample would fragment the heap.
     """
-    buffers: dict[Layout, tuple[Tensor, Parameters]] = _gradients.__dict__.setdefault("by_layout", {})
-    if layout not in buffers:
-        gradient = torch.zeros(layout.size)
-        buffers[layout] = gradient, layout.arrays(gradient)
-    return buffers[layout]
+    buffers: dict[tuple[str, int], tuple[Array, Parameters]] = _gradients.__dict__.setdefault("by_layout", {})
+    kind = layout.preset, layout.size
+    if kind not in buffers:
+        gradient = np.zeros(layout.size, dtype=np.float32)
+        buffers[kind] = gradient, layout.arrays(gradient)
+    return buffers[kind]
 
 
 _gradients = threading.local()

@@ -1,16 +1,15 @@
 """The attention and velocity modules, which score a mission's sensors and the velocities for each of them.
 
-Decisions use :class:`Weights`, a frozen copy of the parameters, with the functions :func:`attend`, :func:`by_distance`
-and :func:`by_reach`. :class:`Modules` are the same computations as torch modules, for training offline.
+Decisions use :class:`Weights`, a frozen copy of the parameters, and numpy. :class:`Modules` are the same computations
+as torch modules, for training offline.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +27,8 @@ WIDTH = 32
 # From so many sensors on, the cores share the queries. From 768 queries on, torch's kernel takes 256 at a time: shares
 # of at least four whole blocks give the same result to the bit as one call for all queries.
 _MANY, _BLOCK, _LEAST_BLOCKS = 2048, 256, 4
-# Numbers that torch computes at once: a parameter of a multiple of so many gives the same result wherever it lies.
-_VECTOR = 32
+# From so many sensors on, torch's kernel is faster than numpy.
+_FOR_TORCH = 64
 
 
 class Sample(NamedTuple):
@@ -125,9 +124,9 @@ def _threads(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="attention")
 
 
-def top_k(scores: Tensor, k: int) -> list[int]:
-    """Indices of the k best scores, best first; of all scores where there are fewer than k."""
-    best: list[int] = torch.topk(scores, min(k, len(scores))).indices.tolist()
+def top_k(scores: Array, k: int) -> list[int]:
+    """Indices of the k best scores, best first; of all scores where there are fewer than k. Of equals, the first."""
+    best: list[int] = np.argsort(-scores, kind="stable")[:k].tolist()
     return best
 
 
@@ -150,93 +149,91 @@ def _values(weights: VelocityWeights, x: Tensor) -> Tensor:
 class Weights:
     """The parameters that decisions compute with: a finished copy that nothing changes.
 
+    Few sensors are scored in numpy, many by torch's kernel: for ten sensors torch's calls take longer than the sums.
+
     Attributes:
         layout: positions of the parameters in ``flat``.
         flat: all parameters, ``(size,)``.
     """
 
-    __slots__ = ("_attention", "_velocity", "flat", "layout")
+    __slots__ = ("_parameters", "flat", "layout")
 
-    def __init__(self, layout: Layout, flat: Tensor) -> None:
+    def __init__(self, layout: Layout, flat: Array) -> None:
         self.layout, self.flat = layout, flat
-        # The views are made on first use: each training step makes new weights, and few decisions use them all.
-        self._attention: AttentionWeights | None = None
-        self._velocity: VelocityWeights | None = None
+        self._parameters: Parameters | None = None
 
     @property
-    def attention(self) -> AttentionWeights:
-        """The attention module's parameters."""
-        if self._attention is None:
-            attention = slice(len(AttentionWeights._fields))
-            self._attention = AttentionWeights(*self.layout.views(self.flat, attention))
-        return self._attention
+    def parameters(self) -> Parameters:
+        """Views of the parameters."""
+        if self._parameters is None:
+            self._parameters = self.layout.arrays(self.flat)
+        return self._parameters
 
-    @torch.inference_mode()
-    def score(self, features: Array) -> tuple[Tensor, Tensor]:
-        """Scores ``(n,)`` and contexts ``(n, d')`` of n sensors' features ``(n, d)``."""
-        return attend(self.attention, torch.from_numpy(features))
+    @property
+    def attention(self) -> dict[str, Array]:
+        """The attention module's parameters by name."""
+        return {name: getattr(self.parameters, name) for name in AttentionWeights._fields}
 
-    @torch.inference_mode()
-    def velocities(self, contexts: Tensor, approaches: Array) -> list[Tensor]:
+    def score(self, features: Array) -> tuple[Array, Array]:
+        """Scores ``(n,)`` and contexts ``(n, d')`` of n sensors' features ``(n, d)``, as :func:`attend`."""
+        if len(features) >= _FOR_TORCH:
+            with torch.inference_mode():
+                attention = AttentionWeights(*map(torch.from_numpy, self.attention.values()))
+                scores, contexts = attend(attention, torch.from_numpy(features))
+                return scores.numpy(), contexts.numpy()
+        own = self.parameters
+        similar = (features @ own.query.T) @ (features @ own.key.T).T
+        similar *= np.float32(len(own.query) ** -0.5)
+        similar -= similar.max(axis=1, keepdims=True)
+        np.exp(similar, out=similar)
+        similar /= similar.sum(axis=1, keepdims=True)
+        z = similar @ (features @ own.value.T)
+        return z @ own.score[0] + own.bias[0], z
+
+    def velocities(self, contexts: Array, approaches: Array) -> list[Array]:
         """Values ``(levels,)`` of the velocities for each of n sensors, from their contexts ``(n, d')``."""
-        if self._velocity is None:
-            velocity = slice(len(AttentionWeights._fields), None)
-            self._velocity = VelocityWeights(*self.layout.views(self.flat, velocity))
-        values = by_distance if self.layout.preset == "paper" else by_reach
+        own = self.parameters
+        found = []
         # One after another: the last bits of a product depend on its size. No value may depend on the other sensors.
-        return [values(self._velocity, *pair) for pair in zip(contexts, torch.from_numpy(approaches), strict=True)]
+        for z, approach in zip(contexts, approaches, strict=True):
+            if self.layout.preset == "paper":
+                hidden = np.maximum(own.hidden @ np.concatenate((z, approach)) + own.hidden_bias, 0)
+                found.append(own.out @ hidden + own.out_bias)
+            else:
+                levels = np.concatenate((np.broadcast_to(z, (len(approach), len(z))), approach), axis=1)
+                hidden = np.maximum(levels @ own.hidden.T + own.hidden_bias, 0)
+                found.append(hidden @ own.out[0] + own.out_bias[0])
+        return found
 
 
-@dataclass(frozen=True, slots=True)
 class Layout:
-    """Positions of a preset's parameters in one flat array: first those of whole vectors of torch's.
+    """Positions of a preset's parameters, in the modules' order, in one flat array.
 
-    ``names``, ``shapes``, ``strides`` and ``starts`` are in the modules' order.
+    Attributes:
+        names: of the parameters.
     """
 
-    preset: Features
-    names: tuple[str, ...]
-    shapes: tuple[torch.Size, ...]
-    strides: tuple[tuple[int, ...], ...]
-    starts: tuple[int, ...]
+    __slots__ = ("_shapes", "_starts", "names", "preset", "size")
 
-    @classmethod
-    def of(cls, preset: Features, named: Iterable[tuple[str, Tensor]]) -> Self:
-        """The layout of a preset's modules, from their parameters by name."""
+    def __init__(self, preset: Features, named: Iterable[tuple[str, Tensor]]) -> None:
+        self.preset = preset
         names, parameters = zip(*named, strict=True)
-        shapes = tuple(p.shape for p in parameters)
-        starts, end = dict[int, int](), 0
-        for index in sorted(range(len(shapes)), key=lambda index: shapes[index].numel() % _VECTOR != 0):
-            starts[index], end = end, end + shapes[index].numel()
-        strides = tuple(p.contiguous().stride() for p in parameters)
-        return cls(preset, names, shapes, strides, tuple(starts[index] for index in range(len(shapes))))
+        self.names: tuple[str, ...] = names
+        self._shapes = tuple(tuple(p.shape) for p in parameters)
+        ends = np.cumsum([p.numel() for p in parameters]).tolist()
+        self._starts = (0, *ends)
+        self.size: int = ends[-1]
 
-    @property
-    def size(self) -> int:
-        """The number of all numbers."""
-        return sum(shape.numel() for shape in self.shapes)
+    def arrays(self, flat: Array) -> Parameters:
+        """Views of the parameters in a flat array."""
+        places = zip(self._starts, self._starts[1:], self._shapes, strict=False)
+        return Parameters(*(flat[start:end].reshape(shape) for start, end, shape in places))
 
-    def views(self, flat: Tensor, which: slice = slice(None)) -> list[Tensor]:
-        """Views of the parameters in a flat array that begins its storage, in the modules' order."""
-        positions = zip(self.shapes[which], self.strides[which], self.starts[which], strict=True)
-        # A slice and a view of it take four times as long, and each training step makes new weights.
-        return [flat.as_strided(*position) for position in positions]
-
-    def arrays(self, flat: Tensor) -> Parameters:
-        """The same views as numpy arrays."""
-        numbers = flat.numpy()
-        return Parameters(
-            *(numbers[a : a + s.numel()].reshape(s) for a, s in zip(self.starts, self.shapes, strict=True))
-        )
-
-    def flat(self, parameters: Sequence[Tensor]) -> Tensor:
-        """The flat array of parameters in the modules' order; raises ``RuntimeError`` where they have other shapes."""
-        if [p.shape for p in parameters] != list(self.shapes):
-            raise RuntimeError(
-                f"the parameters do not have the shapes of preset {self.preset} at these velocity levels"
-            )
-        order = sorted(range(len(parameters)), key=self.starts.__getitem__)
-        return torch.cat([parameters[index].reshape(-1) for index in order])
+    def flat(self, parameters: Sequence[Array]) -> Array:
+        """The flat array of parameters in the modules' order; raises ``ValueError`` where they have other shapes."""
+        if [p.shape for p in parameters] != list(self._shapes):
+            raise ValueError(f"the parameters do not have the shapes of preset {self.preset} at these velocity levels")
+        return np.concatenate([np.ravel(p) for p in parameters])
 
 
 class Attention(nn.Module):
@@ -318,5 +315,5 @@ class Modules(nn.Module):
 
     def weights(self) -> Weights:
         """A copy of the parameters for decisions."""
-        layout = Layout.of(self.preset, self.named_parameters())
-        return Weights(layout, layout.flat([p.detach() for p in self.parameters()]))
+        layout = Layout(self.preset, self.named_parameters())
+        return Weights(layout, layout.flat([p.detach().numpy() for p in self.parameters()]))

@@ -38,10 +38,10 @@ def test_the_weights_are_those_that_decide(tmp_path: Path, report: Report, featu
         told = MissionAttention.model_validate_json(answer.content)
         assert (told.mission_id, told.features, told.belief, told.top_k) == ("test", features, "fleet", 3)
         assert told.updates == 1
-        kept = engine.missions.loaded[0].learner.weights.attention._asdict()
+        kept = engine.missions.loaded[0].learner.weights.attention
         assert [w.name for w in told.weights] == ["query", "key", "value", "score", "bias"]
         for w in told.weights:
-            assert np.array_equal(np.array(w.values, np.float32).reshape(w.shape), kept[w.name].numpy())
+            assert np.array_equal(np.array(w.values, np.float32).reshape(w.shape), kept[w.name])
         assert told.weights[0].shape == [32, numbers]
 
 

@@ -46,7 +46,7 @@ def test_top_k_is_the_missions() -> None:
     view = attended(mission(top_k=2), uav())
     assert len(view.rows) == 2
     scores, _ = mission().learner.weights.score(view.state.features(PAPER))
-    assert view.kept_ids == np.argsort(-scores.numpy())[:2].tolist()
+    assert view.kept_ids == np.argsort(-scores)[:2].tolist()
 
 
 def test_the_shipped_start_prefers_a_full_queue_among_sensors_visited_alike() -> None:

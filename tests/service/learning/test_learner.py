@@ -68,36 +68,46 @@ def test_a_lessons_gradient_is_autograds(preset: Features, sensors: int) -> None
         loss = modules.loss(case, -cost)
         expected = torch.autograd.grad(loss, list(modules.parameters()))
         weights = modules.weights()
-        found = torch.zeros_like(weights.flat)
-        told = descend(weights.layout.arrays(weights.flat), case, -cost, into=weights.layout.arrays(found))
+        found = weights.layout.arrays(np.zeros_like(weights.flat))
+        told = descend(weights.parameters, case, -cost, into=found)
         assert told == pytest.approx(loss.item(), rel=1e-4, abs=1e-9)
-        for name, mine, its in zip(weights.layout.names, weights.layout.views(found), expected, strict=True):
-            torch.testing.assert_close(mine, its, rtol=1e-3, atol=1e-5 * (1 + float(its.abs().max())), msg=name)
+        for name, mine, its in zip(weights.layout.names, found, expected, strict=True):
+            atol = 1e-5 * (1 + float(its.abs().max()))
+            np.testing.assert_allclose(mine, its.numpy(), rtol=1e-3, atol=atol, err_msg=name)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_lesson_is_a_step_of_torchs_adam_to_the_bit(preset: Features) -> None:
+def test_a_lesson_is_a_step_of_torchs_adam(preset: Features) -> None:
     modules = Modules(preset, 15, seed=1)
     adam = torch.optim.Adam(modules.parameters(), lr=5e-3)
     learner = Learner(Modules(preset, 15, seed=1).weights(), learning_rate=5e-3)
     for seed in range(60):
-        weights = modules.weights()
-        gradient = torch.zeros_like(weights.flat)
-        descend(weights.layout.arrays(weights.flat), sample(preset, seed), -0.3, into=weights.layout.arrays(gradient))
-        for parameter, its in zip(modules.parameters(), weights.layout.views(gradient), strict=True):
-            parameter.grad = its.clone()
+        weights = learner.weights
+        gradient = weights.layout.arrays(np.zeros_like(weights.flat))
+        descend(weights.parameters, sample(preset, seed), -0.3, into=gradient)
+        for parameter, its in zip(modules.parameters(), gradient, strict=True):
+            parameter.grad = torch.from_numpy(its.copy())
         adam.step()
         learner.update(sample(preset, seed), cost=0.3)
-        assert torch.equal(
-            learner.weights.score(sample(preset, 99).features)[0],
-            modules.weights().score(sample(preset, 99).features)[0],
-        )
     kept = learner.state_dict()
     for name, values in modules.state_dict().items():
-        assert np.array_equal(kept["weights"][name], values.numpy()), name
+        np.testing.assert_allclose(kept["weights"][name], values.numpy(), rtol=1e-5, atol=1e-6, err_msg=name)
     for index, moments in adam.state_dict()["state"].items():
         for name, value in moments.items():
-            assert np.array_equal(kept["adam"][index][name], value.numpy()), (index, name)
+            np.testing.assert_allclose(kept["adam"][index][name], value.numpy(), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("sensors", [1, 2, 10, 63, 64, 200])
+def test_decisions_compute_what_the_modules_compute(preset: Features, sensors: int) -> None:
+    for seed in range(10):
+        modules, case = Modules(preset, 15, seed=seed), sample(preset, seed, sensors)
+        with torch.no_grad():
+            scores, values = modules.evaluate(case)
+        found, contexts = modules.weights().score(case.features)
+        np.testing.assert_allclose(found, scores.numpy(), atol=2e-6)
+        levels = modules.weights().velocities(contexts[[case.chosen]], case.approach[None])[0]
+        np.testing.assert_allclose(levels, values.numpy(), atol=2e-6)
 
 
 def test_a_lesson_that_is_not_finite_changes_nothing() -> None:
@@ -124,10 +134,10 @@ def test_what_was_kept_goes_on_as_if_it_had_never_stopped() -> None:
     again.load_state_dict(first.state_dict())
     for seed in range(10, 20):
         again.update(sample("reach", seed), cost=0.3)
-    assert torch.equal(
+    assert np.array_equal(
         again.weights.score(sample("reach").features)[0], through.weights.score(sample("reach").features)[0]
     )
-    with pytest.raises(RuntimeError):
+    with pytest.raises(ValueError):
         Learner(Modules("paper", 15, seed=1).weights(), learning_rate=5e-3).load_state_dict(first.state_dict())
 
 
@@ -140,15 +150,17 @@ def test_missions_share_modules_and_until_they_learn_the_pretrained_weights() ->
     for seed in range(20):
         alone.update(sample("reach", seed), cost=0.3)
     scores = [learner.weights.score(sample("reach").features)[0] for learner in (one, other, alone)]
-    assert torch.equal(scores[0], scores[2])
-    assert not torch.equal(scores[0], scores[1])
-    assert not torch.equal(scores[0], initial_weights("pretrained", "reach", 15, 0).score(sample("reach").features)[0])
+    assert np.array_equal(scores[0], scores[2])
+    assert not np.array_equal(scores[0], scores[1])
+    assert not np.array_equal(
+        scores[0], initial_weights("pretrained", "reach", 15, 0).score(sample("reach").features)[0]
+    )
 
 
 def test_what_other_modules_learned_is_refused() -> None:
     learner = Learner(Modules("paper", 15, seed=0).weights(), learning_rate=5e-4)
     for other in (Modules("reach", 15, seed=0), Modules("paper", 9, seed=0)):
-        with pytest.raises(RuntimeError, match="do not have the shapes"):
+        with pytest.raises(ValueError, match="do not have the shapes"):
             learner.load_state_dict(Learner(other.weights(), learning_rate=5e-4).state_dict())
 
 
@@ -205,5 +217,5 @@ def test_the_seed_decides_the_initial_weights_and_leaves_torch_alone() -> None:
     a, b, c = Modules("paper", 15, seed=1), Modules("paper", 15, seed=1), Modules("paper", 15, seed=2)
     assert torch.equal(torch.random.get_rng_state(), state)
     scores = [m.weights().score(sample().features)[0] for m in (a, b, c)]
-    assert torch.equal(scores[0], scores[1])
-    assert not torch.equal(scores[0], scores[2])
+    assert np.array_equal(scores[0], scores[1])
+    assert not np.array_equal(scores[0], scores[2])
