@@ -17,7 +17,7 @@ from service.api.api_keys import ApiKeys
 from service.api.authentication import KeyAuthentication
 from service.api.openapi import schema_of
 from service.api.request_limits import RequestLimits
-from service.api.routes import router
+from service.api.routes import decisions, router
 from service.config.settings import Settings
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
@@ -78,6 +78,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         # Clients made from the schema then have functions of these names.
         generate_unique_id_function=lambda route: route.name,
     )
+    app.include_router(decisions)
     app.include_router(router)
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
