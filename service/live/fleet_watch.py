@@ -26,7 +26,8 @@ class Watched:
     """What was seen of one mission since the edge started.
 
     Attributes:
-        full: by step, the expected number of sensors that overflowed into it, as the fleet believed.
+        full: by step, the expected number of sensors that overflowed into it, as the fleet believed at its first
+            decision of the step.
         silent: by sensor, the newest step in which a UAV was within its radio radius and did not hear it.
         decided_at: the monotonic time of the last decision, seconds; None before the first.
     """
@@ -54,7 +55,8 @@ class FleetWatch:
         """Take a report that was answered, and the belief after it."""
         watched = self.of(mission.mission_id)
         watched.decided_at = time.monotonic()
-        watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
+        if step not in watched.full:
+            watched.full[step] = round(float(_overflowed(mission.belief, step, mission.scenario).sum()), 3)
         self._hear(watched, mission, uav, step)
 
     def of(self, mission_id: str) -> Watched:
@@ -70,14 +72,16 @@ class FleetWatch:
 
     def _hear(self, watched: Watched, mission: Mission, uav: UavState, step: int) -> None:
         """Note the reported sensors within the UAV's radio radius that it did not hear in this step."""
-        ids = np.array(uav.sensors.id, dtype=np.int64)
-        offset = mission.belief.places[ids] - np.array(uav.position)
-        near = np.hypot(offset[:, 0], offset[:, 1]) <= mission.scenario.radio_radius_m
-        for row in np.flatnonzero(near).tolist():
-            if uav.sensors.last_seen[row] == step:
-                watched.silent.pop(int(ids[row]), None)
-            else:
-                watched.silent[int(ids[row])] = step
+        columns = uav.sensors
+        if watched.silent:
+            for sensor, seen in zip(columns.id, columns.last_seen, strict=True):
+                if seen == step:
+                    watched.silent.pop(sensor, None)
+        unheard = np.array([i for i, seen in zip(columns.id, columns.last_seen, strict=True) if seen != step], np.int64)
+        if len(unheard):
+            offset = mission.belief.places[unheard] - np.array(uav.position)
+            near = np.hypot(offset[:, 0], offset[:, 1]) <= mission.scenario.radio_radius_m
+            watched.silent.update(dict.fromkeys(unheard[near].tolist(), step))
 
 
 def _overflowed(belief: FleetBelief, step: int, scenario: Scenario) -> FloatArray:

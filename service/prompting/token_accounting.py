@@ -121,7 +121,7 @@ class UnprunedState:
             if not longer.any():
                 break
             digits += longer & ~unknown
-        kinds = np.where(unknown, 2, numbers < 0) @ 3 ** np.arange(len(names))
+        kinds = np.where(unknown, 2, numbers < 0) @ _columns(names)[1]
         total = count(self.head) if self.head else 0
         for kind, often in Counter(kinds.tolist()).items():
             text, known = _example_row(self.write, names, kind)
@@ -131,9 +131,15 @@ class UnprunedState:
     def _numbers(self) -> tuple[tuple[str, ...], NDArray[np.int64], NDArray[np.bool_]]:
         """The columns' names, their whole numbers ``(J, C)``, and which of these are unknown for want of a beacon."""
         columns = full_columns(self.state)
-        always_known = np.array([name in ALWAYS_KNOWN for name in columns])
+        names = tuple(columns)
         numbers = np.rint(np.array(list(columns.values())).T).astype(np.int64)
-        return tuple(columns), numbers, ~self.state.heard[:, None] & ~always_known
+        return names, numbers, ~self.state.heard[:, None] & _columns(names)[0]
+
+
+@lru_cache(maxsize=16)
+def _columns(names: tuple[str, ...]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Whether each column needs a beacon, and its place value in a row's kind, see :func:`_example_row`."""
+    return np.array([name not in ALWAYS_KNOWN for name in names]), 3 ** np.arange(len(names))
 
 
 @lru_cache(maxsize=256)
