@@ -251,6 +251,10 @@ def augment(
     if stale.any():
         gain[stale] = _expected_gains(belief, np.asarray(position), distance[stale], ids[stale], scenario)
     able = heard & (battery > 0)
+    admissible = able.copy()
+    # Few sensors are reserved: for them np.isin takes several times as long.
+    for sensor in reserved:
+        admissible[ids == sensor] = False
     overflow = overflow_probability(queue, rate, scenario)
     urgencies = urgency_of(queue, overflow, scenario)
     state = State(
@@ -260,7 +264,7 @@ def augment(
         ids=ids,
         heard=heard,
         able=able,
-        admissible=able & ~np.isin(ids, list(reserved)) if reserved else able,
+        admissible=admissible,
         queue=queue,
         battery=battery,
         gain=gain,
