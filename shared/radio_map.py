@@ -140,7 +140,7 @@ class RadioMap:
         size = max(int(self.count[ids].max()), int(slot.max()) + 1)
         rows, inverse = np.arange(len(ids)), self._inverses(ids, size)
         away = self.places[ids, :size] - here
-        covariance = self.kind.covariance(np.sqrt(np.square(away).sum(axis=2)))
+        covariance = self._covariance(np.sqrt(np.square(away).sum(axis=2)))
         left = self._measured[ids, :size] - self.offset_db * self._ones[ids, :size]
         known = (covariance[:, None] @ inverse)[:, 0]
         share = np.maximum(1.0 - (known * covariance).sum(axis=1), self.kind.fading)
@@ -185,7 +185,7 @@ class RadioMap:
             return np.full(shape, offset), np.full(shape, deviation)
         east, north = (places[None, :, None, axis] - self.places[which, None, :kept, axis] for axis in (0, 1))
         # (n, P, kept)
-        covariance = self.kind.covariance(np.sqrt(east * east + north * north))
+        covariance = self._covariance(np.sqrt(east * east + north * north))
         left = self._measured[which, :kept] - offset * self._ones[which, :kept]
         mean = offset + np.matmul(covariance, left[..., None])[..., 0]
         known = (covariance @ self._inverses(which, kept) * covariance).sum(axis=2)
@@ -229,10 +229,15 @@ class RadioMap:
         weight = _PRIOR_WEIGHT + int(self.count.sum())
         self.deviation_db = float(np.sqrt((_PRIOR_WEIGHT * _PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
+    def _covariance(self, apart_m: FloatArray) -> FloatArray:
+        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
+        kind = self.kind
+        return kind.sensor + kind.place * np.exp(-apart_m / kind.range_m)
+
     def _covariances(self, ids: IntArray, kept: int) -> FloatArray:
         """``K``, ``(n, kept, kept)``; the rows without a measurement are the identity's."""
         used = np.arange(kept) < self.count[ids, None]
-        matrix = self.kind.covariance(self._apart(ids, kept)) * (used[:, :, None] & used[:, None, :])
+        matrix = self._covariance(self._apart(ids, kept)) * (used[:, :, None] & used[:, None, :])
         diagonal = 1.0 + self.kind.fading * (self.noise[ids, :kept] - 1.0)
         matrix[:, np.arange(kept), np.arange(kept)] = np.where(used, diagonal, 1.0)
         return np.asarray(matrix)

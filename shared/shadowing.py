@@ -7,8 +7,6 @@ from functools import cached_property
 
 import numpy as np
 
-from shared.channel import FloatArray
-
 
 @dataclass(frozen=True)
 class Shadowing:
@@ -26,10 +24,6 @@ class Shadowing:
     def fading(self) -> float:
         """The share of the variance that no earlier measurement tells anything about."""
         return 1.0 - self.sensor - self.place
-
-    def covariance(self, apart_m: FloatArray) -> FloatArray:
-        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
-        return self.sensor + self.place * np.exp(-apart_m / self.range_m)
 
 
 # The likelihood of the measurements chooses between them. The first is the assumption before.
