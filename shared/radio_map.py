@@ -8,15 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shared.channel import FloatArray, IntArray
-from shared.shadowing import FADINGS, KINDS, PLACE_SHARES, RANGE_OF_KIND, RANGES_M, SENSOR_SHARES
+from shared.shadowing import KINDS, OFFSET_WEIGHT, PRIOR_DB, PRIOR_WEIGHT, likelihoods
 
 # Measurements that a map keeps, of all sensors together and of one.
 _MOST_KEPT, _MOST_OF_ONE = 4096, 24
-# The prior of the excess loss's standard deviation, dB, and its weight in measurements. A low weight: the first report
-# of a world that equals the formula shows that it does.
-_PRIOR_DB, _PRIOR_WEIGHT = 6.0, 0.03
-# The weight of the prior of the offset that all links share, an offset of 0 dB, in independent sensors.
-_OFFSET_WEIGHT = 2.0
 # A measurement counts as at most this much, dB: it bounds how far a wrong report moves the map.
 LARGEST_EXCESS_DB = 40.0
 # A measurement this many standard deviations off its prediction counts less, as in Huber's estimator.
@@ -79,7 +74,7 @@ class RadioMap:
         self.kind = KINDS[0]
         self._compared = _COMPARE_FIRST
         self.exact = True
-        self.offset_db, self.deviation_db = 0.0, _PRIOR_DB
+        self.offset_db, self.deviation_db = 0.0, PRIOR_DB
         # By sensor, K^-1 packed, K^-1 r and K^-1 1, with zeros where a sensor has no measurement. None until a gain
         # differs from the formula.
         self._inverse: FloatArray | None = None
@@ -224,10 +219,10 @@ class RadioMap:
             both[..., 0] = self.excess[ids, :kept]
             solved = self._inverses(ids, kept) @ both
             self._measured[ids, :kept], self._ones[ids, :kept] = solved[..., 0], solved[..., 1]
-        offset = self.offset_db = float(self._measured.sum() / (self._ones.sum() + _OFFSET_WEIGHT))
+        offset = self.offset_db = float(self._measured.sum() / (self._ones.sum() + OFFSET_WEIGHT))
         squares = (self.excess - offset) * (self._measured - offset * self._ones)
-        weight = _PRIOR_WEIGHT + int(self.count.sum())
-        self.deviation_db = float(np.sqrt((_PRIOR_WEIGHT * _PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
+        weight = PRIOR_WEIGHT + int(self.count.sum())
+        self.deviation_db = float(np.sqrt((PRIOR_WEIGHT * PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
     def _covariance(self, apart_m: FloatArray) -> FloatArray:
         """The covariance of two measurements of one sensor at places this far apart, without the fading."""
@@ -251,31 +246,11 @@ class RadioMap:
     def _compare(self) -> None:
         """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
         every = np.flatnonzero(self.count)
-        self.kind = KINDS[int(np.argmax(self._likelihoods(every)))]
-        self._factor(every)
-
-    def _likelihoods(self, ids: IntArray) -> FloatArray:
-        """The log marginal likelihood of these sensors' measurements by each of the kinds, without a constant.
-
-        One array has all kinds' matrices: thirteen times as many small operations would take several times as long.
-        """
         kept = int(self.count.max())
-        used = np.arange(kept) < self.count[ids, None]
-        both_used, apart = used[:, :, None] & used[:, None, :], self._apart(ids, kept)
-        noise, places = self.noise[ids, :kept] - 1.0, np.arange(kept)
-        # (kinds, n, kept, kept)
-        matrices = SENSOR_SHARES + PLACE_SHARES * np.exp(-apart / RANGES_M)[RANGE_OF_KIND]
-        matrices *= both_used
-        matrices[..., places, places] = np.where(used, 1.0 + FADINGS * noise, 1.0)
-        excess = self.excess[ids, :kept] * used
-        solved = np.linalg.solve(matrices, np.stack((excess, used.astype(np.float64)), axis=2))
-        measured, ones = solved[..., 0], solved[..., 1]
-        offset = measured.sum(axis=(1, 2)) / (ones.sum(axis=(1, 2)) + _OFFSET_WEIGHT)
-        squares = (excess - offset[:, None, None]) * (measured - offset[:, None, None] * ones)
-        count = float(self.count.sum())
-        total = _PRIOR_WEIGHT * _PRIOR_DB**2 + np.maximum((squares * used).sum(axis=(1, 2)), 0.0)
-        spread = np.linalg.slogdet(matrices)[1].sum(axis=1)
-        return np.asarray(-0.5 * count * np.log(total / (_PRIOR_WEIGHT + count)) - 0.5 * spread)
+        used = np.arange(kept) < self.count[every, None]
+        excess, noise = self.excess[every, :kept] * used, self.noise[every, :kept]
+        self.kind = KINDS[int(np.argmax(likelihoods(self._apart(every, kept), used, excess, noise)))]
+        self._factor(every)
 
     def state_dict(self) -> dict[str, Any]:
         """The measurements and what was solved of them, as copies."""

@@ -226,7 +226,7 @@ class Engine:
         try:
             if key is None:
                 decisions = await make()
-                answers = [self._answer(decided) for decided in decisions]
+                answers = [_answer(decided, self._settings) for decided in decisions]
             else:
                 decisions, answers = await self._once(mission, request, key, make)
             began = time.perf_counter()
@@ -256,32 +256,12 @@ class Engine:
 
         async def made() -> str:
             decisions.extend(await make())
-            answers.extend(self._answer(decided) for decided in decisions)
+            answers.extend(_answer(decided, self._settings) for decided in decisions)
             # The journal records the answer under its key in the same commit as the decision.
             return _ANSWERS.dump_json(answers).decode()
 
         text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
         return decisions, answers or _ANSWERS.validate_json(text)
-
-    def _answer(self, decided: Decided) -> DecideResponse:
-        """The wire's form of a decision."""
-        task, choice = decided.task, decided.choice
-        return DecideResponse(
-            decision_id=decided.decision_id,
-            mission_id=task.mission.mission_id,
-            uav_id=task.uav.uav_id,
-            step=task.step,
-            sensor_id=choice.action.sensor_id,
-            velocity=choice.action.velocity,
-            source="guided" if choice.report and choice.reason is None else _SOURCES.get(choice.reason, "policy"),
-            reason=choice.reason,
-            model=None if choice.reason else choice.model,
-            top_k=decided.state.candidates,
-            guided=choice.report,
-            tokens=with_usage(decided.tokens, choice.completion, self._settings),
-            deadline_ms=task.deadline_ms,
-            latency_ms=decided.latency_ms,
-        )
 
     def _follow_up(self, mission: Mission, decisions: list[Decided], answers: list[DecideResponse]) -> None:
         """What is left to do for a request whose answer is sent: report it, and write a checkpoint where one is due."""
@@ -309,3 +289,24 @@ class Engine:
 
 def _taken_over() -> Unavailable:
     return Unavailable("mission_id", "another edge has taken over the mission, nothing was recorded: send it again")
+
+
+def _answer(decided: Decided, settings: Settings) -> DecideResponse:
+    """The wire's form of a decision."""
+    task, choice = decided.task, decided.choice
+    return DecideResponse(
+        decision_id=decided.decision_id,
+        mission_id=task.mission.mission_id,
+        uav_id=task.uav.uav_id,
+        step=task.step,
+        sensor_id=choice.action.sensor_id,
+        velocity=choice.action.velocity,
+        source="guided" if choice.report and choice.reason is None else _SOURCES.get(choice.reason, "policy"),
+        reason=choice.reason,
+        model=None if choice.reason else choice.model,
+        top_k=decided.state.candidates,
+        guided=choice.report,
+        tokens=with_usage(decided.tokens, choice.completion, settings),
+        deadline_ms=task.deadline_ms,
+        latency_ms=decided.latency_ms,
+    )
