@@ -18,6 +18,9 @@ That is, without a visit in these steps the sensor loses the excess.
 Over an uncertain link a transfer moves the expected packets, and cancels the risk by the link's chance. ``x`` then
 confines ``c_it`` to the values from which the link holds with a chance of the best tier that the UAV can reach.
 
+After the last step a sensor's price depends on the stage of the nearest UAV (:mod:`shared.fleetplan.afterwards`). A UAV
+that ends below stage k (:mod:`shared.fleetplan.endings`) cancels the prices of that stage as a visit does.
+
 Batteries enter only as the packets that each can pay for over its best link, all steps together. This ignores the
 higher cost of a weak link, and so keeps every plan that the world allows: the proven bound stays valid.
 """
@@ -34,6 +37,7 @@ from numpy.typing import NDArray
 from ortools.sat.python import cp_model
 
 from shared.channel import FloatArray, IntArray, rate_bps
+from shared.fleetplan.endings import Endings
 from shared.fleetplan.problem import Course, FleetProblem, expected_packets, fly
 
 # The Booleans that serve a sensor in a step, the packets that each moves, and the chance of its link in percent.
@@ -95,11 +99,12 @@ class Formulation:
         self._queue: list[list[Any]] = []
         self._lost: list[list[Any]] = []
         self._costs: list[Any] = []
+        self._endings = Endings(self.model, problem.afterwards)
         for uav in range(problem.uavs):
             self._fly(uav)
         self._exclude()
         visits = self._visits()
-        for sensor, affordable in enumerate(self._affordable().tolist()):
+        for sensor, affordable in enumerate(_affordable(problem).tolist()):
             self._store(sensor, affordable, visits[sensor])
         self.model.minimize(_total(self._costs))
 
@@ -117,13 +122,6 @@ class Formulation:
         """The largest possible loss of each sensor in each step, and 0 after the last, shape ``(H + 1, J)``."""
         most = np.maximum(self._most + self.problem.arrivals - self.problem.scenario.queue_capacity, 0)
         return np.concatenate((most, np.zeros_like(most[:1])))
-
-    def _affordable(self) -> IntArray:
-        """Packets that each battery pays for over the best link, the one from right above, shape ``(J,)``."""
-        world = self.problem.scenario
-        # The lower limit is that of the flown world, for a world so noisy that no packet arrives.
-        joules = world.transmit_power_w * world.packet_bits / max(float(rate_bps(0.0, world)), 1e-12)
-        return np.asarray(np.floor(np.minimum(self.problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
 
     def _fly(self, uav: int) -> None:
         """Add one UAV's variables: velocities within 0..max, the fixed ones, and the sensors that it can serve."""
@@ -155,6 +153,7 @@ class Formulation:
             row.append(now)
             self._serve_within(uav, step, now, np.minimum(reached, self._most[step]), start)
         self.flown.append(row)
+        self._endings.add(row[-1], summed[start:])
 
     def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray, start: int) -> None:
         """Add a Boolean for every sensor that the UAV can serve in this step and for every level of its links."""
@@ -165,7 +164,7 @@ class Formulation:
         chances = None if self.problem.chances is None else self.problem.chance(uav, summed, step)
         for sensor in np.flatnonzero(servable).tolist():
             found = (
-                self._levels(packets[:, sensor])
+                _levels(packets[:, sensor], self._links)
                 if chances is None
                 else _best_tier(packets[:, sensor], chances[:, sensor])
             )
@@ -175,18 +174,6 @@ class Formulation:
                 within = cp_model.Domain.from_values(summed[level.within].tolist())
                 self.model.add_linear_expression_in_domain(now, within).only_enforce_if(literal)
                 self.serves[serve] = literal
-
-    def _levels(self, packets: IntArray) -> list[Level]:
-        """The levels of certain links: the packets that a transfer moves, and those that its link must be able to."""
-        levels = np.unique(packets[packets > 0]).tolist()
-        match self._links:
-            case "exact":
-                pairs = [(level, level) for level in levels]
-            case "cautious":
-                pairs = [(levels[0], levels[0])]
-            case "hopeful":
-                pairs = [(levels[-1], levels[0])]
-        return [Level(moved, needed, 100, 100, packets >= needed) for moved, needed in pairs]
 
     def _exclude(self) -> None:
         """Let a UAV serve at most one sensor in a step, and a sensor at most one UAV."""
@@ -252,21 +239,34 @@ class Formulation:
         if neglect is None:
             self._costs += [packet * over for over in lost]
             return
-        steps = np.rint(SCALE * neglect[:, :, sensor]).astype(int)
+        steps = np.rint(SCALE * neglect[:, :-1, sensor]).astype(int)
         for step, column in enumerate(steps.T):
             most = int(column.max(initial=0)) + packet * int(self._overflow[step, sensor])
             cost = self.model.new_int_var(0, most, "")
-            if step < len(lost):
-                self.model.add(cost >= packet * lost[step])
+            self.model.add(cost >= packet * lost[step])
             for since, expected in enumerate(column[: step + 1].tolist()):
                 if expected > (column[since + 1] if since < step else 0):
-                    made = [visit for now in visits[since : step + 1] for visit in now]
-                    if all(chance == 100 for _, _, chance in made):
-                        self.model.add(cost + expected * _total(literal for literal, _, _ in made) >= expected)
-                    else:
-                        within = _total(chance * literal for literal, _, chance in made)
-                        self.model.add(100 * cost + expected * within >= 100 * expected)
+                    _charge(self.model, cost, expected, visits[since : step + 1], [])
             self._costs.append(cost)
+        self._expect_afterwards(sensor, visits)
+
+    def _expect_afterwards(self, sensor: int, visits: list[Visits]) -> None:
+        """Add one sensor's cost after the last step: the price of the stage at which the UAVs end."""
+        after = self.problem.neglect_afterwards
+        assert after is not None
+        prices = np.rint(SCALE * after[:, :, sensor]).astype(int)
+        cost = self.model.new_int_var(0, int(prices.max(initial=0)), "")
+        lower = np.zeros(prices.shape[1], dtype=int)
+        for stage, column in enumerate(prices):
+            near = self._endings.below(stage, sensor)
+            if near is None:
+                break
+            for since, expected in enumerate(column.tolist()):
+                following = column[since + 1] if since + 1 < len(column) else 0
+                if expected > following and expected > lower[since]:
+                    _charge(self.model, cost, expected, visits[since:], near)
+            lower = column
+        self._costs.append(cost)
 
     def hint(self, actions: IntArray) -> None:
         """Let the search start from these actions ``(H, I, 2)``, which begin with the fixed ones."""
@@ -276,6 +276,7 @@ class Formulation:
             for step, variable in enumerate(row):
                 if not isinstance(variable, int):
                     self.model.add_hint(variable, int(flown[step, uav]))
+        self._endings.hint(flown[-1])
         served = self._served(actions, course)
         for serve, literal in self.serves.items():
             if not isinstance(self.flown[serve.uav][serve.step], int):
@@ -322,6 +323,27 @@ class Formulation:
         return int(earlier[0]) if len(earlier) else int(np.argmax(distance))
 
 
+def _levels(packets: IntArray, links: Links) -> list[Level]:
+    """The levels of certain links: the packets that a transfer moves, and those that its link must be able to."""
+    levels = np.unique(packets[packets > 0]).tolist()
+    match links:
+        case "exact":
+            pairs = [(level, level) for level in levels]
+        case "cautious":
+            pairs = [(levels[0], levels[0])]
+        case "hopeful":
+            pairs = [(levels[-1], levels[0])]
+    return [Level(moved, needed, 100, 100, packets >= needed) for moved, needed in pairs]
+
+
+def _affordable(problem: FleetProblem) -> IntArray:
+    """Packets that each battery pays for over the best link, the one from right above, shape ``(J,)``."""
+    world = problem.scenario
+    # The lower limit is that of the flown world, for a world so noisy that no packet arrives.
+    joules = world.transmit_power_w * world.packet_bits / max(float(rate_bps(0.0, world)), 1e-12)
+    return np.asarray(np.floor(np.minimum(problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
+
+
 def _best_tier(packets: IntArray, chances: FloatArray) -> list[Level]:
     """The level of uncertain links, shape ``(C,)`` each, with the highest chances; empty where no tier has any.
 
@@ -338,6 +360,17 @@ def _best_tier(packets: IntArray, chances: FloatArray) -> list[Level]:
             return [Level(moved, int(packets[usable].min()), lowest, round(100 * likely), usable)]
         beyond = lowest
     return []
+
+
+def _charge(model: cp_model.CpModel, cost: Any, expected: int, visits: list[Visits], near: list[Any]) -> None:
+    """Let a cost be at least the expected one, less the share that visits, or a UAV that ends near, cancel."""
+    made = [visit for now in visits for visit in now]
+    if all(chance == 100 for _, _, chance in made):
+        within = _total([*(literal for literal, _, _ in made), *near])
+        model.add(cost + expected * within >= expected)
+    else:
+        within = _total([*(chance * literal for literal, _, chance in made), *(100 * literal for literal in near)])
+        model.add(100 * cost + expected * within >= 100 * expected)
 
 
 def _total(terms: Iterable[Any]) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray, IntArray, link_holds, packets_per_step, rate_bps
+from shared.fleetplan.afterwards import Afterwards
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory
 
@@ -43,6 +44,8 @@ class FleetProblem:
             ``H max_velocity + 1``. ``None``: by the formula.
         chances: of the same shapes as ``links``: the probability that each link holds. A transfer then moves the share
             ``chance`` of its packets, the expected ones, and cancels that share of the risk. ``None``: 1.
+        afterwards: the risk after the horizon by the UAVs' last places, in place of ``risk[:, H]``; it needs a
+            ``risk``. ``None``: wherever the UAVs are, the risk is that.
 
     Raises:
         ValueError: a shape or a value is wrong; the message names the field.
@@ -63,6 +66,7 @@ class FleetProblem:
     late: FloatArray | None = None
     links: Sequence[IntArray] | None = None
     chances: Sequence[FloatArray] | None = None
+    afterwards: Afterwards | None = None
 
     def __post_init__(self) -> None:
         count = len(self.places)
@@ -95,6 +99,7 @@ class FleetProblem:
         if self.allowed is not None and not self.allowed.any():
             raise ValueError("allowed has no velocity")
         self._check_links(count)
+        self._check_afterwards(count)
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
                 shape = actions.shape
@@ -120,6 +125,23 @@ class FleetProblem:
             raise ValueError(f"chances has shapes {[c.shape for c in self.chances]}, must have those of links")
         if not all(((chance >= 0) & (chance <= 1)).all() for chance in self.chances or ()):
             raise ValueError("chances must be probabilities, 0..1")
+
+    def _check_afterwards(self, count: int) -> None:
+        after = self.afterwards
+        if after is None:
+            return
+        if self.risk is None:
+            raise ValueError("afterwards needs a risk")
+        stages, sums = len(after.risk), self.horizon * self.scenario.max_velocity + 1
+        if not stages or after.risk.shape[1:] != (self.horizon + 1, count):
+            raise ValueError(f"afterwards.risk has shape {after.risk.shape}, must be (K, {self.horizon + 1}, {count})")
+        if len(after.stages) != self.uavs:
+            raise ValueError(f"afterwards.stages has tables of {len(after.stages)} UAVs, there are {self.uavs}")
+        for uav, table in enumerate(after.stages):
+            if table.shape != (sums, count):
+                raise ValueError(f"afterwards.stages[{uav}] has shape {table.shape}, must be ({sums}, {count})")
+            if table.min() < 0 or table.max() >= stages:
+                raise ValueError(f"afterwards.stages[{uav}] must be stages, 0..{stages - 1}")
 
     @property
     def horizon(self) -> int:
@@ -149,6 +171,15 @@ class FleetProblem:
             return self.risk if self.risk is None or self.weights is None else self.risk * self.weights
         risk = np.zeros_like(self.late) if self.risk is None else self.risk
         return self.late + (risk if self.weights is None else risk * self.weights)
+
+    @property
+    def neglect_afterwards(self) -> FloatArray | None:
+        """The price of neglecting sensors after the horizon, by stage: ``(K, H + 1, J)``, K = 1 without stages."""
+        neglect = self.neglect
+        if neglect is None or self.afterwards is None:
+            return None if neglect is None else neglect[None, :, -1]
+        risk = self.afterwards.risk if self.weights is None else self.afterwards.risk * self.weights
+        return risk if self.late is None else risk + self.late[:, -1]
 
     def distance(self, uav: int, velocity: IntArray) -> FloatArray:
         """Horizontal distances to all sensors, metres, ``(..., J)``, after steps whose velocities sum to ``(...)``."""
@@ -245,14 +276,19 @@ def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
     """The lost packets of actions, and the objective of a plan: weighted losses and expected losses above them.
 
     The expected loss in a step is the largest ``risk[s, e] (1 - P)`` of all s, with P the sum of the chances of the
-    sensor's visits from step s on. With certain links that is the risk since the last visit.
+    sensor's visits from step s on. With certain links that is the risk since the last visit. After the horizon the
+    risk is that of each sensor's stage in ``afterwards``.
     """
     course = fly(problem, actions)
     lost = int(course.lost.sum())
     paid = course.lost if problem.weights is None else course.lost * problem.weights
-    neglect = problem.neglect
-    if neglect is None:
+    neglect, after = problem.neglect, problem.neglect_afterwards
+    if neglect is None or after is None:
         return lost, float(paid.sum())
+    stage = np.zeros(problem.sensors, dtype=np.int64)
+    if problem.afterwards is not None:
+        stage = problem.afterwards.stage(actions[:, :, 1].sum(axis=0))
+    at_end = np.take_along_axis(after, stage[None, None, :], axis=0)[0]
     visits = np.zeros((problem.horizon + 1, problem.sensors))
     steps = np.repeat(np.arange(problem.horizon), problem.uavs)
     np.add.at(visits, (steps, actions[:, :, 0].ravel()), course.chance.ravel())
@@ -260,7 +296,8 @@ def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
     for step in range(problem.horizon + 1):
         # visited[s]: the chances of the visits in the steps s..e.
         visited = np.cumsum(visits[step::-1], axis=0)[::-1]
-        expected = (neglect[: step + 1, step] * np.maximum(1.0 - visited, 0.0)).max(axis=0)
+        since = at_end if step == problem.horizon else neglect[: step + 1, step]
+        expected = (since * np.maximum(1.0 - visited, 0.0)).max(axis=0)
         cost += float((expected if step == problem.horizon else np.maximum(expected, paid[step])).sum())
     return lost, cost
 

@@ -11,7 +11,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import IntArray
+from shared.channel import FloatArray, IntArray
+from shared.fleetplan.afterwards import Afterwards, steps_to
 from shared.fleetplan.arrivals import Arrivals
 from shared.fleetplan.belief import FAR_M, FleetBelief
 from shared.fleetplan.greedy import look_ahead
@@ -22,8 +23,13 @@ from shared.guidance import NO_GUIDANCE, Guidance
 from shared.scenario import Scenario
 
 _HORIZON = 8
-# Losses in this many steps after the horizon count too, as if no UAV visited the sensors in the meantime.
-_BEYOND = 4
+# After the horizon a sensor's losses count until the nearest UAV can be there, as if none visited it in the meantime:
+# in the first of these numbers of steps that is enough, or else in the last.
+_BEYOND = (4, 7, 10, 13)
+# A place is good for a sensor if its link's chance is at least this share of the best place's.
+_GOOD_SHARE = 0.7
+# Between two places of the way after the horizon, as a sum of velocities.
+_STRIDE = 4
 # Deterministic seconds of search for a whole fleet's step: the limit, and the average, so that a hard world does not
 # cost a multiple of an easy one. A mission begins with some saved seconds.
 _MOST_WORK = 0.3
@@ -76,9 +82,11 @@ class Draft:
 class RecedingHorizon:
     """Plan eight steps ahead for the fleet with CP-SAT, fly the first, and plan again.
 
-    The objective is the expected number of packets lost in those steps and, without further visits, in four more; see
-    :func:`shared.fleetplan.neglect`. A plan covers all UAVs that are present; the decisions already made in this step
-    are fixed. Fleets of more than four UAVs plan UAV by UAV, four steps ahead.
+    The objective is the expected number of packets lost in those steps and, without further visits, in at least four
+    more: as many as the nearest UAV then needs to the sensor, at full speed; see :func:`shared.fleetplan.risk.neglect`
+    and :class:`shared.fleetplan.afterwards.Afterwards`. A plan covers all UAVs that are present; the decisions already
+    made in this step are fixed. Fleets of more than four UAVs plan UAV by UAV, four steps ahead, and for them the four
+    steps count alone.
 
     The solver's deterministic time limits the search, so that a mission repeats to the bit. Steps that are solved early
     save time for others. Without saved time a short search starts from the better of the last plan and
@@ -149,7 +157,7 @@ class RecedingHorizon:
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
             **self._links(present, kept, horizon),
-            **self._outlook(kept, horizon),
+            **self._outlook(present, kept, horizon),
             **self._guided(kept, horizon),
         )
         before = np.empty((horizon, len(present), 2), dtype=np.int64)
@@ -173,9 +181,13 @@ class RecedingHorizon:
                 self.plans[uav] = np.stack((names[actions[:, 0]], actions[:, 1]), axis=-1)
 
     def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
-        """The sensors that these UAVs can reach within the horizon; of too many, the first to fill."""
+        """The sensors that these UAVs can reach; of too many, the first to fill.
+
+        A small fleet's plan has those that it can reach within the horizon and the steps after it that count.
+        """
         belief, world = self._belief, self._scenario
-        flown = np.arange(horizon * world.max_velocity + 1) * world.step_s
+        steps = horizon + (_BEYOND[-1] if self._joint else 0)
+        flown = np.arange(0, steps * world.max_velocity + 1, _STRIDE) * world.step_s
         near = np.zeros(world.sensors, dtype=np.bool_)
         for uav in free:
             near |= (belief.distances(uav, flown) <= world.radio_radius_m).any(axis=0)
@@ -206,13 +218,13 @@ class RecedingHorizon:
         usable[0, :-1] = ~np.isin(kept, list(taken))
         return usable
 
-    def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
+    def _outlook(self, present: list[int], kept: IntArray, horizon: int) -> dict[str, Any]:
         """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         queue, rate, burst = belief.queue(step)[kept], belief.arrivals.rate[kept], belief.arrivals.burst(step)[kept]
         ahead = np.arange(horizon + 1)[:, None]
         expected = np.rint(queue + ahead * rate + burst * Arrivals.burst_over(ahead)).astype(np.int64)
-        risk = neglect(
+        risk, after = neglect(
             base=belief.base[kept] + burst,
             base_variance=belief.base_variance[kept],
             age=np.maximum(step - belief.since[kept], 0),
@@ -228,12 +240,31 @@ class RecedingHorizon:
             "battery": np.append(belief.battery[kept], 0.0),
             "arrivals": np.pad(np.diff(expected, axis=0), ((0, 0), (0, 1))),
             "risk": np.pad(risk, ((0, 0), (0, 0), (0, 1))),
+            "afterwards": self._afterwards(present, kept, horizon, after),
         }
 
-    def _beyond(self, horizon: int) -> int:
-        """The number of steps after the plan that count."""
+    def _afterwards(self, present: list[int], kept: IntArray, horizon: int, risk: FloatArray) -> Afterwards | None:
+        """The risk after the horizon by the UAVs' ways to the kept sensors; a large fleet's does not depend on them."""
+        if not self._joint:
+            return None
+        fastest = self._scenario.max_velocity
+        sums = horizon * fastest + 1
+        metres = np.arange(0, sums + _BEYOND[-1] * fastest, _STRIDE) * self._scenario.step_s
+        links = [self._belief.links(uav, metres) for uav in present]
+        chances = [(link.hold * (link.packets > 0))[:, kept] for link in links]
+        best = np.max(chances, axis=(0, 1))
+        stages = []
+        for chance in chances:
+            steps = steps_to(chance >= _GOOD_SHARE * best, _STRIDE, sums, fastest)
+            stages.append(np.pad(np.minimum(np.searchsorted(_BEYOND, steps), len(_BEYOND) - 1), ((0, 0), (0, 1))))
+        # A UAV that comes saves packets by the chance of its link.
+        risk = risk[0] + best * (risk - risk[0])
+        return Afterwards(stages, np.pad(risk, ((0, 0), (0, 0), (0, 1))))
+
+    def _beyond(self, horizon: int) -> tuple[int, ...]:
+        """By stage, the number of steps after the plan that count."""
         left = self._scenario.steps - self.step
-        return max(0, min(_BEYOND, left - horizon)) if left > 0 else _BEYOND
+        return tuple(max(0, min(steps, left - horizon)) if left > 0 else steps for steps in _BEYOND)
 
     def _guided(self, kept: IntArray, horizon: int) -> dict[str, Any]:
         """The guidance's part of the problem, for the kept sensors and one nowhere."""
@@ -243,6 +274,6 @@ class RecedingHorizon:
             orders["allowed"] = self.guidance.allowed(world.max_velocity + 1)
         if self.guidance.wishes:
             orders["weights"] = np.append(self.guidance.weights(world.sensors)[kept], 1.0)
-            late = self.guidance.lateness(step, self._belief.visited, horizon, self._beyond(horizon))
+            late = self.guidance.lateness(step, self._belief.visited, horizon, self._beyond(horizon)[0])
             orders["late"] = np.pad(late[:, :, kept], ((0, 0), (0, 0), (0, 1)))
         return orders

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,9 +37,9 @@ def neglect(
     rate_variance: FloatArray,
     capacity: int,
     horizon: int,
-    beyond: int,
+    beyond: Sequence[int],
     dispersion: float = 1.0,
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """The price of neglecting sensors in a plan: the ``risk`` of a :class:`~shared.fleetplan.problem.FleetProblem`.
 
     In n steps ``n rate`` packets come on average, with the variance ``n rate dispersion + n^2 rate_variance``: the
@@ -52,22 +53,26 @@ def neglect(
         rate_variance: the estimate's variance, ``(J,)``.
         capacity: W, packets.
         horizon: steps H of the plan.
-        beyond: steps after the plan whose losses count too, at least 0.
+        beyond: by stage (K), steps after the plan whose losses count too, at least 0.
         dispersion: the arrivals' variance over a Poisson's.
 
     Returns:
-        Shape ``(H + 1, H + 1, J)``.
+        The risk, shape ``(H + 1, H + 1, J)``, with the first stage's after the plan, and that of
+        :class:`~shared.fleetplan.afterwards.Afterwards`, shape ``(K, H + 1, J)``.
     """
-    steps = np.arange(horizon + beyond + 3)[:, None]
+    steps = np.arange(horizon + max(beyond) + 3)[:, None]
 
     def lost_by(start: FloatArray | float, variance: FloatArray | float, n: NDArray[np.int64]) -> FloatArray:
         return expected_overflow(start + n * rate, variance + n * rate * dispersion + n**2 * rate_variance, capacity)
 
     emptied, untouched = lost_by(0.0, 0.0, steps), lost_by(base, base_variance, steps + age)
     risk = np.zeros((horizon + 1, horizon + 1, len(rate)))
+    afterwards = np.zeros((len(beyond), horizon + 1, len(rate)))
+    ends = horizon + np.asarray(beyond)
     for since in range(horizon + 1):
         course, first = (untouched, 0) if since == 0 else (emptied, since - 1)
-        for step in range(since, horizon + 1):
-            last = step + 1 if step < horizon else horizon + beyond
-            risk[since, step] = course[last - first] - course[step - first]
-    return risk
+        for step in range(since, horizon):
+            risk[since, step] = course[step + 1 - first] - course[step - first]
+        afterwards[:, since] = course[ends - first] - course[horizon - first]
+    risk[:, horizon] = afterwards[0]
+    return risk, afterwards

@@ -19,16 +19,21 @@ from shared.fleetplan.problem import FleetProblem, fly, price
 if TYPE_CHECKING:
     from shared.fleetplan.formulation import Formulation, Links
 
+# Parameters of the solver, and the share of the work that each search gets.
+_Strategies = tuple[tuple[Mapping[str, Any], float], ...]
+
 _QUICK_WORK = 3.0
 # The steps of each plan that makes a start.
 _NEAR = 8
 # One worker first raises the bound by cores, which is fastest if most sensors lose nothing. With many losses it finds
 # no plan, and the usual search gets the rest of the work. Without a limit of work the first search never ends.
-_STRATEGIES: tuple[tuple[Mapping[str, Any], float], ...] = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
+_CORES: _Strategies = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
 # With less work the first search proves nothing.
 _WORK_FOR_CORES = 0.05
 _INTERRUPTED = "INTERRUPTED"
-_USUAL: tuple[tuple[Mapping[str, Any], float], ...] = (({}, 1.0),)
+_USUAL: _Strategies = (({}, 1.0),)
+# Expected losses make a linear relaxation weak. Without it the search finds better plans in the same work.
+_EXPECTED: _Strategies = (({"linearization_level": 0}, 1.0),)
 
 
 @dataclass(frozen=True)
@@ -123,8 +128,8 @@ def plan(
     begun = time.perf_counter()
     best = _priced(problem, _with_fixed(problem, hint))
     found = _Search(None, 0.0, "UNKNOWN", 0.0)
-    cores = budget.workers == 1 and budget.work >= _WORK_FOR_CORES
-    for strategy, share in _STRATEGIES if cores else _USUAL:
+    strategies = _strategies(problem, budget)
+    for strategy, share in strategies:
         formulation = Formulation(problem, links)
         if hint is not None or best.found:
             formulation.hint(best.actions)
@@ -141,6 +146,12 @@ def plan(
     if found.status == _INTERRUPTED:
         raise Interrupted(whole)
     return whole
+
+
+def _strategies(problem: FleetProblem, budget: Budget) -> _Strategies:
+    if problem.risk is not None:
+        return _EXPECTED
+    return _CORES if budget.workers == 1 and budget.work >= _WORK_FOR_CORES else _USUAL
 
 
 def least_loss(
@@ -206,7 +217,15 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
     begun, flown = time.perf_counter(), []
     now = problem
     while True:
-        near = replace(now, arrivals=now.arrivals[:_NEAR], fixed={}, usable=None, risk=None, **now.tables_until(_NEAR))
+        near = replace(
+            now,
+            arrivals=now.arrivals[:_NEAR],
+            fixed={},
+            usable=None,
+            risk=None,
+            afterwards=None,
+            **now.tables_until(_NEAR),
+        )
         left = seconds - (time.perf_counter() - begun)
         actions = look_ahead(near)
         if left > 0:

@@ -230,7 +230,7 @@ def test_expected_overflow_is_that_of_a_normal() -> None:
 
 def outlook(horizon: int, beyond: int = 0) -> FloatArray:
     base, rate = np.array([30.0, 58.0]), np.array([5.0, 4.0])
-    return neglect(base, np.zeros(2), np.array([2, 0]), rate, rate / 3, 60, horizon, beyond)
+    return neglect(base, np.zeros(2), np.array([2, 0]), rate, rate / 3, 60, horizon, [beyond])[0]
 
 
 def test_a_sensor_left_alone_longer_is_expected_to_lose_more() -> None:
@@ -243,10 +243,20 @@ def test_a_sensor_left_alone_longer_is_expected_to_lose_more() -> None:
     )
 
 
+def test_the_risk_afterwards_is_that_of_each_number_of_steps() -> None:
+    base, rate = np.array([30.0, 58.0]), np.array([5.0, 4.0])
+    risk, later = neglect(base, np.zeros(2), np.array([2, 0]), rate, rate / 3, 60, 8, [3, 7])
+    np.testing.assert_array_equal(later[0], outlook(8, 3)[:, 8])
+    np.testing.assert_array_equal(later[1], outlook(8, 7)[:, 8])
+    np.testing.assert_array_equal(risk, outlook(8, 3))
+
+
 def test_expected_losses_are_priced_as_the_solver_does() -> None:
     problem = tiny(2, horizon=4)
     rate = np.full(3, 20.0)
-    risk = neglect(problem.queue.astype(np.float64), np.zeros(3), np.zeros(3, dtype=np.int64), rate, rate, 60, 4, 2)
+    risk, _ = neglect(
+        problem.queue.astype(np.float64), np.zeros(3), np.zeros(3, dtype=np.int64), rate, rate, 60, 4, [2]
+    )
     problem = changed(problem, risk=risk)
     found = plan(problem, ENOUGH, "cautious")
     assert found.status == "OPTIMAL"
