@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from shared.channel import FloatArray, IntArray
 from shared.fleetplan.afterwards import Afterwards, steps_to
@@ -181,23 +181,31 @@ class RecedingHorizon:
                 self.plans[uav] = np.stack((names[actions[:, 0]], actions[:, 1]), axis=-1)
 
     def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
-        """The sensors that these UAVs can reach; of too many, the first to fill.
+        """The sensors that these UAVs can reach within the horizon; of too many, the first to fill.
 
-        A small fleet's plan has those that it can reach within the horizon and the steps after it that count.
+        A small fleet's plan has room for those, too, that its UAVs can reach in the steps after the horizon that count.
         """
         belief, world = self._belief, self._scenario
-        steps = horizon + (_BEYOND[-1] if self._joint else 0)
-        flown = np.arange(0, steps * world.max_velocity + 1, _STRIDE) * world.step_s
-        near = np.zeros(world.sensors, dtype=np.bool_)
-        for uav in free:
-            near |= (belief.distances(uav, flown) <= world.radio_radius_m).any(axis=0)
-        near |= not near.any()
+        ends = horizon * world.max_velocity
+        near = self._within_radio(free, np.arange(ends + 1))
+        later = np.arange(ends, ends + _BEYOND[-1] * world.max_velocity + 1, _STRIDE) if self._joint else ends
+        ahead = self._within_radio(free, later)
+        near |= not (near | ahead).any()
+        ahead |= near
         room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.arrivals.rate, 1e-9)
         if self.guidance.wishes:
             # The operator's sensors come before those that fill first.
             room = np.where(np.isfinite(self.guidance.every(world.sensors)), -1.0, room)
-        order = np.argsort(np.where(near, room, np.inf), kind="stable")
-        return np.sort(order[: min(int(near.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
+        order = np.lexsort((room, ~near, ~ahead))
+        return np.sort(order[: min(int(ahead.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
+
+    def _within_radio(self, uavs: list[int], sums: ArrayLike) -> NDArray[np.bool_]:
+        """The sensors in radio range of one of these UAVs after velocities that sum to one of ``(n,)``."""
+        metres = np.atleast_1d(sums) * self._scenario.step_s
+        found = np.zeros(self._scenario.sensors, dtype=np.bool_)
+        for uav in uavs:
+            found |= (self._belief.distances(uav, metres) <= self._scenario.radio_radius_m).any(axis=0)
+        return found
 
     def _links(self, present: list[int], kept: IntArray, horizon: int) -> dict[str, Any]:
         """The links of the fleet's UAVs, where the formula does not describe them."""

@@ -113,6 +113,22 @@ def test_a_plan_flies_towards_a_full_sensor_beyond_its_horizon() -> None:
     assert price(draft.problem, parked)[1] > found.objective + 5
 
 
+def test_sensors_beyond_the_horizon_take_no_ones_place_in_a_plan() -> None:
+    world = Scenario(name="lap", sensors=90, uavs=1, lap_radius_m=600.0, lap_offset_m=0.0, radio_radius_m=200.0)
+    (path,) = trajectories(world)
+    belief = FleetBelief(world)
+    planner = RecedingHorizon(world, belief)
+    planner.begin(0)
+    belief.locate(0, 0, path.at(0.0).tolist(), 0.0)
+    # 35 sensors that the plan reaches, 55 half a lap ahead, which are full.
+    full = np.arange(90) >= 35
+    belief.places[:] = np.where(full[:, None], path.at(path.length_m / 2), path.at(300.0))
+    belief.begin(np.arange(90), np.zeros(90, dtype=np.int64), np.where(full, 60.0, 5.0), np.full(90, 50.0))
+    draft = planner.draft([0])
+    assert draft is not None
+    assert draft.kept[:35].tolist() == list(range(35)) and len(draft.kept) == 40
+
+
 def test_a_bound_has_no_price_of_what_comes_after() -> None:
     world = PipelineWorld()
     world.reset(seed=0)
