@@ -32,7 +32,8 @@ _CORES: _Strategies = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
 _WORK_FOR_CORES = 0.05
 _INTERRUPTED = "INTERRUPTED"
 _USUAL: _Strategies = (({}, 1.0),)
-# Expected losses make a linear relaxation weak. Without it the search finds better plans in the same work.
+# Expected losses make a linear relaxation weak: without it the search of a whole fleet's plan, with what comes
+# afterwards, finds better plans in the same work. The small plans of single UAVs gain from it.
 _EXPECTED: _Strategies = (({"linearization_level": 0}, 1.0),)
 
 
@@ -149,7 +150,7 @@ def plan(
 
 
 def _strategies(problem: FleetProblem, budget: Budget) -> _Strategies:
-    if problem.risk is not None:
+    if problem.afterwards is not None:
         return _EXPECTED
     return _CORES if budget.workers == 1 and budget.work >= _WORK_FOR_CORES else _USUAL
 
