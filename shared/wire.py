@@ -44,7 +44,7 @@ Mode = Literal["llm", "guided", "value", "policy"]
 Init = Literal["pretrained", "random"]
 Features = Literal["paper", "reach"]
 Belief = Literal["fleet", "reported"]
-Selection = Literal["recent", "similar", "best"]
+Selection = Literal["recent", "similar", "best", "failures"]
 Source = Literal["llm", "guided", "value", "policy"]
 Uplink = Literal["full", "delta", "pruned"]
 

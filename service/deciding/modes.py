@@ -126,7 +126,8 @@ class LlmByLetter(Policy):
             return super().question(state, task)
         template = template_of(state.mission)
         candidates = candidates_of(state, template)
-        return Question(template.choice_prompt(candidates, state.state, []), candidates=candidates)
+        block, similar = state.mission.experiences.block, state.similar_experiences()
+        return Question(template.choice_prompt(candidates, state.state, block, similar), candidates=candidates)
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
         """The likeliest candidate."""

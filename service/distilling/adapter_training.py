@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from service.distilling.batches import Batches
 from service.distilling.examples import PromptExample
 from service.distilling.gguf_adapter import write_gguf_adapter
 from service.distilling.loss import LETTERS, Outputs, Targets, answer_loss, loss_of
@@ -172,6 +173,7 @@ def train(
     Raises:
         ValueError: the checkpoint is of another run.
     """
+    batches = Batches([len(example.text) for example in examples], args.batch, args.seed)
     weights = [p for p in student.model.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(weights, lr=args.learning_rate, weight_decay=0.0)
     first = 0
@@ -188,7 +190,7 @@ def train(
     for step in range(first, args.steps):
         for group in optimizer.param_groups:
             group["lr"] = args.learning_rate * _schedule(step, args.steps)
-        some = [examples[i] for i in _batch(len(examples), args, step)]
+        some = [examples[i] for i in batches.of(step)]
         outputs = student.read([example.text for example in some])
         loss = loss_of(outputs, Targets.of(some, outputs.answer.device))
         optimizer.zero_grad()
@@ -212,19 +214,6 @@ def _run(examples: Sequence[PromptExample], args: Distill) -> str:
     """What determines a run's weights, as text."""
     texts = hashlib.sha256("\n".join(example.text for example in examples).encode()).hexdigest()
     return f"{texts} {args.begin} {args.steps} {args.batch} {args.rank} {args.learning_rate} {args.seed}"
-
-
-def _batch(count: int, args: Distill, step: int) -> list[int]:
-    """The examples of a step: each pass over all of them has its own order, drawn from the seed."""
-    first = step * args.batch
-    places = range(first, first + args.batch)
-    orders: dict[int, list[int]] = {}
-    for place in places:
-        one_pass = place // count
-        if one_pass not in orders:
-            generator = torch.Generator().manual_seed(args.seed * 1_000_003 + one_pass)
-            orders[one_pass] = torch.randperm(count, generator=generator).tolist()
-    return [orders[place // count][place % count] for place in places]
 
 
 def _schedule(step: int, steps: int) -> float:

@@ -40,15 +40,17 @@ def distill(args: Distill, console: Console) -> None:
     gguf = embedded_model(Settings())
     training: list[PromptExample] = []
     held_out: dict[str, list[PromptExample]] = {}
-    for name, train_part, held in examples_of(args.rollouts, args.out, args.workers):
-        console.print(f"{name}: {len(train_part)} decisions, {len(held)} held out", highlight=False)
-        training += train_part
-        held_out.setdefault(name, []).extend(held)
+    for found in examples_of(args.rollouts, args.out, args.workers):
+        held = sum(map(len, found.held_out.values()))
+        console.print(f"{found.scenario}: {len(found.training)} decisions, {held} held out", highlight=False)
+        training += found.training
+        for name, some in found.held_out.items():
+            held_out.setdefault(name, []).extend(some)
     student = Student(gguf, STATIC, args.rank, device, args.begin)
     _train(student, training, args, console)
-    found = {name: agreement(student, _some(held)) for name, held in held_out.items() if held}
-    _report(found, console)
-    _write(student, found, gguf, len(training), args)
+    agreed = {name: agreement(student, _some(some)) for name, some in held_out.items() if some}
+    _report(agreed, console)
+    _write(student, agreed, gguf, len(training), args)
 
 
 def _train(student: Student, training: list[PromptExample], args: Distill, console: Console) -> None:

@@ -1,4 +1,9 @@
-"""Examples for the adapter: the compact prompts of recorded flights, with a teacher's preference for every label."""
+"""Examples for the adapter: the compact prompts of recorded flights, with a teacher's preference for every label.
+
+A mission is seen in one of several views: with what the fleet has learned of its links, or with each UAV's own reports
+and the formula's links; and with no, few or many experiences. The teacher knows what the fleet has learned in all of
+them, so that where the rows alone mislead, the experiences tell why it chose otherwise.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +19,46 @@ from service.deciding.deliberation import candidates_of, template_of
 from service.deciding.rollout_evaluator import RolloutState, evaluate
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
+from service.prompting.compact_prompt import SIGNS
 from service.training.recorded_states import recorded_states
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.rollouts import Header, Reference, RolloutStep
-from shared.wire import MissionSpec
+from shared.wire import Belief, MissionSpec
 
 # The teacher's own action has this share of a target; the rest goes by regret.
 _REFERENCE_SHARE = 0.6
 # Packets of regret that make an action e times less likely.
 _TEMPERATURE = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What a prompt shows of a fleet's past: its learned ``belief`` or only reports, and so many ``experiences``."""
+
+    belief: Belief
+    experiences: int
+
+
+LEARNED, UNLEARNED, EXPERIENCED = View("fleet", 0), View("reported", 0), View("reported", 8)
+# The views of a file's missions, one after the other. Most are of a learned belief, as missions are by default.
+_CYCLE = (
+    LEARNED,
+    EXPERIENCED,
+    LEARNED,
+    View("reported", 30),
+    LEARNED,
+    EXPERIENCED,
+    View("fleet", 8),
+    UNLEARNED,
+    LEARNED,
+    EXPERIENCED,
+)
+
+
+def view_of(number: int) -> View:
+    """The view in which the training sees a file's mission of that number."""
+    return _CYCLE[number % len(_CYCLE)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,31 +77,38 @@ class PromptExample:
     reference: int
 
 
-def prompt_examples(header: Header, steps: Iterable[RolloutStep]) -> Iterator[list[PromptExample]]:
-    """Each mission's examples, in the states that the edge would have had."""
-    settings = Settings(mode="guided", store="none", llm_adapter="served")
-    for mission_id, group in groupby(steps, key=lambda step: step.request.mission_id):
-        logged = list(group)
-        seed = int(mission_id.rpartition("-")[2])
-        spec = MissionSpec.model_validate(
-            {
-                "scenario": header.scenario,
-                "planner": "off",
-                "prompt": {"format": "compact", "order": "shuffled"},
-                "seed": seed,
-            }
-        )
-        mission = Mission(mission_id, spec, settings)
-        yield [
-            _example(state, step.reference)
-            for step, state in recorded_states(mission, logged)
-            if step.reference is not None and len(state.rows) > 1
-        ]
+def missions_of(steps: Iterable[RolloutStep]) -> Iterator[list[RolloutStep]]:
+    """The decisions of a file, mission by mission."""
+    for _, group in groupby(steps, key=lambda step: step.request.mission_id):
+        yield list(group)
+
+
+def prompt_examples(header: Header, logged: Sequence[RolloutStep], view: View) -> list[PromptExample]:
+    """One mission's examples, in the states that an edge with this view would have had."""
+    mission_id = logged[0].request.mission_id
+    spec = MissionSpec.model_validate(
+        {
+            "scenario": header.scenario,
+            "planner": "off",
+            "features": "reach",
+            "belief": view.belief,
+            "prompt": {"format": "compact", "order": "shuffled", "experiences": view.experiences},
+            "seed": int(mission_id.rpartition("-")[2]),
+        }
+    )
+    mission = Mission(mission_id, spec, Settings(mode="guided", store="none", llm_adapter="served"))
+    return [
+        _example(state, step.reference)
+        for step, state in recorded_states(mission, logged)
+        if step.reference is not None and len(state.rows) > 1
+    ]
 
 
 def _example(state: AttendedState, reference: Reference) -> PromptExample:
     mission = state.mission
-    candidates = candidates_of(state, template_of(mission))
+    template = template_of(mission)
+    candidates = candidates_of(state, template)
+    prompt = template.choice_prompt(candidates, state.state, mission.experiences.block, state.similar_experiences())
     rollout = RolloutState.of(
         mission.belief, mission.scenario, state.step, state.uav_id, seed=mission.spec.seed, reserved=state.reserved
     )
@@ -75,12 +117,18 @@ def _example(state: AttendedState, reference: Reference) -> PromptExample:
     index = np.array([candidates.labels[label] for label in labels])
     chosen = _nearest_label(candidates, labels, Action(reference.sensor_id, reference.velocity))
     return PromptExample(
-        text=candidates.rows,
+        text=_with_other_signs(prompt.user, [mission.spec.seed, state.step, state.uav_id]),
         labels=labels,
         target=_target(lost, index, chosen),
         sensors=tuple(candidates.actions[i].sensor_id for i in index),
         reference=chosen,
     )
+
+
+def _with_other_signs(text: str, seed: Sequence[int]) -> str:
+    """The text with its sensors' signs drawn anew: scenarios' IDs begin at 0, and every sign is to be learned."""
+    drawn = "".join(np.random.default_rng(seed).permutation(list(SIGNS)))
+    return text.translate(str.maketrans(SIGNS, drawn))
 
 
 def _target(lost: FloatArray, index: np.ndarray, chosen: int) -> FloatArray:

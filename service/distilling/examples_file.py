@@ -5,26 +5,42 @@ from __future__ import annotations
 import gzip
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from service.distilling.examples import PromptExample, prompt_examples
+from service.distilling.examples import (
+    EXPERIENCED,
+    LEARNED,
+    UNLEARNED,
+    PromptExample,
+    missions_of,
+    prompt_examples,
+    view_of,
+)
 from service.llm.adapter import PROMPT_VERSION
 from service.llm.model_file import sha256
 from shared.rollouts import read_rollouts
 
-# Every so many missions of a file, one is held out.
+# Every so many missions of a file, one is held out, and seen in each of these views.
 HELD_OUT = 11
+_HELD_OUT_VIEWS = {"": LEARNED, " unlearned": UNLEARNED, " unlearned, experienced": EXPERIENCED}
 
 
-def examples_of(
-    rollouts: Sequence[Path], folder: Path, workers: int
-) -> Iterator[tuple[str, list[PromptExample], list[PromptExample]]]:
-    """For each rollouts file: its scenario, its training examples and its held-out ones.
+@dataclass(frozen=True, slots=True)
+class Examples:
+    """A file's examples: those to train on, and those held out by the name of their scenario and view."""
+
+    scenario: str
+    training: list[PromptExample]
+    held_out: dict[str, list[PromptExample]]
+
+
+def examples_of(rollouts: Sequence[Path], folder: Path, workers: int) -> Iterator[Examples]:
+    """The examples of each rollouts file.
 
     Raises:
         OSError, ValueError: a file cannot be read, or has no teacher.
@@ -46,27 +62,34 @@ def _kept(job: tuple[Path, Path]) -> Path:
     if kept.is_file():
         return kept
     header, steps = read_rollouts(source)
-    missions = [[_plain(example) for example in mission] for mission in prompt_examples(header, steps)]
-    if not any(mission for number, mission in enumerate(missions) if number % HELD_OUT):
+    scenario = header.scenario.name
+    training: list[Any] = []
+    held_out: dict[str, list[Any]] = {scenario + suffix: [] for suffix in _HELD_OUT_VIEWS}
+    for number, logged in enumerate(missions_of(steps)):
+        if number % HELD_OUT:
+            training += map(_plain, prompt_examples(header, logged, view_of(number)))
+            continue
+        for suffix, view in _HELD_OUT_VIEWS.items():
+            held_out[scenario + suffix] += map(_plain, prompt_examples(header, logged, view))
+    if not training:
         raise ValueError(f"{source} has no decision with a teacher in its second mission or later")
     half = kept.with_suffix(".part")
     with gzip.open(half, "wt", encoding="utf-8", compresslevel=3) as file:
-        json.dump({"scenario": header.scenario.name, "missions": missions}, file)
+        json.dump({"scenario": scenario, "training": training, "held_out": held_out}, file)
     half.replace(kept)
     return kept
 
 
-def _read(kept: Path) -> tuple[str, list[PromptExample], list[PromptExample]]:
+def _read(kept: Path) -> Examples:
     with gzip.open(kept, "rt", encoding="utf-8") as file:
         found = json.load(file)
-    train: list[PromptExample] = []
-    held: list[PromptExample] = []
-    for number, mission in enumerate(found["missions"]):
-        part = train if number % HELD_OUT else held
-        part += [
-            PromptExample(t, labels, np.array(target), tuple(sensors), r) for t, labels, target, sensors, r in mission
-        ]
-    return found["scenario"], train, held
+    held_out = {name: list(map(_example, some)) for name, some in found["held_out"].items()}
+    return Examples(found["scenario"], list(map(_example, found["training"])), held_out)
+
+
+def _example(fields: list[Any]) -> PromptExample:
+    text, labels, target, sensors, reference = fields
+    return PromptExample(text, labels, np.array(target), tuple(sensors), reference)
 
 
 def _plain(example: PromptExample) -> list[Any]:

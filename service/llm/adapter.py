@@ -6,7 +6,7 @@ import struct
 from pathlib import Path
 
 # The version of the compact prompt; it changes whenever a text of that prompt does.
-PROMPT_VERSION = 2
+PROMPT_VERSION = 3
 # The key of the adapter's metadata, in GGUF a name, a type and a value.
 VERSION_KEY = "aicvds.prompt_version"
 _UINT32 = 4

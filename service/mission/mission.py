@@ -29,6 +29,7 @@ from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
 from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
+from shared.actions import Action
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.measured import Measured
 from shared.guidance import Guidance, GuidanceAnswer
@@ -200,10 +201,11 @@ class Mission:
         if last is not None and last.decision_id != decision.decision_id:
             return None
         self.belief.settle(decision.uav_id, decision.step, outcome.failed)
-        line = self.template.experience(decision.seen, decision.sensor_id, decision.velocity, outcome.cost)
+        action = Action(decision.sensor_id, decision.velocity)
+        line = self.template.experience(decision.seen, action, outcome.cost, outcome.failed)
         sample = decision.sample
         features = None if sample is None else sample.features[sample.chosen].copy()
-        self.experiences.remember(Experience(line, outcome.cost, features))
+        self.experiences.remember(Experience(line, outcome.cost, features, decision.sensor_id, outcome.failed))
         for trust in self.trust.values():
             trust.settle(outcome.decision_id, outcome.cost)
         return sample

@@ -71,8 +71,8 @@ class PromptFit:
                 "compact needs an LLM with an adapter: leave AICVDS_LLM_ADAPTER unset for the embedded LLM's, "
                 "or set it to `served` where your LLM server applies it",
             )
-        if self._compact and (style.experiences or style.demonstrations):
-            raise Refused("prompt", "the compact prompt has no experiences and no demonstrations: set them to 0")
+        if self._compact and style.demonstrations:
+            raise Refused("prompt.demonstrations", "the compact prompt has no demonstrations: set them to 0")
         if self.fits():
             return
         shown, lower = f"{style.experiences} experiences", "prompt.experiences"

@@ -36,9 +36,8 @@ class ResolvedSpec(MissionSpec):
         """The spec, with the service's settings and the defaults of its mode for what it leaves open."""
         mode = spec.mode or settings.mode
         adapted = settings.adapted and mode in _LLM_MODES
-        # The compact prompt has no experiences and no demonstrations.
-        longer = bool(spec.prompt.experiences or spec.prompt.demonstrations)
-        row_format = spec.prompt.format or ("compact" if adapted and not longer else "csv")
+        # The compact prompt has no demonstrations.
+        row_format = spec.prompt.format or ("compact" if adapted and not spec.prompt.demonstrations else "csv")
         compact = row_format == "compact"
         # Mode `llm` is the paper's method as the paper has it, unless the spec or the adapter says otherwise.
         as_published = mode == "llm" and not compact
@@ -48,7 +47,8 @@ class ResolvedSpec(MissionSpec):
         prompt = {
             "format": row_format,
             "experiences": experiences,
-            "selection": spec.prompt.selection or settings.selection,
+            # The adapter is trained on blocks that keep failures.
+            "selection": spec.prompt.selection or ("failures" if compact else settings.selection),
         }
         resolved = {
             "mode": mode,

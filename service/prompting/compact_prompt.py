@@ -2,12 +2,13 @@
 
 The user message is one line of letters and digits, which the embedded model reads as one token each:
 
-    9 3 4 2 1 5 U   7 3 5 9 2 8 4 6 A   9 1 6 9 3 0 4 4 E   ...      (without the spaces)
+    7 d 9 X   4 a 0 Y   9 3 4 2 1 5 U   7 d 3 5 9 2 8 4 6 A   9 a 1 6 9 3 0 4 4 E   ...      (without the spaces)
 
-``U`` ends the UAV's own six digits, and a row's first choice letter its sensor's eight: a causal model has read a row
-where it reads the row's letter. :func:`fleet_digits` and :func:`row_digits` define the digits. An adapter names the
-version of this prompt that it was trained on: :data:`service.llm.adapter.PROMPT_VERSION` changes whenever a text here
-does.
+First the experiences, which end with ``X`` or ``Y``: see :meth:`CompactTemplate.experience`. ``U`` ends the UAV's own
+six digits, and a row's first choice letter its sensor's eight: a causal model has read a row where it reads the row's
+letter. :func:`fleet_digits` and :func:`row_digits` define the digits. The second place of an experience and of a row is
+its sensor's sign, by which the model finds what came of the sensor. An adapter names the version of this prompt that it
+was trained on: :data:`service.llm.adapter.PROMPT_VERSION` changes whenever a text here does.
 """
 
 from __future__ import annotations
@@ -22,13 +23,16 @@ from numpy.typing import ArrayLike, NDArray
 from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import note_block
-from service.prompting.row_formats import Cells
+from service.prompting.row_formats import UNKNOWN, Cells
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import Reach, State
 from shared.learned_channel import LIKELY, ExpectedLinks
 from shared.scenario import Scenario
 
 STATIC = "{note}Collect packets. Answer with one letter."
+# A sensor's sign: the one at its ID, modulo their number. Between digits each is one token of the embedded model.
+SIGNS = "abcdefghijklmnopqrstuvwxyzαβγδεζηθικλμνοπρςστυφχωбвгдежзийклмнопрстуфхцчшщыьюяàáâãäåæçèéêëìíîïñòóôõöùúûüý"
 
 # The outlook's steps, and the pace of every UAV in them as a share of full speed.
 _STEPS = 9
@@ -72,6 +76,11 @@ def _reached(view: Viewpoint, uav: int, metres: FloatArray, scenario: Scenario) 
     else:
         links = ExpectedLinks.by_formula(belief.distances(uav, metres), scenario)
     return np.asarray((links.packets > 0) & (links.hold >= LIKELY))
+
+
+def sign(sensor_id: int) -> str:
+    """A sensor's sign in the prompt."""
+    return SIGNS[sensor_id % len(SIGNS)]
 
 
 def digits(values: ArrayLike) -> NDArray[np.int64]:
@@ -120,9 +129,16 @@ class CompactTemplate(GuidedTemplate):
         self._scenario = scenario
         self.static = STATIC.format(note=note_block(note))
 
-    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
-        """Nothing: this version of the prompt has no experiences."""
-        return ""
+    def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
+        """An experience such as ``7d9X``.
+
+        It has the packets that the edge expected the sensor to send, ``9 sqrt(m / W)``; the sensor's sign; the cost,
+        9 for at least 1; and ``X`` for a failed transmission, else ``Y``.
+        """
+        expected = seen.get("movable", seen["queue"])
+        packets = 0 if expected == UNKNOWN else int(expected)
+        shown = digits([_NINE * np.sqrt(max(packets, 0) / self._scenario.queue_capacity), _NINE * cost])
+        return f"{shown[0]}{sign(action.sensor_id)}{shown[1]}{'X' if failed else 'Y'}"
 
     def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
         """The candidates for these rows of a state, with the whole user message as their text."""
@@ -134,9 +150,11 @@ class CompactTemplate(GuidedTemplate):
         def write(rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
             spans = digits([(level * own[0], level * own[-1]) for own in options])
             shown_digits = np.concatenate((numbers[list(rows)], spans.reshape(-1, 2)), axis=1).tolist()
+            signs = map(sign, state.ids[list(rows)].tolist())
             text = f"{fleet_digits(state, outlook, view.step, scenario)}U"
             return text + "".join(
-                "".join(map(str, row)) + letter for letter, row in zip(letters, shown_digits, strict=True)
+                f"{row[0]}{own}{''.join(map(str, row[1:]))}{letter}"
+                for letter, own, row in zip(letters, signs, shown_digits, strict=True)
             )
 
         return CandidateSet.of(state, reach, shown, self.letters, write)

@@ -7,6 +7,8 @@ compaction selects. The ``selection`` is one of:
 - ``best``: every outcome is appended; past the limit the block is reduced to half of the limit, chosen by cost among
   all remembered experiences: the lowest costs, and for a quarter of the lines the highest, as warnings. The worst come
   first and the best last. After the ranking of examples by Zhou et al., arXiv 2408.00214.
+- ``failures``: every outcome is appended; past the limit the block is reduced to half of the limit, in order of time:
+  the newest experience of each sensor, first of those whose newest one failed, and then what is newest.
 - ``similar``: nearest neighbours by state. After as many outcomes as the limit, the block becomes half of the limit:
   the experiences nearest to the fleet's newest decisions, the nearest last. Between compactions nothing is appended.
   Instead the last block of the prompt, which is never cached, has the one experience nearest to the current rows,
@@ -40,11 +42,14 @@ class Experience:
     """A past decision: its line in the prompt, its cost, and the chosen row's attention features ``(d,)``, each 0..1.
 
     ``features`` is None where the modules had no part in the decision; `similar` ignores such an experience.
+    ``sensor_id`` is None in experiences that an earlier version stored.
     """
 
     line: str
     cost: float
     features: NDArray[np.float32] | None
+    sensor_id: int | None = None
+    failed: bool = False
 
 
 class Experiences:
@@ -96,7 +101,7 @@ class Experiences:
             "block": list(self.block),
             "compactions": self.compactions,
             "since": self._since_compaction,
-            "remembered": [[e.line, e.cost, e.features] for e in self._remembered],
+            "remembered": [[e.line, e.cost, e.features, e.sensor_id, e.failed] for e in self._remembered],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -111,8 +116,17 @@ class Experiences:
             return self.block[-keep:]
         if self.selection == "best":
             return self._ranked(keep)
+        if self.selection == "failures":
+            return self._failures(keep)
         present = [e.features for e in list(self._remembered)[-self._uavs :] if e.features is not None]
         return self._nearest(np.stack(present), keep) if present else []
+
+    def _failures(self, keep: int) -> list[str]:
+        """Lines in order of time: the newest of each sensor, failed ones first, and then what is newest."""
+        known = list(self._remembered)
+        newest = {experience.sensor_id: number for number, experience in enumerate(known)}.values()
+        by_worth = sorted(range(len(known)), key=lambda n: (n in newest, n in newest and known[n].failed, n))
+        return [known[number].line for number in sorted(by_worth[-keep:])]
 
     def _ranked(self, keep: int) -> list[str]:
         """Lines of the highest costs, then of the lowest, best last; the newest of equal ones."""

@@ -9,6 +9,7 @@ from service.prompting.candidates import CandidateSet, Letters, Viewpoint
 from service.prompting.prompt import Prompt, Template, note_block
 from service.prompting.row_formats import FORMATS, Cells, cells
 from service.prompting.token_accounting import UnprunedState
+from shared.actions import Action
 from shared.features import Reach, State
 from shared.scenario import Scenario
 
@@ -82,9 +83,9 @@ class GuidedTemplate(Template):
         self.static = _STATIC.format(**fields, **_ALONE)
         self.fleet_static = _STATIC.format(**fields, **_TOGETHER)
 
-    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
+    def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """A line such as ``52,3>7:0``, with the cost in tenths."""
-        return f"{seen['queue']},{seen['age']}>{velocity}:{min(99, round(10 * cost))}\n"
+        return f"{seen['queue']},{seen['age']}>{action.velocity}:{min(99, round(10 * cost))}\n"
 
     def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
         """The candidates for these rows of a state, in this order."""

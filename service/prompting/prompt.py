@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from service.prompting.demonstrations import Solved
 from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
 from service.prompting.token_accounting import UnprunedState
+from shared.actions import Action
 from shared.features import State
 from shared.scenario import Scenario
 from shared.wire import Features, PromptStyle
@@ -105,9 +106,9 @@ class Template:
             demonstrations=examples,
         )
 
-    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
-        """One line of the experiences: the chosen sensor's row, the decision, and its cost."""
-        return self._format.experience(seen, f"{sensor_id} {velocity}", f"{cost:.1f}")
+    def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
+        """One line of the experiences: the chosen sensor's row, the decision, and its cost, which has the failure."""
+        return self._format.experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.1f}")
 
     def unreported_row(self, sensor_id: int) -> Cells:
         """The row of a sensor that the report lacks."""

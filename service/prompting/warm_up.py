@@ -15,7 +15,7 @@ def warm_up(settings: Settings) -> WarmUp:
     paper = SCENARIOS["paper"]
     if settings.adapted:
         compact = CompactTemplate(paper, rows=settings.top_k)
-        return WarmUp(compact.static, "999999U99999999A", compact.labels)
+        return WarmUp(compact.static, "999999U9a9999999A", compact.labels)
     if settings.mode == "guided":
         guided = GuidedTemplate(paper, rows=settings.top_k, experiences=settings.experiences, ranked=True)
         return WarmUp(guided.static, guided.content_free()[0], guided.labels)

@@ -19,6 +19,7 @@ from shared.rollouts import Header, RolloutStep, write_rollouts
 from shared.scenario import Scenario, scenario_named
 from simulator.errors import EdgeError
 from simulator.flying.exploration import explore
+from simulator.policies.registry import policy_named
 
 # The world and the planner take seconds to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
@@ -52,7 +53,8 @@ class Explore:
     several scenarios.
 
     With `--edge` the UAVs fly that edge's decisions, and the teacher's action in each state is recorded beside them.
-    So an LLM learns from the states that its own decisions bring about (DAgger, Ross et al. 2011).
+    So an LLM learns from the states that its own decisions bring about (DAgger, Ross et al. 2011). With `--policy` they
+    fly that policy's: `mpc_formula` believes in the formulas' links and so brings about failures that a teacher avoids.
     """
 
     out: Annotated[Path, arg(metavar="FILE")]
@@ -69,6 +71,8 @@ class Explore:
     """Number of the first world: its seed is 1,000,000 more."""
     edge: Annotated[str | None, arg(metavar="URL")] = None
     """An edge whose decisions are flown, in the edge's own mode, such as http://127.0.0.1:8000."""
+    policy: Annotated[str | None, arg(metavar="NAME")] = None
+    """A policy whose decisions are flown, such as mpc_formula."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes that fly the worlds, 1 to 64."""
 
@@ -78,6 +82,8 @@ def main(argv: list[str]) -> int:
     args = tyro.cli(Explore, prog="aicvds explore", args=argv)
     try:
         scenario = scenario_named(args.scenario)
+        if args.edge is not None and args.policy is not None:
+            raise ValueError("--edge and --policy exclude each other: name whose decisions are flown")
         for name in ("missions", "untaught", "first"):
             if getattr(args, name) < 0:
                 raise ValueError(f"--{name} {getattr(args, name)} is less than 0")
@@ -88,7 +94,9 @@ def main(argv: list[str]) -> int:
         args.out.parent.mkdir(parents=True, exist_ok=True)
         if args.edge is not None:
             _await_edge(args.edge)
-        behaviour = _BEHAVIOUR if args.edge is None else "an edge's decisions"
+        if args.policy is not None:
+            policy_named(args.policy)
+        behaviour = args.policy or (_BEHAVIOUR if args.edge is None else "an edge's decisions")
         header = Header(scenario=scenario, missions=args.missions + args.untaught, behaviour=behaviour)
         write_rollouts(args.out, header, _explored(scenario, args))
     except (ValueError, OSError, EdgeError) as error:
@@ -114,7 +122,7 @@ def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
     taught = range(args.first, args.first + args.missions)
     teachers = [teacher_of(args.teacher, mission) for mission in taught] + [None] * args.untaught
     worlds = list(enumerate(teachers, start=args.first))
-    fly = partial(_mission, scenario, args.edge)
+    fly = partial(_mission, scenario, args.edge, args.policy)
     tracked = partial(track, description="Exploring", total=len(worlds), console=Console(stderr=True))
     if args.workers == 1:
         for steps in tracked(map(fly, worlds)):
@@ -125,9 +133,11 @@ def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
             yield from steps
 
 
-def _mission(scenario: Scenario, edge: str | None, numbered: tuple[int, TeacherName | None]) -> list[RolloutStep]:
+def _mission(
+    scenario: Scenario, edge: str | None, policy: str | None, numbered: tuple[int, TeacherName | None]
+) -> list[RolloutStep]:
     mission, teacher = numbered
-    return list(explore(scenario, mission, teacher, edge))
+    return list(explore(scenario, mission, teacher, edge, policy))
 
 
 def teacher_of(option: TeacherOption, mission: int) -> TeacherName:

@@ -26,12 +26,17 @@ _TIMEOUT_S = 65.0
 
 
 def explore(
-    scenario: Scenario, mission: int, teacher: TeacherName | None = None, edge: str | None = None
+    scenario: Scenario,
+    mission: int,
+    teacher: TeacherName | None = None,
+    edge: str | None = None,
+    policy: str | None = None,
 ) -> Iterator[RolloutStep]:
     """One mission's decisions in order of step and UAV, in training world number ``mission``.
 
     Args:
         edge: URL of the edge whose decisions the UAVs fly; by default they explore.
+        policy: the policy whose decisions they fly, in place of an edge's.
 
     Raises:
         EdgeError: the edge gives no decision.
@@ -46,10 +51,12 @@ def explore(
     guide: Teacher | None = None if teacher is None else TEACHERS[teacher](world)
     with ExitStack() as stack:
         fleet: _Fleet
-        if edge is None:
-            fleet = _ExploringFleet(scenario, mission, guide)
-        else:
+        if edge is not None:
             fleet = stack.enter_context(_EdgeFleet(edge, scenario, mission))
+        elif policy is not None:
+            fleet = _PolicyFleet(policy, scenario, mission)
+        else:
+            fleet = _ExploringFleet(scenario, mission, guide)
         for step in range(scenario.steps):
             fleet.begin_step()
             choices: dict[int, Action] = {}
@@ -140,6 +147,28 @@ class _ExploringFleet:
 
     def learn(self, uav: int, cost: float, failed: bool) -> None:
         """Nothing."""
+
+
+class _PolicyFleet:
+    """Flies a policy's decisions."""
+
+    deviating = False
+
+    def __init__(self, name: str, scenario: Scenario, mission: int) -> None:
+        from simulator.policies.registry import policy_named
+
+        self._policy = policy_named(name)
+        self._policy.reset(scenario, mission)
+
+    def begin_step(self) -> None:
+        """Nothing."""
+
+    def action(self, advised: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
+        """The policy's decision."""
+        return self._policy.decide(uav, observation, taken)
+
+    def learn(self, uav: int, cost: float, failed: bool) -> None:
+        """Nothing: the policies that learn are teachers."""
 
 
 class _EdgeFleet:

@@ -14,7 +14,9 @@ from service.deciding.deliberation import candidates_of, template_of
 from service.errors import Refused
 from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint
-from service.prompting.compact_prompt import CompactTemplate, Outlook, digits
+from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, digits, sign
+from service.prompting.experiences import Experience
+from shared.actions import Action
 from shared.scenario import SCENARIOS, Scenario
 from shared.wire import MissionSpec
 from simulator.client.observation_report import decide_request
@@ -22,7 +24,7 @@ from simulator.world import PipelineWorld
 from tests.service.making import PAPER, attended
 
 ADAPTED = Settings(mode="llm", llm_url="http://127.0.0.1:9/v1", llm_adapter="served")
-MESSAGE = re.compile(r"(\d{6})U((?:\d{8}[A-T])+)")
+MESSAGE = re.compile(r"(\d{6})U((?:\d[a-jk]\d{7}[A-T])+)".replace("a-jk", SIGNS))
 
 
 def flown(scenario: Scenario, steps: int, **spec: object) -> tuple[Mission, AttendedState]:
@@ -48,11 +50,45 @@ def test_the_message_is_one_line_of_letters_and_digits(name: str) -> None:
     mission, state = flown(SCENARIOS[name], 4)
     found = MESSAGE.fullmatch(candidates_of(state, template_of(mission)).rows)
     assert found is not None
-    rows = re.findall(r"\d{8}([A-T])", found[2])
-    assert rows == list("AEIMQ")[: len(state.rows)]
+    rows = re.findall(r"\d(\D)\d{7}([A-T])", found[2])
+    assert rows == [(sign(int(state.state.ids[row])), f) for row, f in zip(state.shown(), "AEIMQ", strict=False)]
     # One token a character, and 8 around the message: at most 70 are read anew.
     assert len(found[0]) + 8 <= 70
     assert "U" not in mission.template.static.replace("Collect", "")
+
+
+def test_each_of_a_hundred_sensors_has_its_own_sign() -> None:
+    assert len({sign(sensor) for sensor in range(100)}) == 100
+    assert not any(one.isdigit() or one.isupper() for one in SIGNS)
+    assert sign(len(SIGNS) + 3) == sign(3)
+
+
+@pytest.mark.parametrize(
+    ("seen", "cost", "failed", "line"),
+    [
+        ({"queue": "60", "movable": "37"}, 1.4, True, "7d9X"),
+        ({"queue": "60", "movable": "0"}, 1.0, True, "0d9X"),
+        ({"queue": "60", "movable": "60"}, 0.0, False, "9d0Y"),
+        ({"queue": "15"}, 0.51, False, "4d5Y"),
+        ({"queue": "?", "movable": "?"}, 0.0, False, "0d0Y"),
+    ],
+)
+def test_an_experience_has_what_was_expected_and_what_it_cost(
+    seen: dict[str, str], cost: float, failed: bool, line: str
+) -> None:
+    assert CompactTemplate(PAPER, rows=5).experience(seen, Action(3, 14), cost, failed) == line
+
+
+def test_experiences_come_first_and_a_mission_has_none_unless_it_asks() -> None:
+    for count, before in ((0, ""), (2, "7d9X9a0Y")):
+        mission, state = flown(PAPER, 2, prompt={"experiences": count, "format": "compact"}, mode="guided")
+        for line in ("7d9X", "9a0Y"):
+            mission.experiences.remember(Experience(line, 1.0, None, 3, failed=True))
+        template = template_of(mission)
+        candidates = candidates_of(state, template)
+        prompt = template.choice_prompt(candidates, state.state, mission.experiences.block)
+        assert prompt.user == before + candidates.rows
+        assert mission.spec.prompt.selection == "failures"
 
 
 def test_a_row_shows_the_queue_and_what_can_be_collected() -> None:
@@ -60,8 +96,9 @@ def test_a_row_shows_the_queue_and_what_can_be_collected() -> None:
     text = candidates_of(state, template_of(mission)).rows
     found = MESSAGE.fullmatch(text)
     assert found is not None
-    rows = re.findall(r"(\d{8})[A-T]", found[2])
-    for row, shown in zip(rows, state.shown(), strict=True):
+    rows = re.findall(r"(\d)\D(\d{7})[A-T]", found[2])
+    for parts, shown in zip(rows, state.shown(), strict=True):
+        row = "".join(parts)
         queue, packets = state.state.queue[shown], state.reach.best_packets[shown]
         assert int(row[0]) == round(9 * (queue / PAPER.queue_capacity) ** 0.5)
         assert int(row[2]) == round(9 * (packets / PAPER.queue_capacity) ** 0.5)
@@ -115,17 +152,16 @@ def test_an_llm_without_the_adapter_is_not_asked_in_it() -> None:
     assert not again.prompt_fits
 
 
-@pytest.mark.parametrize("field", ["experiences", "demonstrations"])
-def test_it_has_no_experiences_and_no_demonstrations(field: str) -> None:
-    spec = MissionSpec.model_validate({"mode": "llm", "prompt": {"format": "compact", field: 2}})
+def test_it_has_no_demonstrations() -> None:
+    spec = MissionSpec.model_validate({"mode": "llm", "prompt": {"format": "compact", "demonstrations": 2}})
     with pytest.raises(Refused, match="set them to 0"):
         Mission("test", spec, ADAPTED)
 
 
-@pytest.mark.parametrize("field", ["experiences", "demonstrations"])
-def test_a_mission_that_asks_for_them_has_the_long_prompt(field: str) -> None:
+@pytest.mark.parametrize(("field", "form"), [("experiences", "compact"), ("demonstrations", "csv")])
+def test_a_mission_that_asks_for_demonstrations_has_the_long_prompt(field: str, form: str) -> None:
     spec = MissionSpec.model_validate({"mode": "llm", "prompt": {field: 2}})
-    assert Mission("test", spec, ADAPTED).spec.prompt.format == "csv"
+    assert Mission("test", spec, ADAPTED).spec.prompt.format == form
 
 
 def test_it_is_about_one_uav() -> None:

@@ -58,6 +58,28 @@ def test_recent_keeps_the_newest() -> None:
     assert words(memory.block) == "de"
 
 
+def test_failures_keep_the_newest_of_each_sensor_those_that_failed_first() -> None:
+    failed = {"a": (1, True), "b": (2, True), "c": (1, False), "d": (3, False), "e": (4, True), "f": (5, False)}
+    pasts = [Experience(line, 0.0, None, sensor, lost) for line, (sensor, lost) in failed.items()]
+    assert words(remembering("failures", 5, *pasts).block) == "be"
+    assert words(remembering("failures", 5, *pasts, *pasts[:1] * 4).block) == "ea"
+    memory = remembering("failures", 5, *pasts)
+    again = Experiences(5, "failures")
+    again.load_state_dict(memory.state_dict())
+    for one in (memory, again):
+        for experience in (*pasts[:3], *pasts[3:4] * 2):
+            one.remember(experience)
+    assert again.block == memory.block
+
+
+def test_an_experience_that_an_earlier_version_stored_stays() -> None:
+    memory = Experiences(2, "failures")
+    old = {"block": ["a\n", "b\n"], "compactions": 0, "since": 2, "remembered": [["a\n", 1.0, None], ["b\n", 0, None]]}
+    memory.load_state_dict(old)
+    memory.remember(Experience("c\n", 0.0, None, 1, failed=True))
+    assert words(memory.block) == "c"
+
+
 def test_best_keeps_the_lowest_costs_and_some_of_the_highest_as_warnings() -> None:
     costs = {"a": 0.1, "b": 3.0, "c": 0.4, "d": 0.0, "e": 1.0, "f": 0.2, "g": 2.0, "h": 0.3, "i": 0.5}
     memory = remembering("best", 8, *(past(line, cost) for line, cost in costs.items()))
