@@ -323,8 +323,9 @@ class PromptStyle(Received):
     )
     selection: Selection | None = Field(
         None,
-        description="experiences that stay: the newest, those most like the present state, or the best and some of the "
-        "worst; default: the service's",
+        description="experiences that stay: the newest, those most like the present state, the best and some of the "
+        "worst, or the newest of each sensor with failures first; default: the service's, and `failures` with the "
+        "compact prompt",
     )
     demonstrations: int = Field(0, ge=0, le=20, description="worked examples, solved by the teacher")
 

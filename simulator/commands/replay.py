@@ -86,7 +86,7 @@ class Replay:
     """The rows' order."""
     experiences: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Experiences in the prompt, 0 to 100."""
-    selection: Annotated[Selection | None, arg(metavar="recent|similar|best", help_behavior_hint="")] = None
+    selection: Annotated[Selection | None, arg(metavar="recent|similar|best|failures", help_behavior_hint="")] = None
     """The selection of experiences beyond that number."""
     demonstrations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Worked examples in the prompt, 0 to 20."""

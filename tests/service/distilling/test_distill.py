@@ -4,20 +4,33 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from service.commands.distill import main
 from service.config.settings import Settings
 from service.distilling.adapter_training import Student, train
+from service.distilling.batches import Batches
 from service.distilling.distill import distill
-from service.distilling.examples import PromptExample, prompt_examples
+from service.distilling.examples import (
+    EXPERIENCED,
+    LEARNED,
+    UNLEARNED,
+    PromptExample,
+    View,
+    missions_of,
+    prompt_examples,
+)
 from service.distilling.examples_file import examples_of
 from service.distilling.loss import Outputs, Targets, answer_loss, loss_of
 from service.distilling.options import Distill
@@ -28,7 +41,7 @@ from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import embedded_model
 from service.llm.request_bodies import label_body
-from service.prompting.compact_prompt import STATIC
+from service.prompting.compact_prompt import STATIC, failing_signs
 from shared.rollouts import Header, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS
 from simulator.flying.exploration import explore
@@ -55,9 +68,13 @@ def distilled(rollouts: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_target_prefers_the_teachers_action_and_shares_the_rest_by_regret(rollouts: Path) -> None:
+def examples_in(view: View, rollouts: Path) -> list[list[PromptExample]]:
     header, steps = read_rollouts(rollouts)
-    missions = list(prompt_examples(header, steps))
+    return [prompt_examples(header, mission, view) for mission in missions_of(steps)]
+
+
+def test_a_target_prefers_the_teachers_action_and_shares_the_rest_by_regret(rollouts: Path) -> None:
+    missions = examples_in(LEARNED, rollouts)
     assert [len(mission) for mission in missions] == [SHORT.steps * SHORT.uavs] * 3
     for example in (example for mission in missions for example in mission):
         assert example.target.sum() == pytest.approx(1.0)
@@ -69,20 +86,82 @@ def test_a_target_prefers_the_teachers_action_and_shares_the_rest_by_regret(roll
 
 
 def test_rows_are_shuffled(rollouts: Path) -> None:
-    header, steps = read_rollouts(rollouts)
-    places = {example.reference // 4 for mission in prompt_examples(header, steps) for example in mission}
+    places = {example.reference // 4 for mission in examples_in(LEARNED, rollouts) for example in mission}
     assert {0, 1, 2, 3, 4} <= places
 
 
+def test_with_experiences_a_target_shuns_the_sensors_that_failed_and_is_else_the_same(tmp_path: Path) -> None:
+    world = SCENARIOS["faulty"].model_copy(update={"steps": 7, "dead_radios": 9})
+    file = tmp_path / "faulty.jsonl.gz"
+    flown = explore(world, 60_000, "planner", policy="wqcs")
+    write_rollouts(file, Header(scenario=world, missions=1, behaviour="wqcs"), flown)
+    [bare], [experienced] = (examples_in(view, file) for view in (UNLEARNED, EXPERIENCED))
+    lengths, shunning = [], 0
+    for one, other in zip(bare, experienced, strict=True):
+        lengths.append(len(other.text) - len(one.text))
+        assert other.text.endswith(one.text)
+        assert other.target.sum() == pytest.approx(1.0)
+        failing = failing_signs(re.findall(r"\d\D\d[XY]", other.text[: lengths[-1]]))
+        shunned = [letter for own, letter in re.findall(r"\d(\D)\d{7}([A-T])", one.text) if own in failing]
+        labels = [label for label in one.labels if any(first <= label < chr(ord(first) + 4) for first in shunned)]
+        own = np.array([label in labels for label in one.labels])
+        if not own.any() or own.all():
+            assert np.allclose(other.target, one.target)
+            continue
+        shunning += 1
+        odds, before = (e.target[own].sum() / e.target[~own].sum() for e in (other, one))
+        assert odds == pytest.approx(0.15 * before)
+    assert shunning > 0
+    # Four characters each, and no outcome comes before a UAV's second report.
+    assert lengths[:2] == [0, 0]
+    assert max(lengths) == 8 * 4
+
+
+def test_an_experience_and_a_row_of_one_sensor_have_one_sign(rollouts: Path) -> None:
+    texts = [example.text for mission in examples_in(EXPERIENCED, rollouts) for example in mission]
+    signs = [
+        ({part[1] for part in re.findall(r"\d\D\d[XY]", text)}, set(re.findall(r"\d(\D)\d{7}[A-T]", text)))
+        for text in texts
+    ]
+    assert any(past & shown for past, shown in signs)
+    # Each prompt has drawn its signs from all of them.
+    assert len(set().union(*(shown for _, shown in signs))) > 50
+
+
+@given(st.lists(st.integers(1, 200), min_size=1, max_size=400), st.integers(1, 16))
+def test_a_pass_has_each_example_at_most_once_and_batches_of_alike_lengths(lengths: list[int], size: int) -> None:
+    batches, steps = Batches(lengths, size, seed=1), len(lengths) // size
+    seen = [batches.of(step) for step in range(steps)]
+    assert all(len(batch) == size for batch in seen)
+    numbers = [number for batch in seen for number in batch]
+    assert len(set(numbers)) == len(numbers)
+    assert [batches.of(step) for step in range(steps)] == seen
+    if steps <= 16:
+        # One stretch: sorted, its batches do not overlap in length.
+        spans = sorted((min(lengths[i] for i in batch), max(lengths[i] for i in batch)) for batch in seen)
+        assert all(before[1] <= after[0] for before, after in pairwise(spans))
+
+
 def test_the_examples_are_kept_and_every_eleventh_mission_is_held_out(rollouts: Path, tmp_path: Path) -> None:
-    [(name, training, held)] = examples_of([rollouts], tmp_path, 1)
-    assert (name, len(training), len(held)) == ("paper", 30, 15)
+    [found] = examples_of([rollouts], tmp_path, 1)
+    missions = [examples_in(view, rollouts) for view in (EXPERIENCED, LEARNED)]
+    assert found.scenario == "paper"
+    # The file's second mission has the cycle's second view, and its third the third.
+    training = missions[0][1] + missions[1][2]
+    assert [example.text for example in found.training] == [example.text for example in training]
+    held = {name: [example.text for example in some] for name, some in found.held_out.items()}
+    names = ("paper", "paper unlearned", "paper unlearned, experienced")
+    views = (LEARNED, UNLEARNED, EXPERIENCED)
+    assert held == {
+        name: [example.text for example in examples_in(view, rollouts)[0]]
+        for name, view in zip(names, views, strict=True)
+    }
     [kept] = tmp_path.glob("examples-*.json.gz")
     written = kept.stat().st_mtime_ns
-    [(_, again, _)] = examples_of([rollouts], tmp_path, 1)
+    [again] = examples_of([rollouts], tmp_path, 1)
     assert kept.stat().st_mtime_ns == written
-    assert [example.text for example in again] == [example.text for example in training]
-    assert np.allclose(again[3].target, training[3].target)
+    assert [example.text for example in again.training] == [example.text for example in found.training]
+    assert np.allclose(again.training[3].target, found.training[3].target)
 
 
 def test_a_file_without_a_teacher_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,8 +230,9 @@ def test_it_writes_an_adapter_for_llama_cpp_one_for_vllm_and_a_card(distilled: P
     check_adapter(distilled / "adapter.gguf")
     assert (distilled / "peft" / "adapter_model.safetensors").is_file()
     card = json.loads((distilled / "card.json").read_text(encoding="utf-8"))
-    assert (card["prompt_version"], card["steps"], card["examples"]) == (PROMPT_VERSION, 3, 30)
-    assert 0.0 <= card["held_out"]["paper"]["sensor"] <= 1.0
+    assert (card["prompt_version"], card["steps"]) == (PROMPT_VERSION, 3)
+    assert 15 < card["examples"] <= 30
+    assert 0.0 <= card["held_out"]["paper unlearned, experienced"]["sensor"] <= 1.0
 
 
 @pytest.fixture(scope="module")
@@ -176,8 +256,7 @@ def changed(distilled: Path) -> tuple[Student, Path]:
 @pytest.mark.long
 def test_llama_cpp_gives_the_trained_probabilities(changed: tuple[Student, Path], rollouts: Path) -> None:
     student, adapter = changed
-    header, steps = read_rollouts(rollouts)
-    example = next(prompt_examples(header, steps))[7]
+    example = examples_in(LEARNED, rollouts)[0][7]
     with torch.no_grad():
         trained = torch.softmax(student.read([example.text]).answer, dim=1)[0].numpy()
     gguf = embedded_model(Settings())
@@ -239,7 +318,8 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
 ) -> None:
     monkeypatch.setattr("service.distilling.adapter_training._CHECKPOINT_STEPS", 2)
     args = Distill(rollouts=(rollouts,), out=tmp_path, steps=4, batch=2, rank=1)
-    [(_, examples, _)] = examples_of([rollouts], tmp_path, 1)
+    [found] = examples_of([rollouts], tmp_path, 1)
+    examples = found.training
 
     def student() -> Student:
         torch.manual_seed(0)
