@@ -14,6 +14,7 @@ from service.prompting.experiences import Experiences
 from service.prompting.prompt import Prompt, Template
 from service.prompting.row_formats import UNKNOWN, Cells
 from service.prompting.token_accounting import UnprunedState
+from shared.actions import Action
 from shared.features import State
 from shared.scenario import Scenario
 
@@ -59,10 +60,10 @@ class PaperTemplate(Template):
             max_velocity=scenario.max_velocity,
         )
 
-    def experience(self, seen: Cells, sensor_id: int, velocity: int, cost: float) -> str:
+    def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """The chosen sensor's state, the decision and its cost, in a sentence."""
         state = _sentence({name: text for name, text in seen.items() if name != "distance"})
-        return f"{state}; decision: sensor {sensor_id}, velocity {velocity}; cost {cost:.1f}\n"
+        return f"{state}; decision: sensor {action.sensor_id}, velocity {action.velocity}; cost {cost:.1f}\n"
 
     def prompt(
         self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()

@@ -249,10 +249,12 @@ def augment(
         queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], coming[ids]
     stale = beacon != step
     if stale.any():
-        gain[stale] = _expected_gains(belief, np.asarray(position), distance[stale], ids[stale], scenario)
+        far, here = distance[stale], np.asarray(position)
+        known = None if belief is None else belief.channel
+        gain[stale] = channel_gain_db(far, scenario) if known is None else known.gain_db(here, far, ids[stale])
     able = heard & (battery > 0)
-    admissible = able.copy()
     # Few sensors are reserved: for them np.isin takes several times as long.
+    admissible = able.copy()
     for sensor in reserved:
         admissible[ids == sensor] = False
     overflow = overflow_probability(queue, rate, scenario)
@@ -277,13 +279,6 @@ def augment(
         drift=None if belief is None else belief.drift,
     )
     return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
-
-
-def _expected_gains(
-    belief: FleetBelief | None, place: FloatArray, distance: FloatArray, ids: NDArray[np.int64], scenario: Scenario
-) -> FloatArray:
-    """The expected gains ``(n,)``, dB, of sensors at distances ``(n,)`` from a UAV's place ``(2,)``."""
-    return channel_gain_db(distance, scenario) if belief is None else belief.channel.gain_db(place, distance, ids)
 
 
 def beacon_columns(sensors: SensorColumns) -> FloatArray:

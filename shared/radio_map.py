@@ -155,7 +155,9 @@ class RadioMap:
         beside = known / -free[:, None]
         inverse[rows, slot], inverse[rows, :, slot] = beside, beside
         inverse[rows, slot, slot] = 1.0 / free
-        self._keep(ids, inverse)
+        assert self._inverse is not None
+        few = size * (size + 1) // 2
+        self._inverse[ids, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
         return noise
 
     def _dropped(self, ids: IntArray, here: FloatArray) -> IntArray:
@@ -193,12 +195,6 @@ class RadioMap:
         assert self._inverse is not None
         return np.asarray(self._inverse[ids][:, _PLACE_IN_PACKED[:kept, :kept]])
 
-    def _keep(self, ids: IntArray, inverse: FloatArray) -> None:
-        """Store ``K^-1`` of these sensors, ``(n, kept, kept)``."""
-        assert self._inverse is not None
-        few = inverse.shape[1] * (inverse.shape[1] + 1) // 2
-        self._inverse[ids, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
-
     def _factor(self, ids: IntArray) -> None:
         """Invert the covariances of these sensors' measurements, and estimate what all links have in common."""
         if self._inverse is None:
@@ -208,7 +204,9 @@ class RadioMap:
         if kept:
             used = np.arange(kept) < self.count[ids, None]
             inverse: FloatArray = np.linalg.inv(self._covariances(ids, kept)).astype(np.float64, copy=False)
-            self._keep(ids, inverse * (used[:, :, None] & used[:, None, :]))
+            few = kept * (kept + 1) // 2
+            both_used = used[:, :, None] & used[:, None, :]
+            self._inverse[ids, :few] = (inverse * both_used)[:, _ROWS[:few], _COLUMNS[:few]]
         self._solve(ids)
 
     def _solve(self, ids: IntArray) -> None:

@@ -116,7 +116,9 @@ class MissionRegistry:
             Refused: as :meth:`Reports.complete`; nothing is recorded.
         """
         mission_id = request.mission_id
-        mission = self._owned(mission_id)
+        mission = self._missions.get(mission_id)
+        if mission is not None and not self._ownership.owns(mission_id):
+            mission = None
         within = Deadline(deadline.at - RESERVE_S)
         if mission is None:
             mission = await self._find(mission_id, within.left())
@@ -193,14 +195,10 @@ class MissionRegistry:
     def _listed(self) -> set[str]:
         return set() if self._store is None else self._store.listed
 
-    def _owned(self, mission_id: str) -> Mission | None:
-        """The mission in memory, if this edge has its lease."""
-        mission = self._missions.get(mission_id)
-        return mission if mission is not None and self._ownership.owns(mission_id) else None
-
     async def _find(self, mission_id: str, within_s: float) -> Mission | None:
-        if (mission := self._owned(mission_id)) is not None:
-            return mission
+        """The mission, loaded where it is not in memory or where this edge does not have its lease."""
+        if mission_id in self._missions and self._ownership.owns(mission_id):
+            return self._missions[mission_id]
         if self._store is not None:
             await self._store.load(mission_id, within_s)
         return self._missions.get(mission_id)

@@ -154,20 +154,14 @@ class Weights:
     Attributes:
         layout: positions of the parameters in ``flat``.
         flat: all parameters, ``(size,)``.
+        parameters: views of them.
     """
 
-    __slots__ = ("_parameters", "flat", "layout")
+    __slots__ = ("flat", "layout", "parameters")
 
     def __init__(self, layout: Layout, flat: Array) -> None:
         self.layout, self.flat = layout, flat
-        self._parameters: Parameters | None = None
-
-    @property
-    def parameters(self) -> Parameters:
-        """Views of the parameters."""
-        if self._parameters is None:
-            self._parameters = self.layout.arrays(self.flat)
-        return self._parameters
+        self.parameters = layout.arrays(flat)
 
     @property
     def attention(self) -> dict[str, Array]:

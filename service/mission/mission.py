@@ -203,8 +203,7 @@ class Mission:
         self.belief.settle(decision.uav_id, decision.step, outcome.failed)
         action = Action(decision.sensor_id, decision.velocity)
         line = self.template.experience(decision.seen, action, outcome.cost, outcome.failed)
-        sample = decision.sample
-        features = None if sample is None else sample.features[sample.chosen].copy()
+        features = None if (sample := decision.sample) is None else sample.features[sample.chosen].copy()
         self.experiences.remember(Experience(line, outcome.cost, features, decision.sensor_id, outcome.failed))
         for trust in self.trust.values():
             trust.settle(outcome.decision_id, outcome.cost)

@@ -228,20 +228,21 @@ class GroupCommit:
             self._queue.popleft()
         if self._queue and self._queue[0][0] <= last:
             self._queue = deque(entry for entry in self._queue if id(entry[1]) not in durable)
-        self._recover()
+        if self._failure is not None:
+            self._recover()
         self._written = max(self._written, last)
 
     def _drop(self, error: LeaseLost) -> None:
         """Take the changes of lost missions from the queue; nothing of the transaction was written."""
-        self._recover()
+        if self._failure is not None:
+            self._recover()
         self._queue = deque(e for e in self._queue if (e[1].mission_id, e[1].epoch) not in error.lost)
         self._written = max(self._written, self._queue[0][0] - 1 if self._queue else self._added)
         for mission_id, epoch in error.lost:
             self._on_lost(mission_id, epoch)
 
     def _recover(self) -> None:
-        if self._failure is not None:
-            log.warning("the store works again")
+        log.warning("the store works again")
         self._failure, self._pause_s = None, _FIRST_PAUSE_S
 
     def _fail(self, error: Exception) -> None:
