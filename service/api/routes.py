@@ -40,7 +40,7 @@ _KEY, _KEY_PATTERN = "Idempotency-Key", re.compile(r"[\x21-\x7e]{1,64}")
 class DecideRoute(APIRoute):
     """``POST /decide``: it validates a well-formed request itself, from the bytes.
 
-    FastAPI's way to a function's arguments takes some four times as long as validating the body. Any other request goes
+    FastAPI's way to a function's arguments takes several times as long as validating the body. Any other request goes
     that way, and gets its errors.
     """
 

@@ -49,7 +49,7 @@ class SoleOwnership:
 
 
 @dataclass(slots=True)
-class _Held:
+class _Lease:
     """A lease of this edge: its epoch, and until when it is surely valid, by this machine's clock."""
 
     epoch: int
@@ -88,7 +88,7 @@ class LeasedOwnership:
         self._term_s = term_s
         self._metrics = metrics
         self._on_round = on_round
-        self._held: dict[str, _Held] = {}
+        self._leased: dict[str, _Lease] = {}
         self._renewed_at = time.monotonic()
         self._failure: str | None = None
         self._loop = asyncio.get_running_loop()
@@ -103,13 +103,13 @@ class LeasedOwnership:
 
     def owns(self, mission_id: str) -> bool:
         """Whether this edge has the mission's lease now."""
-        held = self._held.get(mission_id)
-        return held is not None and time.monotonic() < held.until
+        lease = self._leased.get(mission_id)
+        return lease is not None and time.monotonic() < lease.until
 
     def epoch(self, mission_id: str) -> int:
         """The epoch of a lease of this edge, also if it has ended; 0 if it had none."""
-        held = self._held.get(mission_id)
-        return 0 if held is None else held.epoch
+        lease = self._leased.get(mission_id)
+        return 0 if lease is None else lease.epoch
 
     def claim(self, mission_id: str) -> int:
         """Take the mission's lease if it is free; returns its epoch. It waits for the database.
@@ -121,24 +121,24 @@ class LeasedOwnership:
         asked_at = time.monotonic()
         answer = self._leases.acquire(mission_id, self._address, self._term_s)
         if isinstance(answer, Owner):
-            self._held.pop(mission_id, None)
+            self._leased.pop(mission_id, None)
             detail = f"another edge has mission {mission_id}: send the request there"
             raise Misdirected("mission_id", detail, answer.address or None, answer.left_s)
-        held = self._held.get(mission_id)
-        if answer > 1 and (held is None or held.epoch != answer):
+        lease = self._leased.get(mission_id)
+        if answer > 1 and (lease is None or lease.epoch != answer):
             self._metrics.leases_taken_over.inc()
             log.info("mission %s is taken over, epoch %d", mission_id, answer)
-        self._held[mission_id] = _Held(answer, asked_at + self._term_s)
+        self._leased[mission_id] = _Lease(answer, asked_at + self._term_s)
         return answer
 
     def forget(self, mission_id: str) -> None:
         """Own a mission no longer that is deleted or taken over."""
-        self._held.pop(mission_id, None)
+        self._leased.pop(mission_id, None)
 
     def close(self) -> None:
         """End all leases, so that another edge need not wait for their terms. It waits for the database."""
         self._ending.set()
-        self._held.clear()
+        self._leased.clear()
         if self._failure is not None:
             return
         try:
@@ -157,20 +157,20 @@ class LeasedOwnership:
                 self._fail(cause(error))
 
     def _renew(self) -> None:
-        held, asked_at = dict(self._held), time.monotonic()
+        leases, asked_at = dict(self._leased), time.monotonic()
         renewed = self._leases.renew(self._term_s)
-        for mission_id, lease in held.items():
+        for mission_id, lease in leases.items():
             # A lease that has ended is taken again by the next request for its mission, if nobody else has it by then.
             valid = renewed.get(mission_id) == lease.epoch
             lease.until = asked_at + self._term_s if valid else 0.0
-        ended = [mission_id for mission_id, lease in held.items() if not lease.until]
+        ended = [mission_id for mission_id, lease in leases.items() if not lease.until]
         taken = self._leases.taken(ended) if ended else set[str]()
         unowned = self._leases.unowned()
         self._renewed_at = asked_at
         if self._failure is not None:
             log.warning("the leases are renewed again")
             self._failure = None
-        self._metrics.leases.set(len(held) - len(ended))
+        self._metrics.leases.set(len(leases) - len(ended))
         # The event loop is closed if the edge has ended meanwhile.
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._on_round, taken, unowned)

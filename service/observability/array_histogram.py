@@ -12,7 +12,7 @@ from prometheus_client.registry import Collector
 
 
 class ArrayHistogram(Collector):
-    """A histogram without labels; prometheus_client's own takes one value a call, ten times as long for ten values.
+    """A histogram without labels; prometheus_client's own takes one value a call.
 
     Args:
         buckets: upper bounds, ascending; the last bucket is without a bound.

@@ -32,8 +32,8 @@ _CORES: _Strategies = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
 _WORK_FOR_CORES = 0.05
 _INTERRUPTED = "INTERRUPTED"
 _USUAL: _Strategies = (({}, 1.0),)
-# Expected losses make a linear relaxation weak: without it the search of a whole fleet's plan, with what comes
-# afterwards, finds better plans in the same work. The small plans of single UAVs gain from it.
+# A linear relaxation bounds expected losses badly. Without one, the search for a whole fleet's plan finds better plans
+# in the same work. The search for a single UAV's plan gains from one.
 _EXPECTED: _Strategies = (({"linearization_level": 0}, 1.0),)
 
 

@@ -86,7 +86,7 @@ class Uav(threading.Thread):
 
     def _until_answered(self, client: httpx.Client, path: str, body: dict[str, Any]) -> httpx.Response | None:
         headers = {"Idempotency-Key": uuid.uuid4().hex} if path == "/decide" else {}
-        # What is under way at the end is sent until it is answered, so that it is known what was acknowledged.
+        # A request that is not answered at the end is sent again until it is: the test has to know its answer.
         ends = None
         while ends is None or time.monotonic() < ends:
             if self.over and ends is None:

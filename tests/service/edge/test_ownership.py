@@ -250,7 +250,7 @@ def test_an_edge_without_its_database_is_not_ready_and_decides_no_longer_than_it
         patch.setattr(owned._leases, "acquire", down)
         # As after a term without a renewal.
         owned._renewed_at -= TERM_S
-        owned._held["test"].until -= TERM_S
+        owned._leased["test"].until -= TERM_S
         unready = one.get("/readyz")
         assert (unready.status_code, unready.json()["ready"]) == (503, False)
         refused = one.post("/decide", json=report(step=1))

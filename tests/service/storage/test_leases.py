@@ -117,7 +117,7 @@ def test_the_fence_stops_whom_another_owner_has_followed(store: Store, edges: tu
     acquired(one)
     fenced(store, one, 1)
     expire(store)
-    # Nobody else came: what is waiting may still be written.
+    # No other edge has taken the mission, so its waiting changes may still be written.
     fenced(store, one, 1)
     acquired(other)
     with pytest.raises(LeaseLost) as refused:
