@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 import threading
@@ -11,7 +12,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import httpx
-import pytest
 from fastapi import FastAPI
 from starlette.types import Receive, Scope, Send
 
@@ -22,40 +22,46 @@ from tests.running import serving
 from tests.waiting import PATIENCE_S, Gate, until
 
 
+class Arrivals:
+    """An ASGI application that passes requests on to the gate, and has their paths and the server's event loop."""
+
+    def __init__(self, gate: StartupGate) -> None:
+        self.gate = gate
+        self.paths: set[str] = set()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.paths.add(scope.get("path", ""))
+        await self.gate(scope, receive, send)
+
+
 @contextmanager
-def held(make: Callable[[], FastAPI]) -> Iterator[tuple[str, StartupGate, Gate, threading.Event]]:
-    """An edge whose loading waits: its URL, itself, what lets it load, and what tells that it asked for its end."""
+def loading(make: Callable[[], FastAPI]) -> Iterator[tuple[str, Arrivals, Gate, threading.Event]]:
+    """An edge that loads only once a gate is open: its URL, its requests, that gate, and the event of its end."""
     may, stopped = Gate(), threading.Event()
 
     def load() -> FastAPI:
         may.wait()
         return make()
 
-    loading = StartupGate(load, stopped.set)
-    # The server's end waits for whoever loads.
-    with serving(loading) as url, may:
-        yield url, loading, may, stopped
+    arrivals = Arrivals(StartupGate(load, stopped.set))
+    # The server's end waits for the loading.
+    with serving(arrivals) as url, may:
+        yield url, arrivals, may, stopped
 
 
 def test_alive_is_told_and_a_decision_waits_until_it_is_loaded(
-    report: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    report: Callable[..., dict[str, Any]],
 ) -> None:
-    call, came = StartupGate.__call__, set[str]()
-
-    async def coming(self: StartupGate, scope: Scope, receive: Receive, send: Send) -> None:
-        came.add(scope.get("path", ""))
-        await call(self, scope, receive, send)
-
-    monkeypatch.setattr(StartupGate, "__call__", coming)
     with (
-        held(lambda: create_app(Settings(mode="policy"))) as (url, _, may, _),
+        loading(lambda: create_app(Settings(mode="policy"))) as (url, arrivals, may, _),
         httpx.Client(base_url=url, timeout=PATIENCE_S) as client,
         ThreadPoolExecutor() as pool,
     ):
         asked = pool.submit(httpx.post, f"{url}/decide", json=report(), timeout=PATIENCE_S)
         ready = pool.submit(httpx.get, f"{url}/readyz", timeout=PATIENCE_S)
         early = client.get("/healthz")
-        until(lambda: came >= {"/decide", "/readyz"})
+        until(lambda: arrivals.paths >= {"/decide", "/readyz"})
         assert not asked.done()
         assert not ready.done()
         may.open()
@@ -71,7 +77,7 @@ def test_alive_is_told_and_a_decision_waits_until_it_is_loaded(
 
 def test_only_a_plain_question_after_its_life_is_answered_early() -> None:
     with (
-        held(lambda: create_app(Settings(mode="policy"))) as (url, _, may, _),
+        loading(lambda: create_app(Settings(mode="policy"))) as (url, _, may, _),
         ThreadPoolExecutor() as pool,
     ):
         posted = pool.submit(httpx.post, f"{url}/healthz", timeout=PATIENCE_S)
@@ -85,23 +91,27 @@ def test_what_cannot_be_loaded_ends_the_server_and_leaves_nobody_waiting() -> No
     def broken() -> FastAPI:
         raise RuntimeError("no such module")
 
-    with held(broken) as (url, loading, may, stopped), ThreadPoolExecutor() as pool:
+    with loading(broken) as (url, arrivals, may, stopped), ThreadPoolExecutor() as pool:
         asked = pool.submit(httpx.get, f"{url}/readyz", timeout=PATIENCE_S)
         assert httpx.get(f"{url}/healthz", timeout=PATIENCE_S).status_code == 200
         may.open()
         answer = asked.result(timeout=PATIENCE_S)
         assert stopped.wait(timeout=PATIENCE_S)
-        assert str(loading.error) == "no such module"
+        assert str(arrivals.gate.error) == "no such module"
         assert httpx.get(f"{url}/healthz", timeout=PATIENCE_S).status_code == 503
     assert (answer.status_code, answer.headers["content-type"]) == (503, "application/problem+json")
 
 
 def test_nobody_waits_for_an_edge_that_ends() -> None:
-    with held(lambda: create_app(Settings(mode="policy"))) as (url, loading, _, _), ThreadPoolExecutor() as pool:
+    with (
+        loading(lambda: create_app(Settings(mode="policy"))) as (url, arrivals, _, _),
+        ThreadPoolExecutor() as pool,
+    ):
         asked = pool.submit(httpx.get, f"{url}/readyz", timeout=PATIENCE_S)
+        until(lambda: "/readyz" in arrivals.paths)
         assert httpx.get(f"{url}/healthz", timeout=PATIENCE_S).status_code == 200
         assert not asked.done()
-        loading.open()
+        arrivals.loop.call_soon_threadsafe(arrivals.gate.open)
         answer = asked.result(timeout=PATIENCE_S)
     assert (answer.status_code, answer.headers["retry-after"]) == (503, "1")
 
