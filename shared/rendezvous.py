@@ -1,0 +1,15 @@
+"""Rendezvous hashing (Thaler and Ravishankar 1998, "Using Name-Based Mappings to Increase Hit Rates").
+
+Every process that knows the same names ranks them alike for a key, in whatever order it lists them. Where a name leaves,
+only the keys that it ranked first for move, evenly to the others; where it returns, they return.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+
+
+def weight(key: str, name: str) -> int:
+    """The weight of a name for a key, 0 to 2^64 - 1; the name of the highest weight is the key's."""
+    # The length keeps ("a", "bc") and ("ab", "c") apart.
+    return int.from_bytes(blake2b(f"{len(key)}:{key}{name}".encode(), digest_size=8).digest())
