@@ -1,0 +1,60 @@
+"""The processes of one edge, and which of them decides a mission."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import blake2b
+from pathlib import Path
+
+_REMEMBERED = 10_000
+
+
+@lru_cache(_REMEMBERED)
+def slot_of(mission_id: str, slots: int) -> int:
+    """Which of ``slots`` processes, 0 to slots - 1, decides a mission: the same in every process and on every machine.
+
+    Rendezvous hashing (Thaler and Ravishankar 1998, "Using Name-Based Mappings to Increase Hit Rates"): with one slot
+    more, only the missions that the new slot gets move.
+    """
+    return max(range(slots), key=lambda slot: blake2b(f"{slot}/{mission_id}".encode(), digest_size=8).digest())
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One of the processes that decide for one edge; all listen on the edge's port, and have the edge's store.
+
+    Attributes:
+        slot: its number, from 0.
+        slots: number of the processes.
+        folder: of the sockets by which the processes reach each other. Only the edge's user can open it.
+        store_lock: descriptor of the lock of the SQLite file, which the parent process took for all; None without one.
+        replaces: whether it takes the place of a process that has ended, while the others go on.
+    """
+
+    slot: int
+    slots: int
+    folder: Path
+    store_lock: int | None = None
+    replaces: bool = False
+
+    def slot_of(self, mission_id: str) -> int:
+        """Which process decides the mission."""
+        return slot_of(mission_id, self.slots)
+
+    def decides(self, mission_id: str) -> bool:
+        """Whether this process decides the mission."""
+        return slot_of(mission_id, self.slots) == self.slot
+
+    @property
+    def others(self) -> list[int]:
+        """The slots of the other processes."""
+        return [slot for slot in range(self.slots) if slot != self.slot]
+
+    def requests_of(self, slot: int) -> str:
+        """Path of the Unix socket at which a process answers the others' HTTP requests, for itself alone."""
+        return str(self.folder / f"{slot}.http")
+
+    def connections_of(self, slot: int) -> str:
+        """Path of the Unix socket at which a process takes connections over."""
+        return str(self.folder / f"{slot}.moved")
