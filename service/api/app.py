@@ -18,6 +18,8 @@ from service.api.authentication import KeyAuthentication
 from service.api.openapi import schema_of
 from service.api.request_limits import RequestLimits
 from service.api.routes import decisions, router
+from service.api.siblings import Siblings
+from service.config.processes import Member
 from service.config.settings import Settings
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
@@ -37,11 +39,12 @@ class State(TypedDict):
     metrics: Metrics
 
 
-def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
+def create_app(settings: Settings, store: Store | None = None, member: Member | None = None) -> FastAPI:
     """One edge service; its LLM begins to load when the application starts.
 
     Args:
         store: the missions' durable store, closed when the application ends; None keeps missions in memory only.
+        member: which of several processes of the edge this is; None where it is the only one.
 
     Raises:
         BadKeys: the file of keys that the settings name cannot be used.
@@ -56,7 +59,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         metrics = Metrics()
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
-        engine = Engine(settings, llm, counter, metrics, traces, store)
+        engine = Engine(settings, llm, counter, metrics, traces, store, member)
         app.state.engine = engine
         llm.start()
         try:
@@ -82,6 +85,8 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     app.include_router(router)
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
+    if member is not None:
+        app.add_middleware(Siblings, member=member)
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if settings.keys is not None:
         app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))

@@ -20,6 +20,7 @@ from shared.wire import Mode
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
+    from service.config.processes import Member
     from service.config.settings import Settings
 
 
@@ -46,10 +47,13 @@ class Serve:
     """The model at that server. Default: AICVDS_LLM_MODEL, or the first that it lists."""
     store: Annotated[str | None, tyro.conf.arg(metavar="FILE|none", help_behavior_hint="")] = None
     """SQLite file of the missions; none: they end with the process. Default: AICVDS_STORE, or a file in your home."""
+    processes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Processes that decide, at most one a core; each has missions of its own. Default: AICVDS_PROCESSES, or 1."""
 
     def settings(self) -> dict[str, Any]:
         """The settings that were given as options; the environment has the others."""
-        given = {"mode": self.mode, "llm_url": self.llm_url, "llm_model": self.llm_model, "store": self.store}
+        names = ("mode", "llm_url", "llm_model", "store", "processes")
+        given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -75,7 +79,8 @@ def main(argv: list[str]) -> int:
         # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
         with listener:
-            return _serve(listener, settings, url)
+            place = None if settings.processes == 1 else _share_out(settings, listener)
+            return place if isinstance(place, int) else _serve(listener, settings, url, place)
     except KeyboardInterrupt:
         return 130
     finally:
@@ -112,7 +117,19 @@ def checked_settings(given: dict[str, Any], host: str) -> Settings | None:
     return settings
 
 
-def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
+def _share_out(settings: Settings, listener: socket.socket) -> Member | int:
+    """Start the edge's processes; returns the exit code in the parent, and in each of them its place."""
+    from service.commands.processes import Parent
+    from service.storage.locks import StoreUnusable
+
+    try:
+        parent = Parent(settings, listener)
+    except (StoreUnusable, OSError) as error:
+        return _refused(_store_fault(error))
+    return parent.run()
+
+
+def _serve(listener: socket.socket, settings: Settings, url: str, member: Member | None) -> int:
     from service.observability import logs
     from service.server.malloc import hand_back_memory
     from service.server.server import Server
@@ -120,8 +137,9 @@ def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     hand_back_memory()
     logs.configure(settings.log_level, settings.log_format)
     # A machine reads a log of JSON: it gets no banner.
-    loaded = _say if settings.log_format == "text" else lambda text: None
-    server = Server(partial(_application, settings, url, loaded), settings.log_level)
+    tells = settings.log_format == "text" and (member is None or (member.slot == 0 and not member.replaces))
+    loaded = _say if tells else lambda text: None
+    server = Server(partial(_application, settings, url, loaded, member), settings.log_level, member)
     server.run(sockets=[listener])
     if isinstance(server.error, _Unusable):
         return _refused(str(server.error))
@@ -130,7 +148,7 @@ def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     return 0
 
 
-def _application(settings: Settings, url: str, loaded: Callable[[str], None]) -> FastAPI:
+def _application(settings: Settings, url: str, loaded: Callable[[str], None], member: Member | None) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
     from service.api.api_keys import BadKeys
     from service.api.app import create_app
@@ -140,16 +158,18 @@ def _application(settings: Settings, url: str, loaded: Callable[[str], None]) ->
 
     settings = settings.model_copy(update={"advertise_url": settings.advertise_url or _reachable(url)})
     try:
-        store = None if settings.store == "none" else Store(settings.store)
-        app = create_app(settings, store)
+        store = None if settings.store == "none" else Store(settings.store, member)
+        app = create_app(settings, store, member)
     except BadKeys as error:
         raise _Unusable(f"AICVDS_KEYS: {error}") from None
     except StoreUnusable as error:
-        raise _Unusable(
-            f"AICVDS_STORE: {error}. Give another (--store FILE), or `--store none` to store nothing"
-        ) from None
+        raise _Unusable(_store_fault(error)) from None
     loaded(banner(settings, url, 0 if store is None else len(store.missions())))
     return app
+
+
+def _store_fault(error: Exception) -> str:
+    return f"AICVDS_STORE: {error}. Give another (--store FILE), or `--store none` to store nothing"
 
 
 class _Unusable(Exception):

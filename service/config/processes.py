@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from hashlib import blake2b
 from pathlib import Path
+
+from shared.rendezvous import weight
 
 _REMEMBERED = 10_000
 
@@ -14,10 +15,9 @@ _REMEMBERED = 10_000
 def slot_of(mission_id: str, slots: int) -> int:
     """Which of ``slots`` processes, 0 to slots - 1, decides a mission: the same in every process and on every machine.
 
-    Rendezvous hashing (Thaler and Ravishankar 1998, "Using Name-Based Mappings to Increase Hit Rates"): with one slot
-    more, only the missions that the new slot gets move.
+    By rendezvous hashing: with one slot more, only the missions that the new slot gets move.
     """
-    return max(range(slots), key=lambda slot: blake2b(f"{slot}/{mission_id}".encode(), digest_size=8).digest())
+    return max(range(slots), key=lambda slot: weight(mission_id, str(slot)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,6 +116,8 @@ class Settings(BaseSettings):
     # Seconds that this edge owns a mission of a PostgreSQL store without renewing that. Another edge can go on with the
     # missions of a killed one after so long.
     lease_s: float = Field(5.0, ge=1, le=300)
+    # Processes that decide, each for the missions of its own: one a core. All have the store and the embedded LLM.
+    processes: int = Field(1, ge=1, le=64)
     # Missions at once, in memory or in the store; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
     # Folder of the model file and the token vocabulary.

@@ -10,6 +10,7 @@ from functools import partial
 from pydantic import TypeAdapter
 from structlog.contextvars import bind_contextvars, clear_contextvars
 
+from service.config.processes import Member
 from service.config.settings import Settings
 from service.deciding.decision_task import RESERVE_S, DecisionTask
 from service.deciding.decision_time import Deadline, Stopwatch
@@ -61,6 +62,7 @@ class Engine:
         metrics: Metrics,
         traces: Traces,
         store: Store | None,
+        member: Member | None = None,
     ) -> None:
         self._settings = settings
         self._metrics = metrics
@@ -72,7 +74,9 @@ class Engine:
         self._batches = BatchDecider(self.pipeline, self.queries)
         self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self._feedback = Feedback(metrics, self.journal, self.live)
-        self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile, self.live.forget)
+        self.missions = MissionRegistry(
+            settings, metrics, self.journal, store, self.compiler.compile, self.live.forget, member
+        )
 
     def hurry(self) -> None:
         """The service is closing: queries to the LLM end within seconds, and pages get no more updates."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import uuid
 from collections import OrderedDict
 from dataclasses import dataclass
@@ -50,17 +51,23 @@ class RecentDecision:
 
 
 class RecentDecisions:
-    """Decisions by ID, oldest first. An entry only refers to objects that exist anyway."""
+    """Decisions by ID, oldest first. An entry only refers to objects that exist anyway.
+
+    Attributes:
+        decided_at: when the newest was added, seconds of the machine's monotonic clock; 0 before the first.
+    """
 
     def __init__(self) -> None:
         self._decisions: OrderedDict[str, RecentDecision] = OrderedDict()
         self._characters = 0
         self.order = 0
+        self.decided_at = 0.0
         self.edge = uuid.uuid4().hex
 
     def decided(self, position: tuple[float, float], prompt: Prompt, answer: DecideResponse) -> None:
         """Add an answered decision."""
         self.order += 1
+        self.decided_at = time.monotonic()
         blocks = Blocks(prompt.static, prompt.experiences, prompt.state)
         decision = RecentDecision(answer.mission_id, position, blocks, answer, self.order)
         self._decisions[answer.decision_id] = decision

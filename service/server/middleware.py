@@ -94,6 +94,10 @@ class StartupGate:
             return
         await self.app({**scope, "state": dict(self._state)}, receive, send)
 
+    async def opened(self) -> None:
+        """Wait until requests need not wait any more."""
+        await self._opened.wait()
+
     def open(self) -> None:
         """Let the requests wait no longer: the server ends."""
         self._opened.set()

@@ -34,14 +34,14 @@ class ProcessWriter:
     Args:
         statements: SQL for SQLite.
         path: of the file.
-        lock: descriptor of the file's lock. The process inherits it, so that no other edge takes the file between the
-            end of a killed edge and that edge's last commit.
+        locks: descriptors of the file's locks. The process inherits them, so that no other edge takes the file between
+            the end of a killed edge and that edge's last commit.
     """
 
-    def __init__(self, statements: Statements, path: str, lock: int) -> None:
+    def __init__(self, statements: Statements, path: str, locks: Sequence[int]) -> None:
         self._statements = statements
         self._path = path
-        self._lock = lock
+        self._locks = locks
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         # Set while the event loop reads the socket.
@@ -109,7 +109,7 @@ class ProcessWriter:
                     stdout=subprocess.DEVNULL,
                     # With the edge's own stderr, a reader of the edge's log would wait for a killed edge's last commit.
                     stderr=subprocess.PIPE,
-                    pass_fds=(theirs.fileno(), self._lock),
+                    pass_fds=(theirs.fileno(), *self._locks),
                     # Signals of a terminal are for the edge, not for this process.
                     start_new_session=True,
                 )

@@ -13,10 +13,11 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.config.processes import Member
 from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.leases import Leases
-from service.storage.locks import FileLock, StoreUnusable
+from service.storage.locks import FileLock, SharedLock, StoreUnusable
 from service.storage.process_writer import ProcessWriter
 from service.storage.rows import Statements, decode, unpack
 from service.storage.schema import SCHEMA, checkpoints, journal, missions
@@ -58,6 +59,7 @@ class Store:
 
     Args:
         url: path of a SQLite file, or a URL of SQLAlchemy.
+        member: which of several processes of one edge this is, if there are several; they use a SQLite file together.
 
     Raises:
         StoreUnusable: the store cannot be reached, is damaged or of a newer version, or another edge uses the file.
@@ -66,16 +68,19 @@ class Store:
         leases: of the missions in PostgreSQL; None for a SQLite file, which is this edge's alone.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, member: Member | None = None) -> None:
         self.leases: Leases | None = None
-        self._lock: FileLock | None = None
+        self._lock: FileLock | SharedLock | None = None
         try:
             self._engine = _engine(url)
-            if self._engine.url.database and self._engine.dialect.name == "sqlite":
-                self._lock = FileLock(self._engine.url.database)
+            file = self._engine.url.database
+            if file and self._engine.dialect.name == "sqlite":
+                self._lock = FileLock(file) if member is None else SharedLock(file, member)
+                with self._lock.alone():
+                    self._migrate()
             else:
                 self.leases = Leases(self._engine)
-            self._migrate()
+                self._migrate()
         except (sa.exc.SQLAlchemyError, ImportError, OSError, ValueError) as error:
             self.close()
             raise StoreUnusable(cause(error)) from None
@@ -128,7 +133,7 @@ class Store:
         if self.leases is not None:
             return ThreadWriter(statements, self.leases, self._engine)
         assert self._lock is not None
-        return ProcessWriter(statements, self._lock.file, self._lock.descriptor)
+        return ProcessWriter(statements, self._lock.file, self._lock.descriptors)
 
     def _migrate(self) -> None:
         """Bring the schema up to date. alembic is slow to import, so an up-to-date store does without it."""
