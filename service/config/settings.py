@@ -46,13 +46,22 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="AICVDS_", frozen=True, extra="forbid", env_ignore_empty=True)
 
-    # URL of an OpenAI-compatible server, up to and including /v1, or of several in order of preference, separated by
-    # commas. Unset: the embedded llama.cpp.
+    # URL of an OpenAI-compatible server, up to and including /v1, or of several, separated by commas. Unset: the
+    # embedded llama.cpp.
     llm_url: str | None = None
     # Name of the model, or one for each server. Unset: the first model that the server lists.
     llm_model: str | None = None
     # Bearer token for all servers, or one for each.
     llm_api_key: SecretStr | None = None
+    # The order in which several servers are asked: that of their URLs (`preference`), or one that follows from the
+    # mission's ID (`mission`). Missions are then shared out evenly, and each stays with the server whose prefix cache
+    # has its prompts.
+    llm_order: Literal["preference", "mission"] = "preference"
+    # Calls of this edge that one of several servers has at once before the next server gets them. 0: any number.
+    llm_slots: int = Field(0, ge=0, le=10_000)
+    # Name of a header with the mission's ID in each call for a decision, for a router that sends requests of one
+    # session to one replica. Unset: none.
+    llm_session_header: str | None = Field(None, pattern=r"^[A-Za-z0-9-]{1,64}$")
     # Milliseconds after which a second server, or the only one again, is called beside a server that has not answered.
     # 0: never. It doubles the work of a slow server, so it pays where there are several.
     hedge_ms: int = Field(0, ge=0, le=60_000)
@@ -165,7 +174,7 @@ class Settings(BaseSettings):
         return self
 
     def each_server(self) -> list[Settings]:
-        """Settings with a single LLM server, for each server in order of preference; raises ``ValueError``."""
+        """Settings with a single LLM server, for each server in the order of their URLs; raises ``ValueError``."""
         if self.llm_url is None:
             return [self]
         urls = self.llm_url.split(",")

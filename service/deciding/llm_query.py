@@ -51,7 +51,7 @@ class LlmQueries:
         self._llm = llm
         self._limit = limit
         self._metrics = metrics
-        self._labels = LabelReader(llm.ask_labels)
+        self._labels = LabelReader()
         self._late = 0
         self._waiting: set[asyncio.Timeout] = set()
         self._closing = False
@@ -69,24 +69,30 @@ class LlmQueries:
         """Give up the queries in the background."""
         await self._labels.close()
 
-    async def ask_for_pair(self, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: Deadline) -> Completion:
+    async def ask_for_pair(
+        self, mission: Mission, prompt: Prompt, sensor_ids: list[int], levels: int, deadline: Deadline
+    ) -> Completion:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``."""
-        return await self._within(partial(self._llm.ask, prompt.static, prompt.user, sensor_ids, levels), deadline)
+        query = partial(self._llm.ask, mission.mission_id, prompt.static, prompt.user, sensor_ids, levels)
+        return await self._within(query, deadline)
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
         if not mission.prompt_fits:
-            return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=self._llm.model)
+            model = self._llm.serving(mission.mission_id).model
+            return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=model)
         answer = await self._query(mission, prompt.static, prompt.user, [list(candidates.labels)], deadline)
         if answer.to_calibrate:
             template = template_of(mission)
-            self._labels.calibrate(answer.model, prompt.static, template.content_free(), [template.labels])
+            ask = partial(self._llm.ask_labels, mission.mission_id)
+            self._labels.calibrate(ask, answer.model, prompt.static, template.content_free(), [template.labels])
         probabilities = None if answer.by_label is None else candidates.by_action(answer.by_label[0])
         return LlmAdvice(prompt, probabilities, answer.reason, answer.completion, answer.calibrated, answer.model)
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
-        able = self._llm.status == "ready" and uavs <= self._llm.max_uavs_per_call
+        server = self._llm.serving(mission.mission_id)
+        able = server.status.llm == "ready" and uavs <= server.max_uavs_per_call
         return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
 
     async def ask_for_fleet(
@@ -110,12 +116,13 @@ class LlmQueries:
         static, user = template.fleet_static, "".join(prompt.user for prompt in prompts.values())
         labels = [list(candidates.labels) for _, candidates in asked.values()]
         answer = await self._query(mission, static, user, labels, deadline)
-        self._note_lateness(len(asked), answer.reason)
+        self._note_lateness(mission, len(asked), answer.reason)
         if answer.reason is not None and answer.reason != "llm_timeout":
             return {}
         if answer.to_calibrate:
             texts = template.content_free(list(asked))
-            self._labels.calibrate(answer.model, static, texts, [template.labels] * len(asked))
+            ask = partial(self._llm.ask_labels, mission.mission_id)
+            self._labels.calibrate(ask, answer.model, static, texts, [template.labels] * len(asked))
         advice = {}
         for index, (uav, (_, candidates)) in enumerate(asked.items()):
             probabilities = None if answer.by_label is None else candidates.by_action(answer.by_label[index])
@@ -123,12 +130,12 @@ class LlmQueries:
             advice[uav] = LlmAdvice(prompts[uav], probabilities, answer.reason, whole, answer.calibrated, answer.model)
         return advice
 
-    def _note_lateness(self, uavs: int, reason: Reason | None) -> None:
+    def _note_lateness(self, mission: Mission, uavs: int, reason: Reason | None) -> None:
         """Ask about fewer UAVs at once where the LLM failed, or is late again."""
         self._late = self._late + 1 if reason == "llm_timeout" else 0
         if reason is not None and (self._late == 0 or self._late >= _LATE):
             log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
-            self._llm.max_uavs_per_call = uavs - 1
+            self._llm.serving(mission.mission_id).max_uavs_per_call = uavs - 1
             self._late = 0
 
     async def _query(
@@ -136,14 +143,16 @@ class LlmQueries:
     ) -> _Answer:
         completion, by_label, reason = None, None, None
         try:
-            completion = await self._within(partial(self._llm.ask_labels, static, user, labels), deadline)
+            query = partial(self._llm.ask_labels, mission.mission_id, static, user, labels)
+            completion = await self._within(query, deadline)
             by_label = self._labels.read(completion, static, labels)
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()
         if completion is None:
-            return _Answer(None, None, reason, calibrated=False, to_calibrate=False, model=self._llm.model)
+            model = self._llm.serving(mission.mission_id).model
+            return _Answer(None, None, reason, calibrated=False, to_calibrate=False, model=model)
         known = bool(completion.positions) and self._labels.bias(completion.model, static, len(labels)) is not None
         unknown = by_label is not None and bool(completion.positions) and not known
         return _Answer(completion, by_label, reason, calibrated=known, to_calibrate=unknown, model=completion.model)

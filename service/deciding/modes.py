@@ -101,7 +101,9 @@ class Llm(Policy):
         levels = state.mission.scenario.max_velocity + 1
         try:
             try:
-                completion = await self._queries.ask_for_pair(question.prompt, state.kept_ids, levels, task.deadline)
+                completion = await self._queries.ask_for_pair(
+                    state.mission, question.prompt, state.kept_ids, levels, task.deadline
+                )
             finally:
                 task.watch.ended.append(("llm", perf_counter()))
             answer = Action(*check_answer(completion.text, state.kept_ids, levels))

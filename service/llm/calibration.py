@@ -90,8 +90,7 @@ class LabelReader:
     A request has one or several lists of labels; its answer names one label of each list.
     """
 
-    def __init__(self, ask: Ask) -> None:
-        self._ask = ask
+    def __init__(self) -> None:
         self._bias = BoundedDict[_Question, list[dict[str, float]]](_MOST_BIASES)
         self._attempts: dict[_Question, int] = {}
         self._task: asyncio.Task[None] | None = None
@@ -108,10 +107,13 @@ class LabelReader:
             return measured
         return [calibrated(*pair) for pair in zip(measured, bias, strict=True)]
 
-    def calibrate(self, model: str | None, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
+    def calibrate(
+        self, ask: Ask, model: str | None, static: str, texts: Sequence[str], lists: Sequence[Sequence[str]]
+    ) -> None:
         """Measure the bias of a model that gives probabilities in the background, unless it is known or under way.
 
         Args:
+            ask: calls that model.
             texts: content-free user messages; without any there is nothing to measure.
             lists: every label that a request under this static block can offer, by list.
         """
@@ -120,7 +122,7 @@ class LabelReader:
         if busy or not texts or key in self._bias or self._attempts.get(key, 0) >= _ATTEMPTS:
             return
         self._attempts[key] = self._attempts.get(key, 0) + 1
-        self._task = asyncio.create_task(self._measure(key, texts, lists), name="calibration")
+        self._task = asyncio.create_task(self._measure(ask, key, texts, lists), name="calibration")
 
     async def close(self) -> None:
         """Cancel the measurement."""
@@ -128,10 +130,10 @@ class LabelReader:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
-    async def _measure(self, key: _Question, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
+    async def _measure(self, ask: Ask, key: _Question, texts: Sequence[str], lists: Sequence[Sequence[str]]) -> None:
         try:
             async with asyncio.timeout(_TIMEOUT_S):
-                answers = [await self._ask(key[1], text, lists) for text in texts]
+                answers = [await ask(key[1], text, lists) for text in texts]
             measured = [probabilities(answer, lists) for answer in answers]
         except (NoDecision, TimeoutError) as error:
             log.warning("label bias not measured: %s", error)

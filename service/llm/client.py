@@ -39,10 +39,19 @@ class LLMClient:
     Args:
         base_url: up to and including ``/v1``.
         trust_env: obey ``HTTP_PROXY`` and similar variables.
+        session_header: name of a header with each completion's session; None: none.
     """
 
-    def __init__(self, base_url: str, *, api_key: str | None = None, trust_env: bool = True) -> None:
+    def __init__(
+        self,
+        base_url: str,
+        *,
+        api_key: str | None = None,
+        trust_env: bool = True,
+        session_header: str | None = None,
+    ) -> None:
         self.base_url = base_url
+        self._session_header = session_header
         # Parsed once: aiohttp would parse a string at each call.
         self._models, self._completions = (URL(f"{base_url}/{path}") for path in ("models", "chat/completions"))
         # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before it is counted.
@@ -81,11 +90,16 @@ class LLMClient:
             raise NoDecision("llm_error", f"{self.base_url}/models: no model has a name that can be used")
         return names
 
-    async def complete(self, body: dict[str, Any]) -> Completion:
-        """The chat completion of a request body; raises :class:`NoDecision`."""
+    async def complete(self, body: dict[str, Any], session: str | None = None) -> Completion:
+        """The chat completion of a request body; raises :class:`NoDecision`.
+
+        Args:
+            session: what completions that share a prefix have in common: requests of one session may be routed to one
+                server.
+        """
         # Each token may come with the likeliest tokens of its position.
         most = max(_MAX_RESPONSE_BYTES, _BYTES_A_TOKEN * body.get("max_tokens", 1))
-        answer = await self._call("POST", self._completions, body, most)
+        answer = await self._call("POST", self._completions, body, most, session)
         try:
             text = answer["choices"][0]["message"]["content"]
             usage = answer.get("usage") or {}
@@ -100,13 +114,22 @@ class LLMClient:
             cached = min(cached, prompt)
         return Completion(text, prompt, cached, completion, _positions(answer["choices"][0]))
 
-    async def _call(self, method: str, url: URL, body: dict[str, Any] | None, most: int = _MAX_RESPONSE_BYTES) -> Any:
-        content = bytearray()
+    async def _call(
+        self,
+        method: str,
+        url: URL,
+        body: dict[str, Any] | None,
+        most: int = _MAX_RESPONSE_BYTES,
+        session: str | None = None,
+    ) -> Any:
+        content, options = bytearray(), self._proxy
         sent = None if body is None else json.dumps(body, ensure_ascii=False, separators=(",", ":")).encode()
+        if session is not None and self._session_header is not None:
+            options = {**options, "headers": {**options.get("headers", {}), self._session_header: session}}
         try:
             allowed = _ALLOWED.set(most)
             try:
-                request = await self._http.request(method, url, data=sent, allow_redirects=False, **self._proxy)
+                request = await self._http.request(method, url, data=sent, allow_redirects=False, **options)
             finally:
                 _ALLOWED.reset(allowed)
             async with request as response:

@@ -69,6 +69,7 @@ class LlmServer:
 
     Attributes:
         status: replaced as a whole when the state changes.
+        url: the server's address; empty for the embedded LLM.
         model, bare_model: name of the model, once it is known, with its adapter and without.
         constraint: the kind of constraint that the server obeys.
         logprobs: whether the server gives the probabilities of tokens.
@@ -80,6 +81,7 @@ class LlmServer:
         self._warm_up = warm_up
         self._on_open = on_open
         self.status = ServerStatus("off" if settings.mode in ("value", "policy") else "loading")
+        self.url = settings.llm_url or ""
         self._client: LLMClient | None = None
         self._embedded: EmbeddedServer | None = None
         # Brings the server up, or waits for its recovery.
@@ -127,17 +129,16 @@ class LlmServer:
         if self._embedded is not None:
             await asyncio.to_thread(self._embedded.close)
 
-    async def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
+    async def ask(self, mission_id: str, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
         """Call for one decision's sensor and velocity; the caller sets the time limit.
 
         Raises:
             NoDecision: no answer, with the reason.
         """
-        return await self._decide(
-            chat_body(self.model, system, user, self.constraint, sensor_ids, velocities), self._silence
-        )
+        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
+        return await self._decide(mission_id, body, self._silence)
 
-    async def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
+    async def ask_labels(self, mission_id: str, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
         """Call for one label of each list, with the likeliest tokens' probabilities where the server gives them.
 
         Raises:
@@ -145,7 +146,7 @@ class LlmServer:
         """
         body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
         # The silence of a call for several UAVs says nothing about calls for one.
-        answer = await self._decide(body, self._silence if len(lists) == 1 else None)
+        answer = await self._decide(mission_id, body, self._silence if len(lists) == 1 else None)
         if self.constraint != "grammar" or len(lists) == 1:
             return answer
         positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
@@ -180,14 +181,14 @@ class LlmServer:
                 return
             await asyncio.sleep(min(0.1, _SILENCE_S))
 
-    async def _decide(self, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
+    async def _decide(self, mission_id: str, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
         """Call for a decision, and count its result; ``silence`` counts the wait of a cancelled call."""
         self._decisions += 1
         if self._rewriting is not None:
             self._rewriting.cancel()
         begun = time.monotonic()
         try:
-            answer = await self._ask(body)
+            answer = await self._ask(body, mission_id)
         except NotUnderstood:
             # The fault is the request's, not the server's.
             raise
@@ -209,13 +210,13 @@ class LlmServer:
             self._decisions -= 1
             self._decided_at = time.monotonic()
 
-    async def _ask(self, body: dict[str, Any]) -> Completion:
+    async def _ask(self, body: dict[str, Any], mission_id: str | None = None) -> Completion:
         if self._client is None or self.status.llm != "ready":
             raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
         try:
             embedded, system = self._embedded, body["messages"][0]["content"]
             if embedded is None:
-                return replace(await self._client.complete(body), model=self.model)
+                return replace(await self._client.complete(body, mission_id), model=self.model)
             with embedded.request(system, self._warm_up.static) as fields:
                 answer = await self._client.complete(body | fields)
             return replace(answer, model=self.bare_model if "lora" in fields else self.model)
@@ -274,7 +275,7 @@ class LlmServer:
         settings, http_client = self._settings, await asyncio.to_thread(_http_client)
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
-            self._client = http_client(settings.llm_url, api_key=key)
+            self._client = http_client(settings.llm_url, api_key=key, session_header=settings.llm_session_header)
         elif self._client is None:
             gguf, adapter = embedded_model(settings), settings.embedded_adapter
             if adapter is not None:

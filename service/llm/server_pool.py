@@ -1,5 +1,7 @@
-"""Several LLM servers in order of preference: the first that is ready is called, and the next one where that fails.
+"""Several LLM servers in order: the first that is ready is called, and the next one where that fails.
 
+The order is that of the settings, or each mission's own, so that missions are shared out evenly, and a mission's calls
+go to the server whose prefix cache has its prompts. A server with as many calls as it may have comes after the others.
 Each server has its own health and circuit breaker. Optionally a second server is called beside a slow first one (a
 hedged request: Dean and Barroso 2013, "The Tail at Scale"). The first answer counts, and the other call is cancelled.
 """
@@ -7,6 +9,7 @@ hedged request: Dean and Barroso 2013, "The Tail at Scale"). The first answer co
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Literal
@@ -15,6 +18,7 @@ from service.config.settings import Settings
 from service.llm.answers import Completion, NoDecision
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
+from shared.rendezvous import weight
 from shared.wire import Readiness
 
 Answer = Coroutine[Any, Any, Completion]
@@ -32,11 +36,20 @@ class ServerPool:
     def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
         self._each = [LlmServer(one, warm_up, on_open) for one in settings.each_server()]
         self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None
+        self._by_mission = settings.llm_order == "mission"
+        self._slots = settings.llm_slots or math.inf
+        # Calls under way by server; counted where there are several.
+        self._calls = Counter[LlmServer]()
 
     @property
     def active(self) -> LlmServer:
-        """The server that is called now: the first that is ready, or the first of all."""
+        """The first server of the settings that is ready, or the first of all."""
         return next((server for server in self._each if server.status.llm == "ready"), self._each[0])
+
+    def serving(self, mission_id: str) -> LlmServer:
+        """The first server of a mission that is ready, or its first of all."""
+        each = self._ordered(mission_id, self._each)
+        return next((server for server in each if server.status.llm == "ready"), each[0])
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
@@ -44,23 +57,9 @@ class ServerPool:
         return self.active.status.llm
 
     @property
-    def model(self) -> str | None:
-        """The active server's model."""
-        return self.active.model
-
-    @property
     def bare_model(self) -> str | None:
         """The active server's model, without an adapter."""
         return self.active.bare_model
-
-    @property
-    def max_uavs_per_call(self) -> int:
-        """Number of UAVs that one call of the active server may decide for."""
-        return self.active.max_uavs_per_call
-
-    @max_uavs_per_call.setter
-    def max_uavs_per_call(self, number: int) -> None:
-        self.active.max_uavs_per_call = number
 
     @property
     def recovering(self) -> bool:
@@ -94,21 +93,24 @@ class ServerPool:
 
     # Plain functions that return a coroutine: a call resumes no coroutine that only passes its result on.
 
-    def ask(self, system: str, user: str, sensor_ids: list[int], velocities: int) -> Answer:
+    def ask(self, mission_id: str, system: str, user: str, sensor_ids: list[int], velocities: int) -> Answer:
         """As :meth:`LlmServer.ask`."""
-        return self._first(lambda server: server.ask(system, user, sensor_ids, velocities))
+        return self._first(mission_id, lambda server: server.ask(mission_id, system, user, sensor_ids, velocities))
 
-    def ask_labels(self, system: str, user: str, lists: Sequence[Sequence[str]]) -> Answer:
+    def ask_labels(self, mission_id: str, system: str, user: str, lists: Sequence[Sequence[str]]) -> Answer:
         """As :meth:`LlmServer.ask_labels`."""
-        return self._first(lambda server: server.ask_labels(system, user, lists), len(lists))
+        return self._first(mission_id, lambda server: server.ask_labels(mission_id, system, user, lists), len(lists))
 
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
         """As :meth:`LlmServer.rewrite`, by the active server."""
         return await self.active.rewrite(wanted, temperature=temperature, seed=seed)
 
-    def _first(self, call: Call, uavs: int = 1) -> Answer:
+    def _first(self, mission_id: str, call: Call, uavs: int = 1) -> Answer:
         """The first answer of the ready servers."""
         ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
+        if len(ready) > 1:
+            # A stable sort: where every server is full, the order is as without a limit.
+            ready = sorted(self._ordered(mission_id, ready), key=lambda server: self._calls[server] >= self._slots)
         waiting = deque(ready or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
             # A hedge to the same address: there may be several machines behind it.
@@ -143,7 +145,15 @@ class ServerPool:
             await asyncio.gather(*running, return_exceptions=True)
         raise failure or NoDecision("llm_unavailable", "there is no server")
 
-    @staticmethod
-    def _begin(call: Call, waiting: deque[LlmServer], running: dict[asyncio.Task[Completion], LlmServer]) -> None:
+    def _ordered(self, mission_id: str, servers: list[LlmServer]) -> list[LlmServer]:
+        """Servers in a mission's order: the one of the settings, or by rendezvous hashing."""
+        if not self._by_mission or len(servers) == 1:
+            return servers
+        return sorted(servers, key=lambda server: weight(mission_id, server.url), reverse=True)
+
+    def _begin(self, call: Call, waiting: deque[LlmServer], running: dict[asyncio.Task[Completion], LlmServer]) -> None:
         server = waiting.popleft()
-        running[asyncio.create_task(call(server), name="ask-llm")] = server
+        self._calls[server] += 1
+        task = asyncio.create_task(call(server), name="ask-llm")
+        task.add_done_callback(lambda _: self._calls.subtract([server]))
+        running[task] = server

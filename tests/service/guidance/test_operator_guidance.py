@@ -332,7 +332,7 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
     running: list[str] = []
     finished: list[str] = []
 
-    async def ask(body: dict[str, Any]) -> Completion:
+    async def ask(body: dict[str, Any], mission_id: str | None = None) -> Completion:
         name = "note" if "Rewrite" in body["messages"][0]["content"] else "decision"
         running.append(name)
         if running == ["note"]:
@@ -344,7 +344,7 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
     upstream._embedded = object()  # type: ignore[assignment]
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     await soon(lambda: running)
-    await upstream.ask("static", "user", [0], 15)
+    await upstream.ask("mission", "static", "user", [0], 15)
     assert finished == ["decision"]
     assert await note == ORDERS
     assert (running, finished) == (["note", "decision", "note"], ["decision", "note"])
@@ -355,7 +355,7 @@ async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.Mon
     upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     given_up = asked = decided = 0
 
-    async def ask(body: dict[str, Any]) -> Completion:
+    async def ask(body: dict[str, Any], mission_id: str | None = None) -> Completion:
         nonlocal given_up, asked, decided
         if "Rewrite" in body["messages"][0]["content"]:
             asked, before = asked + 1, decided
@@ -377,6 +377,6 @@ async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.Mon
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     for turn in range(1, 5):
         await soon(partial(asked_times, turn))
-        await upstream.ask("static", "user", [0], 15)
+        await upstream.ask("mission", "static", "user", [0], 15)
     await note
     assert (note.result(), given_up) == (ORDERS, 3)

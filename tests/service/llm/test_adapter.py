@@ -110,7 +110,7 @@ async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
     sent: list[dict[str, Any]] = []
 
     class Client:
-        async def complete(self, body: dict[str, Any]) -> Completion:
+        async def complete(self, body: dict[str, Any], session: str | None = None) -> Completion:
             sent.append({key: body.get(key) for key in ("lora", "cache_prompt")})
             if len(sent) == 1:
                 await asyncio.Event().wait()
@@ -122,9 +122,9 @@ async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
     rewriting = Rewriting("Rewrite the note.", [], "note", lambda _: {})
     note = asyncio.create_task(server.rewrite(rewriting, temperature=0.0, seed=0))
     await soon(lambda: sent)
-    await server.ask(warm.static, "user", [0], 15)
+    await server.ask("mission", warm.static, "user", [0], 15)
     await note
-    await server.ask(warm.static, "user", [0], 15)
+    await server.ask("mission", warm.static, "user", [0], 15)
     bare, again = {"lora": OFF["lora"], "cache_prompt": None}, {"lora": None, "cache_prompt": False}
     assert sent == [bare, again, bare, again]
 
