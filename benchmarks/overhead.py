@@ -11,7 +11,9 @@ send their next request after each answer. Every round measures all of (a) to (e
 all. Added latency is the latency at the UAV less that of the LLM server with the same load generator. It prints
 medians over rounds and their ratios with 95% bootstrap intervals over rounds, and writes the same as JSON. Goals: the
 edge adds at most 1.5 times as much as ``bare`` and 0.4 times as much as LiteLLM, and answers at least 0.6 and 3 times
-as many requests a second.
+as many requests a second. The processor time a request is that of the service's processes, the store's writer among
+them. ``--before`` names another checkout of this repository, for example of the last commit, with its virtual
+environment in ``.venv``: its edge, as (c), is measured in the same rounds.
 The first run installs LiteLLM into a virtual environment of its own under runs/; --litellm none omits it.
 """
 
@@ -33,6 +35,7 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 import tyro
 from rich.console import Console
 from rich.progress import Progress
@@ -43,7 +46,8 @@ from simulator.flying.local_edge import HOST, usable_port
 
 LITELLM = "litellm[proxy]==1.106.2"
 FLEET, SENSORS = 3, 10
-QUANTITIES = ("p50", "p99", "rps")
+# Milliseconds, milliseconds, requests a second, and milliseconds of processor time a request.
+QUANTITIES = ("p50", "p99", "rps", "cpu")
 HERE = Path(__file__).parent
 EDGE = {
     "AICVDS_MODE": "llm",
@@ -54,8 +58,8 @@ EDGE = {
     # Answers without the LLM must not hide the slowness of a busy machine.
     "AICVDS_DEADLINE_MS": "20000",
 }
-# Each entry: the target, the highest ratio of latencies to it, and the lowest ratio of requests a second.
-GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0)}
+# The services that the edge is compared to, with the highest ratio of latencies and the lowest of requests a second.
+GOALS = {"bare": (1.5, 0.6), "litellm": (0.4, 3.0), "before": None}
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,8 @@ class Overhead:
     """Numbers of concurrent UAVs."""
     litellm: str = "install"
     """`install`, the path of a `litellm` program, or `none`."""
+    before: Path | None = None
+    """Another checkout, whose edge is measured beside this one's."""
     out: Path = Path("runs/overhead.json")
     """Where to write the figures."""
 
@@ -108,9 +114,10 @@ class Uav:
 
 @dataclass(frozen=True)
 class Target:
-    """A service under load: its URL, its key, and the requests of a UAV."""
+    """A service under load: its process, its URL, its key, and the requests of a UAV."""
 
     name: str
+    process: int
     port: int
     path: str
     body: Callable[[Uav], bytes]
@@ -146,7 +153,7 @@ async def _flies(target: Target, uav: Uav, ends: float, took_ms: list[float]) ->
 
 
 def load(target: Target, uavs: list[Uav], seconds: float) -> dict[str, float]:
-    """p50 and p99 in ms, and answers a second, of UAVs that ask at once."""
+    """p50 and p99 in ms, answers a second, and processor time an answer in ms, of UAVs that ask at once."""
 
     async def all_of_them() -> tuple[list[float], float]:
         took_ms: list[float] = []
@@ -154,15 +161,27 @@ def load(target: Target, uavs: list[Uav], seconds: float) -> dict[str, float]:
         await asyncio.gather(*(_flies(target, uav, began + seconds, took_ms) for uav in uavs))
         return took_ms, time.perf_counter() - began
 
+    busy_s = _processor_s(target.process)
     took_ms, lasted = asyncio.run(all_of_them())
+    busy_s = _processor_s(target.process) - busy_s
     p50, p99 = np.percentile(took_ms, [50, 99])
-    return {"p50": float(p50), "p99": float(p99), "rps": len(took_ms) / lasted}
+    cpu = busy_s * 1e3 / len(took_ms)
+    return {"p50": float(p50), "p99": float(p99), "rps": len(took_ms) / lasted, "cpu": cpu}
+
+
+def _processor_s(process: int) -> float:
+    """Seconds of processor time of a process and of those that it started."""
+    first = psutil.Process(process)
+    times = [each.cpu_times() for each in (first, *first.children(recursive=True))]
+    return float(sum(each.user + each.system for each in times))
 
 
 @contextmanager
-def running(command: list[str], health: str, env: dict[str, str] | None = None) -> Iterator[None]:
-    """A service as a process, until it answers ``health`` with 200."""
-    process = subprocess.Popen(command, env={**os.environ, **(env or {})}, stdout=subprocess.DEVNULL)
+def running(
+    command: list[str], health: str, env: dict[str, str] | None = None, folder: Path | None = None
+) -> Iterator[int]:
+    """A service as a process that answers ``health`` with 200; yields the process's ID."""
+    process = subprocess.Popen(command, env={**os.environ, **(env or {})}, cwd=folder, stdout=subprocess.DEVNULL)
     try:
         ends = time.monotonic() + 120
         while True:
@@ -174,7 +193,7 @@ def running(command: list[str], health: str, env: dict[str, str] | None = None) 
             if process.poll() is not None or time.monotonic() > ends:
                 raise SystemExit(f"{' '.join(command)}: did not start")
             time.sleep(0.1)
-        yield
+        yield process.pid
     finally:
         process.terminate()
         process.wait(30)
@@ -195,37 +214,41 @@ def litellm_program(choice: str, console: Console) -> str | None:
     return str(program)
 
 
-def _edge(settings: dict[str, str], stack: ExitStack) -> int:
-    """Start an edge and wait for its LLM; returns its port."""
+def _edge(settings: dict[str, str], stack: ExitStack, checkout: Path | None = None) -> tuple[int, int]:
+    """Start an edge of this checkout or another, and wait for its LLM; returns its process and its port."""
     port = usable_port(0)
-    serve = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
-    stack.enter_context(running(serve, f"http://{HOST}:{port}/healthz", settings))
+    python = str(checkout / ".venv/bin/python") if checkout else sys.executable
+    serve = [python, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+    process = stack.enter_context(running(serve, f"http://{HOST}:{port}/healthz", settings, checkout))
     while httpx.get(f"http://{HOST}:{port}/readyz", timeout=60).json()["llm"] != "ready":
         time.sleep(0.1)
-    return port
+    return process, port
 
 
-def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
+def start(folder: Path, litellm: str | None, before: Path | None, stack: ExitStack) -> list[Target]:
     """Start all targets; the first is the LLM server itself."""
     llm, bare, proxy = (usable_port(0) for _ in range(3))
     python, upstream = sys.executable, f"http://{HOST}:{llm}/v1"
-    stack.enter_context(running([python, str(HERE / "instant_llm.py"), "--port", str(llm)], f"{upstream}/models"))
+    instant = [python, str(HERE / "instant_llm.py"), "--port", str(llm)]
+    server = stack.enter_context(running(instant, f"{upstream}/models"))
     forwarder = [python, str(HERE / "bare_forwarder.py"), "--port", str(bare), "--upstream", upstream]
-    stack.enter_context(running(forwarder, f"http://{HOST}:{bare}/healthz"))
+    forwards = stack.enter_context(running(forwarder, f"http://{HOST}:{bare}/healthz"))
     keys = folder / "keys.json"
     add = ["keys", "add", "load", "--file", str(keys), "--scopes", "decide", "admin", "--per-minute", "1000000"]
     made = subprocess.run([python, "-m", "shared.cli", *add], check=True, capture_output=True, text=True)
     key = made.stdout.split()[-1]
     settings = {**EDGE, "AICVDS_LLM_URL": upstream, "AICVDS_KEYS": str(keys)}
-    edge, storeless = (
-        _edge({**settings, "AICVDS_STORE": store}, stack) for store in (str(folder / "missions.db"), "none")
-    )
+    edge = _edge({**settings, "AICVDS_STORE": str(folder / "missions.db")}, stack)
+    storeless = _edge({**settings, "AICVDS_STORE": "none"}, stack)
     targets = [
-        Target("bare", bare, "/decide", lambda uav: uav.report(outcomes=False)),
-        Target("edge", edge, "/decide", lambda uav: uav.report(outcomes=True), key),
-        Target("edge, no outcomes", edge, "/decide", lambda uav: uav.report(outcomes=False), key),
-        Target("edge, no store", storeless, "/decide", lambda uav: uav.report(outcomes=True), key),
+        Target("bare", forwards, bare, "/decide", lambda uav: uav.report(outcomes=False)),
+        Target("edge", *edge, "/decide", lambda uav: uav.report(outcomes=True), key),
+        Target("edge, no outcomes", *edge, "/decide", lambda uav: uav.report(outcomes=False), key),
+        Target("edge, no store", *storeless, "/decide", lambda uav: uav.report(outcomes=True), key),
     ]
+    if before is not None:
+        other = _edge({**settings, "AICVDS_STORE": str(folder / "before.db")}, stack, before.absolute())
+        targets.insert(2, Target("before", *other, "/decide", lambda uav: uav.report(outcomes=True), key))
     # LiteLLM is to forward the edge's own query.
     load(targets[1], [Uav(n) for n in range(FLEET)], 1.0)
     asked = httpx.get(f"http://{HOST}:{llm}/last").json()
@@ -237,9 +260,9 @@ def start(folder: Path, litellm: str | None, stack: ExitStack) -> list[Target]:
         config.write_text(json.dumps({"model_list": [{"model_name": "instant", "litellm_params": model}]}))
         command = [litellm, "--config", str(config), "--host", HOST, "--port", str(proxy)]
         offline = {"LITELLM_LOCAL_MODEL_COST_MAP": "True", "LITELLM_LOG": "ERROR", "LITELLM_MASTER_KEY": master}
-        stack.enter_context(running(command, f"http://{HOST}:{proxy}/health/liveliness", offline))
-        targets.append(Target("litellm", proxy, "/v1/chat/completions", lambda _: chat, master))
-    return [Target("direct", llm, "/v1/chat/completions", lambda _: chat), *targets]
+        lite = stack.enter_context(running(command, f"http://{HOST}:{proxy}/health/liveliness", offline))
+        targets.append(Target("litellm", lite, proxy, "/v1/chat/completions", lambda _: chat, master))
+    return [Target("direct", server, llm, "/v1/chat/completions", lambda _: chat), *targets]
 
 
 Figures = dict[str, dict[int, dict[str, list[float]]]]
@@ -247,7 +270,7 @@ Figures = dict[str, dict[int, dict[str, list[float]]]]
 
 def measure(targets: list[Target], options: Overhead, console: Console) -> Figures:
     """By target, number of UAVs and quantity: one value a round."""
-    found: Figures = {t.name: {n: {"p50": [], "p99": [], "rps": []} for n in options.uavs} for t in targets}
+    found: Figures = {t.name: {n: {q: [] for q in QUANTITIES} for n in options.uavs} for t in targets}
     # Each target's UAVs continue their missions from round to round; the edge's two kinds fly separate missions.
     fleets = {t.name: [Uav(999 * i + n) for n in range(max(options.uavs))] for i, t in enumerate(targets)}
     with Progress(console=console) as progress:
@@ -272,7 +295,8 @@ def compare(found: Figures, uavs: tuple[int, ...]) -> list[dict[str, Any]]:
             for quantity in QUANTITIES:
                 row[quantity] = round(float(np.median(by_count[count][quantity])), 2)
             if name.startswith("edge"):
-                for other in (o for o in GOALS if o in found):
+                # `before` does all that `edge` does.
+                for other in (o for o in GOALS if o in found and (o != "before" or name == "edge")):
                     row[f"to {other}"] = {q: _ratio(found, name, other, count, q) for q in QUANTITIES}
             rows.append(row)
     return rows
@@ -280,7 +304,7 @@ def compare(found: Figures, uavs: tuple[int, ...]) -> list[dict[str, Any]]:
 
 def _ratio(found: Figures, name: str, other: str, count: int, quantity: str) -> list[float]:
     mine, its = (np.array(found[n][count][quantity]) for n in (name, other))
-    if quantity != "rps":
+    if quantity in ("p50", "p99"):
         direct = np.array(found["direct"][count][quantity])
         mine, its = mine - direct, its - direct
     told = next(p for p in paired(name, other, quantity, list(mine), list(its)) if p.kind == "ratio")
@@ -289,21 +313,27 @@ def _ratio(found: Figures, name: str, other: str, count: int, quantity: str) -> 
 
 def tell(rows: list[dict[str, Any]], console: Console) -> None:
     """Print each target's figures, and the edge's ratios with their goals."""
-    taken = Table("UAVs", "service", "p50 ms", "p99 ms", "requests/s")
+    taken = Table("UAVs", "service", "p50 ms", "p99 ms", "requests/s", "processor ms")
     for row in rows:
         taken.add_row(str(row["uavs"]), row["service"], *(f"{row[q]:.2f}" for q in QUANTITIES))
     console.print(taken)
-    names = {"p50": "added p50", "p99": "added p99", "rps": "requests/s"}
+    names = {"p50": "added p50", "p99": "added p99", "rps": "requests/s", "cpu": "processor time"}
     ratios = Table("UAVs", "service", "to", "what", "ratio [95%]", "goal")
     for row in rows:
         for other in (o for o in GOALS if f"to {o}" in row):
             for quantity in QUANTITIES:
                 value, low, high = row[f"to {other}"][quantity]
-                most, least = GOALS[other]
-                goal = f"at least {least:g}" if quantity == "rps" else f"at most {most:g}"
-                told = f"{value:.2f} [{low:.2f}, {high:.2f}]"
-                ratios.add_row(str(row["uavs"]), row["service"], other, names[quantity], told, goal)
+                ratio = f"{value:.2f} [{low:.2f}, {high:.2f}]"
+                ratios.add_row(str(row["uavs"]), row["service"], other, names[quantity], ratio, _goal(other, quantity))
     console.print(ratios)
+
+
+def _goal(other: str, quantity: str) -> str:
+    limits = GOALS[other]
+    if limits is None or quantity == "cpu":
+        return ""
+    most, least = limits
+    return f"at least {least:g}" if quantity == "rps" else f"at most {most:g}"
 
 
 def main(options: Overhead) -> None:
@@ -312,7 +342,7 @@ def main(options: Overhead) -> None:
     program = litellm_program(options.litellm, console)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         with console.status("starting"):
-            targets = start(Path(folder), program, stack)
+            targets = start(Path(folder), program, options.before, stack)
         found = measure(targets, options, console)
     rows = compare(found, options.uavs)
     options.out.parent.mkdir(parents=True, exist_ok=True)
