@@ -64,6 +64,7 @@ docs: install
 bench: install
 	$(BIN)/python benchmarks/startup.py --rounds 3
 	$(BIN)/python benchmarks/overhead.py --rounds 5
+	$(BIN)/python benchmarks/processor_stages.py
 	$(BIN)/python benchmarks/tokens.py --seeds 3
 	$(BIN)/python benchmarks/llm.py --rounds 3
 	$(BIN)/python benchmarks/sensors.py
