@@ -20,6 +20,7 @@ from service.distilling.options import Distill
 from service.llm.adapter import PROMPT_VERSION
 from service.llm.model_file import embedded_model, sha256
 from service.prompting.compact_prompt import STATIC
+from shared.executors import ordered_map
 
 # Held-out decisions of each scenario that are evaluated.
 _EVALUATED = 300
@@ -32,6 +33,7 @@ def distill(args: Distill, console: Console) -> None:
 
     Raises:
         OSError, ValueError: a file cannot be read, or has nothing to train on.
+        RayUnusable: there is no such Ray.
         ModelMissing: the embedded model's file does not exist.
     """
     device = args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
@@ -40,12 +42,13 @@ def distill(args: Distill, console: Console) -> None:
     gguf = embedded_model(Settings())
     training: list[PromptExample] = []
     held_out: dict[str, list[PromptExample]] = {}
-    for found in examples_of(args.rollouts, args.out, args.workers):
-        held = sum(map(len, found.held_out.values()))
-        console.print(f"{found.scenario}: {len(found.training)} decisions, {held} held out", highlight=False)
-        training += found.training
-        for name, some in found.held_out.items():
-            held_out.setdefault(name, []).extend(some)
+    with ordered_map(args.workers, args.ray) as each:
+        for found in examples_of(args.rollouts, args.out, each):
+            held = sum(map(len, found.held_out.values()))
+            console.print(f"{found.scenario}: {len(found.training)} decisions, {held} held out", highlight=False)
+            training += found.training
+            for name, some in found.held_out.items():
+                held_out.setdefault(name, []).extend(some)
     student = Student(gguf, STATIC, args.rank, device, args.begin)
     _train(student, training, args, console)
     agreed = {name: agreement(student, _some(some)) for name, some in held_out.items() if some}

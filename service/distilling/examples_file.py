@@ -6,7 +6,7 @@ import gzip
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from service.distilling.examples import (
 )
 from service.llm.adapter import PROMPT_VERSION
 from service.llm.model_file import sha256
-from shared.rollouts import read_rollouts
+from shared.executors import OrderedMap
+from shared.rollouts import Header, RolloutStep, read_rollouts
 
 # Every so many missions of a file, one is held out, and seen in each of these views.
 HELD_OUT = 11
@@ -39,45 +40,47 @@ class Examples:
     held_out: dict[str, list[PromptExample]]
 
 
-def examples_of(rollouts: Sequence[Path], folder: Path, workers: int) -> Iterator[Examples]:
+def examples_of(rollouts: Sequence[Path], folder: Path, each: OrderedMap = map) -> Iterator[Examples]:
     """The examples of each rollouts file.
+
+    Args:
+        folder: of the files that keep the examples.
+        each: makes the examples of the missions.
 
     Raises:
         OSError, ValueError: a file cannot be read, or has no teacher.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = [(source, folder / f"examples-{PROMPT_VERSION}-{sha256(source)[:16]}.json.gz") for source in rollouts]
-    if workers == 1:
-        for kept in map(_kept, jobs):
-            yield _read(kept)
-        return
-    with get_context("spawn").Pool(workers) as pool:
-        for kept in pool.imap(_kept, jobs):
-            yield _read(kept)
+    for source in rollouts:
+        kept = folder / f"examples-{PROMPT_VERSION}-{sha256(source)[:16]}.json.gz"
+        if not kept.is_file():
+            _make(source, kept, each)
+        yield _read(kept)
 
 
-def _kept(job: tuple[Path, Path]) -> Path:
-    """Make a file's examples, unless they are there; raises ``ValueError`` where there is nothing to train on."""
-    source, kept = job
-    if kept.is_file():
-        return kept
+def _make(source: Path, kept: Path, each: OrderedMap) -> None:
+    """Make a file's examples; raises ``ValueError`` where there is nothing to train on."""
     header, steps = read_rollouts(source)
     scenario = header.scenario.name
     training: list[Any] = []
     held_out: dict[str, list[Any]] = {scenario + suffix: [] for suffix in _HELD_OUT_VIEWS}
-    for number, logged in enumerate(missions_of(steps)):
-        if number % HELD_OUT:
-            training += map(_plain, prompt_examples(header, logged, view_of(number)))
-            continue
-        for suffix, view in _HELD_OUT_VIEWS.items():
-            held_out[scenario + suffix] += map(_plain, prompt_examples(header, logged, view))
+    missions = ((header, number, logged) for number, logged in enumerate(missions_of(steps)))
+    for suffix, some in chain.from_iterable(each(_of_mission, missions)):
+        target = training if suffix is None else held_out[scenario + suffix]
+        target += some
     if not training:
         raise ValueError(f"{source} has no decision with a teacher in its second mission or later")
     half = kept.with_suffix(".part")
     with gzip.open(half, "wt", encoding="utf-8", compresslevel=3) as file:
         json.dump({"scenario": scenario, "training": training, "held_out": held_out}, file)
     half.replace(kept)
-    return kept
+
+
+def _of_mission(mission: tuple[Header, int, list[RolloutStep]]) -> list[tuple[str | None, list[Any]]]:
+    """A mission's examples, by the suffix of the held-out view; ``None`` for the training."""
+    header, number, logged = mission
+    views = {None: view_of(number)} if number % HELD_OUT else _HELD_OUT_VIEWS
+    return [(suffix, list(map(_plain, prompt_examples(header, logged, view)))) for suffix, view in views.items()]
 
 
 def _read(kept: Path) -> Examples:

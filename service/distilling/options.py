@@ -43,7 +43,10 @@ class Distill:
     seed: int = 0
     """Of the initial weights and the order of the decisions."""
     workers: int = 1
-    """Processes that make the examples of one file each."""
+    """Processes that make the examples."""
+    ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None
+    """Make them as tasks of Ray: of one that starts here with --workers processes, or of a cluster with this machine in
+    it. Needs the extra `ray`."""
     threads: int = 0
     """Threads of the training on a CPU; 0: all cores."""
     device: str = "auto"

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
+from shared.ray_connection import RayUnusable
 from simulator.cli.options import check_between, checked_edge, chosen_site
 from simulator.cli.running import command_main
 from simulator.errors import UsageError
@@ -70,6 +71,9 @@ class Options:
     """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes for the flights without an edge."""
+    ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None
+    """Fly those as tasks of Ray: of one that starts here with --workers processes, or of a cluster with this machine in
+    it (auto: the one that runs here). Needs the extra `ray`."""
 
 
 def main(argv: list[str]) -> int:
@@ -85,16 +89,18 @@ def experiment(options: Options, argv: list[str], console: Console) -> int:
     """Fly the missing flights, write, print; returns the exit code.
 
     Raises:
-        UsageError: the options are unusable, or the folder cannot be written.
+        UsageError: the options are unusable, the folder cannot be written, or there is no such Ray.
         EdgeError: an edge died, or lacks an LLM that it needs.
     """
     chosen = _chosen(options.name)
     setup = setup_of(options)
     from simulator.experiments.runner import Run
 
-    run = Run(setup, options.out, _commands(options.name, argv), console, options.workers)
+    run = Run(setup, options.out, _commands(options.name, argv), console, options.workers, options.ray)
     try:
         results = run.make(chosen)
+    except RayUnusable as error:
+        raise UsageError(str(error)) from None
     except KeyboardInterrupt:
         console.print(f"interrupted; {run.flown} new flights are stored: the same command continues")
         raise

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,6 +14,7 @@ from rich.console import Console
 from rich.progress import track
 from tyro.conf import arg
 
+from shared.executors import ordered_map
 from shared.rollouts import Header, RolloutStep, write_rollouts
 from shared.scenario import Scenario, scenario_named
 from simulator.errors import EdgeError
@@ -75,6 +75,9 @@ class Explore:
     """A policy whose decisions are flown, such as mpc_formula."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes that fly the worlds, 1 to 64."""
+    ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None
+    """Fly the worlds as tasks of Ray: of one that starts here with --workers processes, or of a cluster with this
+    machine in it. Needs the extra `ray`."""
 
 
 def main(argv: list[str]) -> int:
@@ -124,12 +127,8 @@ def _explored(scenario: Scenario, args: Explore) -> Iterator[RolloutStep]:
     worlds = list(enumerate(teachers, start=args.first))
     fly = partial(_mission, scenario, args.edge, args.policy)
     tracked = partial(track, description="Exploring", total=len(worlds), console=Console(stderr=True))
-    if args.workers == 1:
-        for steps in tracked(map(fly, worlds)):
-            yield from steps
-        return
-    with get_context("spawn").Pool(args.workers) as pool:
-        for steps in tracked(pool.imap(fly, worlds)):
+    with ordered_map(args.workers, args.ray) as each:
+        for steps in tracked(each(fly, worlds)):
             yield from steps
 
 

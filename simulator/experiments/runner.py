@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from shared.executors import executor
 from simulator.errors import UsageError
 from simulator.experiments.edges import edge_for
 from simulator.experiments.execution import CannotFly, commit, fly_locally, fly_with_edge
@@ -34,7 +33,7 @@ class Run:
     """One run of the command.
 
     ``command_of`` gives the command line that makes one experiment. ``workers`` processes fly the flights without an
-    edge.
+    edge, or the workers of the ``ray`` that is named.
     """
 
     setup: Setup
@@ -42,6 +41,7 @@ class Run:
     command_of: Callable[[Experiment], str]
     console: Console
     workers: int = 1
+    ray: str | None = None
     pace: Pace = field(default_factory=Pace)
     grounded: dict[str, str] = field(default_factory=dict)
     flown: int = 0
@@ -52,6 +52,7 @@ class Run:
         Raises:
             UsageError: the folder cannot be written.
             EdgeError: an edge died, or lacks an LLM that it needs.
+            RayUnusable: flights are missing, and there is no such Ray.
             KeyboardInterrupt: the run was interrupted; finished flights are stored.
         """
         self.store = FlightStore(self.out / FLIGHTS)
@@ -120,11 +121,13 @@ class Run:
                     yield planned, fly_with_edge(edge, planned)
 
     def _fly_locally(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
-        pooled = [planned for planned in flights if self.workers > 1 or planned.plans]
+        # Planners need a separate process: OR-Tools installs a SIGINT handler for its search and does not restore the
+        # old one.
+        pooled = [planned for planned in flights if self.workers > 1 or self.ray or planned.plans]
         for planned in (planned for planned in flights if planned not in pooled):
             yield planned, self._record_of(planned, lambda planned=planned: fly_locally(planned))  # type: ignore[misc]
         if pooled:
-            with _workers(self.workers) as pool:
+            with executor(self.workers, self.ray) as pool:
                 futures = {pool.submit(fly_locally, planned): planned for planned in pooled}
                 for future in as_completed(futures):
                     yield futures[future], self._record_of(futures[future], future.result)
@@ -169,32 +172,6 @@ def _concerns(plan: Plan, label: str) -> bool:
 def _order(planned: Planned) -> tuple[bool, bool, bool]:
     """The sort key for cheap flights first: policies, planners and bounds, edges without an LLM, edges with one."""
     return planned.scheme.asks_llm, planned.backing is not None, planned.plans
-
-
-@contextmanager
-def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes for flights, terminated when this process is interrupted.
-
-    Planners need a separate process: OR-Tools installs a SIGINT handler for its search and does not restore the old
-    one.
-    """
-    # Forked children would inherit this process's threads and sockets.
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=_ignore_interrupts)
-    try:
-        yield pool
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in multiprocessing.active_children():
-            child.terminate()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _ignore_interrupts() -> None:
-    # Ctrl-C reaches every process of the terminal; only the parent handles it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager

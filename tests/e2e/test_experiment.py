@@ -72,6 +72,14 @@ def test_bad_use_is_one_line_and_code_2(args: list[str], said: str, tmp_path: Pa
     assert said in ended.stderr and ended.stderr.count("\n") == 1
 
 
+def test_without_the_extra_ray_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    args = ["fairness", "--llm", "none", "--seeds", "1", "--steps", "1", "--ray", "local", "--out", str(tmp_path)]
+    ended = run_here("experiment", *args)
+    assert ended.returncode == 2
+    assert "pip install 'aic-vds[ray]'" in ended.stderr and ended.stderr.count("\n") == 1
+
+
 @pytest.mark.long
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
     args = ["fairness", "--llm", "none", "--steps", "2", "--seeds", "6"]
@@ -150,7 +158,7 @@ def test_the_page_is_a_command_of_its_own() -> None:
 def test_help_comes_without_the_heavy_imports() -> None:
     code = (
         "import sys; from simulator.commands import experiment; experiment.main(['--help']);"
-        "print([m for m in ('matplotlib', 'pettingzoo', 'scipy', 'torch') if m in sys.modules], file=sys.stderr)"
+        "print([m for m in ('matplotlib', 'pettingzoo', 'ray', 'scipy', 'torch') if m in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"

@@ -143,7 +143,7 @@ def test_a_pass_has_each_example_at_most_once_and_batches_of_alike_lengths(lengt
 
 
 def test_the_examples_are_kept_and_every_eleventh_mission_is_held_out(rollouts: Path, tmp_path: Path) -> None:
-    [found] = examples_of([rollouts], tmp_path, 1)
+    [found] = examples_of([rollouts], tmp_path)
     missions = [examples_in(view, rollouts) for view in (EXPERIENCED, LEARNED)]
     assert found.scenario == "paper"
     # The file's second mission has the cycle's second view, and its third the third.
@@ -158,7 +158,7 @@ def test_the_examples_are_kept_and_every_eleventh_mission_is_held_out(rollouts: 
     }
     [kept] = tmp_path.glob("examples-*.json.gz")
     written = kept.stat().st_mtime_ns
-    [again] = examples_of([rollouts], tmp_path, 1)
+    [again] = examples_of([rollouts], tmp_path)
     assert kept.stat().st_mtime_ns == written
     assert [example.text for example in again.training] == [example.text for example in found.training]
     assert np.allclose(again.training[3].target, found.training[3].target)
@@ -318,7 +318,7 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
 ) -> None:
     monkeypatch.setattr("service.distilling.adapter_training._CHECKPOINT_STEPS", 2)
     args = Distill(rollouts=(rollouts,), out=tmp_path, steps=4, batch=2, rank=1)
-    [found] = examples_of([rollouts], tmp_path, 1)
+    [found] = examples_of([rollouts], tmp_path)
     examples = found.training
 
     def student() -> Student:
