@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib.metadata import version
 from typing import TypedDict
 
@@ -22,6 +23,8 @@ from service.api.siblings import Siblings
 from service.config.processes import Member
 from service.config.settings import Settings
 from service.edge.engine import Engine
+from service.llm.embedded import embedded
+from service.llm.hosted import hosted
 from service.llm.server_pool import ServerPool
 from service.observability.metrics import Metrics
 from service.observability.tracing import Traced, Traces, provider_from_environment
@@ -57,7 +60,8 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
         # One thread computes the small modules faster than it can start others, and llama.cpp needs the other cores.
         torch.set_num_threads(1)
         metrics = Metrics()
-        llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
+        embed = embedded if member is None else partial(hosted, member)
+        llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc, embed)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         engine = Engine(settings, llm, counter, metrics, traces, store, member)
         app.state.engine = engine

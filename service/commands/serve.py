@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -122,11 +123,21 @@ def _share_out(settings: Settings, listener: socket.socket) -> Member | int:
     from service.commands.processes import Parent
     from service.storage.locks import StoreUnusable
 
+    embeds = settings.llm_url is None and settings.mode in ("guided", "llm")
     try:
-        parent = Parent(settings, listener)
+        parent = Parent(settings, listener, partial(_host_llm, settings) if embeds else None)
     except (StoreUnusable, OSError) as error:
         return _refused(_store_fault(error))
     return parent.run()
+
+
+def _host_llm(settings: Settings, folder: Path) -> int:
+    """Have the embedded LLM for all processes; returns an exit code where it cannot be loaded."""
+    from service.llm.hosted import host
+    from service.server.malloc import hand_back_memory
+
+    hand_back_memory()
+    return host(settings, folder)
 
 
 def _serve(listener: socket.socket, settings: Settings, url: str, member: Member | None) -> int:

@@ -55,6 +55,21 @@ class Member:
         """Path of the Unix socket at which a process answers the others' HTTP requests, for itself alone."""
         return str(self.folder / f"{slot}.http")
 
+    @property
+    def llm(self) -> Path:
+        """The file that says where the embedded LLM is, which one more process has for all."""
+        return llm_file(self.folder)
+
+    @property
+    def bare_requests(self) -> Path:
+        """The file in which the processes count their requests to the embedded LLM without its adapter."""
+        return self.folder / "bare"
+
     def connections_of(self, slot: int) -> str:
         """Path of the Unix socket at which a process takes connections over."""
         return str(self.folder / f"{slot}.moved")
+
+
+def llm_file(folder: Path) -> Path:
+    """The file of :attr:`Member.llm`."""
+    return folder / "llm.json"

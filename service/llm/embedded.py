@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import secrets
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import xllamacpp
+
+from service.config.settings import Settings
+from service.llm.adapter import check_adapter
+from service.llm.model_file import embedded_model
 
 # By default llama.cpp uses up to 8 GB of host memory for old prompts.
 _PROMPT_CACHE_MIB = 64
@@ -68,6 +73,11 @@ class EmbeddedServer:
         self.bare_model = gguf.stem
         self.model = gguf.stem if adapter is None else f"{gguf.stem}+{adapter.stem}"
 
+    @property
+    def gone(self) -> bool:
+        """Whether the server is at this address no longer: False."""
+        return False
+
     @contextmanager
     def request(self, system: str, trained: str) -> Iterator[dict[str, Any]]:
         """While a request runs, its fields: the adapter answers prompts whose static block ends as ``trained``."""
@@ -86,3 +96,24 @@ class EmbeddedServer:
     def close(self) -> None:
         """Stop the server and free the model; blocks until its threads have ended."""
         self._server = None
+
+
+def embed(settings: Settings) -> EmbeddedServer:
+    """Load the model and the adapter that the settings name; it takes seconds.
+
+    Raises:
+        ModelMissing, AdapterUnusable, LoadFailed: there is none, or it cannot be used.
+    """
+    gguf, adapter = embedded_model(settings), settings.embedded_adapter
+    if adapter is not None:
+        check_adapter(adapter)
+    return EmbeddedServer(gguf, threads=settings.embedded_threads, context=settings.llm_context, adapter=adapter)
+
+
+async def embedded(settings: Settings) -> EmbeddedServer:
+    """As :func:`embed`, in a thread."""
+    return await asyncio.to_thread(embed, settings)
+
+
+# Gets an embedded LLM; raises as `embed`.
+Embed = Callable[[Settings], Awaitable[EmbeddedServer]]

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
-from service.llm.adapter import AdapterUnusable, check_adapter
+from service.llm.adapter import AdapterUnusable
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
-from service.llm.embedded import EmbeddedServer, LoadFailed
-from service.llm.model_file import ModelMissing, embedded_model
+from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
+from service.llm.model_file import ModelMissing
 from service.llm.probing import probe, probe_body
 from service.llm.request_bodies import (
     SEVERAL_LABELS_TEMPERATURE,
@@ -66,6 +66,7 @@ class LlmServer:
     Args:
         warm_up: the first request to a server.
         on_open: called when the circuit breaker opens.
+        embed: gets the embedded LLM, by default by loading it.
 
     Attributes:
         status: replaced as a whole when the state changes.
@@ -76,8 +77,15 @@ class LlmServer:
         max_uavs_per_call: number of UAVs that one call may decide for.
     """
 
-    def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        warm_up: WarmUp,
+        on_open: Callable[[], None] = lambda: None,
+        embed: Embed = embedded,
+    ) -> None:
         self._settings = settings
+        self._embed = embed
         self._warm_up = warm_up
         self._on_open = on_open
         self.status = ServerStatus("off" if settings.mode in ("value", "policy") else "loading")
@@ -244,6 +252,8 @@ class LlmServer:
                 async with asyncio.timeout(_PROBE_TIMEOUT_S):
                     await self._client.complete(probe_body(self.model, self.constraint))
             except (NoDecision, TimeoutError) as error:
+                if self._embedded is not None and self._embedded.gone:
+                    return self.start()
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
             else:
@@ -273,20 +283,14 @@ class LlmServer:
     async def _connect(self) -> LLMClient:
         """Reach or load the LLM, probe its abilities, and send the warm-up."""
         settings, http_client = self._settings, await asyncio.to_thread(_http_client)
+        if self._client is not None and self._embedded is not None and self._embedded.gone:
+            await self._client.close()
+            self._client = None
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
             self._client = http_client(settings.llm_url, api_key=key, session_header=settings.llm_session_header)
         elif self._client is None:
-            gguf, adapter = embedded_model(settings), settings.embedded_adapter
-            if adapter is not None:
-                check_adapter(adapter)
-            self._embedded = await asyncio.to_thread(
-                EmbeddedServer,
-                gguf,
-                threads=settings.embedded_threads,
-                context=settings.llm_context,
-                adapter=adapter,
-            )
+            self._embedded = await self._embed(settings)
             self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
             self.bare_model = self.bare_model or self._embedded.bare_model

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from service.config.settings import Settings
 from service.llm.answers import Completion, NoDecision
+from service.llm.embedded import Embed, embedded
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
 from shared.rendezvous import weight
@@ -31,10 +32,17 @@ class ServerPool:
     Args:
         warm_up: the first request to each server.
         on_open: called when a server's circuit breaker opens.
+        embed: as of :class:`LlmServer`.
     """
 
-    def __init__(self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None) -> None:
-        self._each = [LlmServer(one, warm_up, on_open) for one in settings.each_server()]
+    def __init__(
+        self,
+        settings: Settings,
+        warm_up: WarmUp,
+        on_open: Callable[[], None] = lambda: None,
+        embed: Embed = embedded,
+    ) -> None:
+        self._each = [LlmServer(one, warm_up, on_open, embed) for one in settings.each_server()]
         self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None
         self._by_mission = settings.llm_order == "mission"
         self._slots = settings.llm_slots or math.inf

@@ -17,7 +17,9 @@ import psutil
 import pytest
 
 from service.config.processes import slot_of
-from tests.e2e.processes import output_until, run, started
+from service.storage.locks import FileLock, StoreUnusable
+from tests.e2e.processes import output_until, run, run_here, started
+from tests.service.stub_llm import wait_for
 from tests.waiting import PATIENCE_S, until
 
 Report = Callable[..., dict[str, Any]]
@@ -33,23 +35,23 @@ class Processes:
         self.url, self.parent = url, parent
 
     def deciding(self) -> dict[int, psutil.Process]:
-        """The process of each slot that has loaded the edge: it has the lock of its place."""
-        found = dict[int, psutil.Process]()
-        for child in self.parent.children():
-            for file in _locks(child):
-                found[int(Path(file).stem)] = child
-        return found
+        """The deciding processes by slot: each answers the others' requests at a socket named by its slot."""
+        return {slot: child for child in self.parent.children() if (slot := _slot(child)) is not None}
 
     def ready(self) -> bool:
         """Whether all are."""
         return httpx.get(f"{self.url}/readyz", timeout=PATIENCE_S).status_code == 200
 
 
-def _locks(process: psutil.Process) -> list[str]:
+def _sockets(process: psutil.Process) -> list[Path]:
     try:
-        return [file.path for file in process.open_files() if file.path.endswith(("/0.lock", "/1.lock"))]
+        return [Path(c.laddr) for c in process.net_connections("unix") if isinstance(c.laddr, str)]
     except psutil.Error:
         return []
+
+
+def _slot(process: psutil.Process) -> int | None:
+    return next((int(path.stem) for path in _sockets(process) if path.suffix == ".moved"), None)
 
 
 @contextmanager
@@ -108,28 +110,10 @@ def test_every_mission_is_decided_by_its_own_process(tmp_path: Path, report: Rep
         assert client.get(f"/missions/{NAMES[0]}").status_code == 404
         assert set(edge.deciding()) == {0, 1}
         children = edge.parent.children(recursive=True)
-        folder = Path(next(file for file in map(_locks, children) if file)[0]).parent
+        folder = next(path.parent for path in _sockets(edge.deciding()[0]) if path.suffix == ".moved")
         assert folder.stat().st_mode & 0o777 == 0o700
     assert not psutil.wait_procs(children, PATIENCE_S)[1]
     assert not folder.exists()
-
-
-@pytest.mark.long
-def test_missions_go_on_with_another_number_of_processes(tmp_path: Path, report: Report) -> None:
-    names = [*NAMES, *OTHERS]
-    for run_number, processes in enumerate((2, 1, 3)):
-        with _serving(tmp_path / "m.db", processes) as edge:
-            with httpx.Client(base_url=edge.url, timeout=PATIENCE_S) as client:
-                listed = client.get("/missions").json()["missions"]
-                assert {line["mission_id"] for line in listed} == (set(names) if run_number else set())
-                for name in names:
-                    answer = client.post("/decide", json=report(mission_id=name, step=run_number))
-                    assert answer.status_code == 200, answer.text
-                    assert client.get(f"/missions/{name}").json()["decisions"] == run_number + 1
-            if processes == 2:
-                # The file is the processes' own.
-                other = run("serve", "--port", "0", AICVDS_STORE=str(tmp_path / "m.db"))
-                assert other.returncode == 2 and "another edge uses" in other.stderr
 
 
 class Uav(threading.Thread):
@@ -198,11 +182,35 @@ def test_a_killed_process_loses_nothing_and_the_others_go_on(tmp_path: Path, rep
 
 
 @pytest.mark.long
-def test_keys_hold_for_every_process_and_a_killed_parent_takes_all_along(tmp_path: Path, report: Report) -> None:
-    keys = str(tmp_path / "keys.json")
-    key = run("keys", "add", "fleet", "--file", keys, "--scopes", "decide", "admin").stdout.strip()
+def test_all_have_one_embedded_llm_and_outlive_it(tmp_path: Path, report: Report) -> None:
     with (
-        started("serve", "--port", "0", "--processes", "2", AICVDS_KEYS=keys, AICVDS_MODE="value") as process,
+        _serving("none", AICVDS_MODE="llm", AICVDS_LLM_ADAPTER="off") as edge,
+        httpx.Client(base_url=edge.url, timeout=PATIENCE_S) as client,
+    ):
+        wait_for(client, "ready")
+
+        def reasons(step: int) -> list[str | None]:
+            return [client.post("/decide", json=report(mission_id=n, step=step)).json()["reason"] for n in NAMES]
+
+        away = {"llm_loading", "llm_unavailable", "llm_timeout"}
+        assert not away & set(reasons(0))
+        deciding = {child.pid for child in edge.deciding().values()}
+        (llm,) = (child for child in edge.parent.children() if child.pid not in deciding)
+        llm.kill()
+        # The first calls end with the connection that they find.
+        until(lambda: reasons(1) == ["llm_unavailable"] * 2)
+        wait_for(client, "ready")
+        assert not away & set(reasons(2))
+
+
+@pytest.mark.long
+def test_missions_go_on_in_one_process_after_the_parent_was_killed(tmp_path: Path, report: Report) -> None:
+    """With keys, which hold for every process."""
+    store, keys = tmp_path / "m.db", str(tmp_path / "keys.json")
+    key = run_here("keys", "add", "fleet", "--file", keys, "--scopes", "decide", "admin").stdout.strip()
+    env = {"AICVDS_STORE": str(store), "AICVDS_KEYS": keys, "AICVDS_MODE": "value", "AICVDS_DEADLINE_MS": "60000"}
+    with (
+        started("serve", "--port", "0", AICVDS_PROCESSES="2", **env) as process,
         httpx.Client(timeout=PATIENCE_S) as client,
     ):
         client.base_url = httpx.URL(output_until(process, r"listening on (http://[\d.:]+)")[1])
@@ -211,13 +219,21 @@ def test_keys_hold_for_every_process_and_a_killed_parent_takes_all_along(tmp_pat
             assert client.post("/decide", json=report(mission_id=name)).status_code == 401
         client.headers["Authorization"] = f"Bearer {key}"
         for name in NAMES:
-            assert client.post("/decide", json=report(mission_id=name)).status_code == 200
+            assert client.post("/decide", json=report(mission_id=name)).json()["stored"]
         assert client.get("/metrics").text.count("aicvds_missions{") == 2
         listed = client.get("/missions").json()
         assert len(listed["missions"]) == 2 and listed["may_command"]
+        with pytest.raises(StoreUnusable, match="another edge"):
+            FileLock(str(store))
         children = psutil.Process(process.pid).children(recursive=True)
         process.kill()
         assert not psutil.wait_procs(children, PATIENCE_S)[1]
+    with _serving(store, 1) as edge, httpx.Client(base_url=edge.url, timeout=PATIENCE_S) as client:
+        listed = client.get("/missions").json()
+        assert {line["mission_id"] for line in listed["missions"]} == set(NAMES)
+        for name in NAMES:
+            assert client.post("/decide", json=report(mission_id=name, step=1)).status_code == 200
+            assert client.get(f"/missions/{name}").json()["decisions"] == 2
 
 
 @pytest.mark.parametrize("processes", ["0", "65", "two"])

@@ -156,7 +156,7 @@ def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkey
         gate.wait()
         return EmbeddedServer(*args, **settings)
 
-    monkeypatch.setattr("service.llm.server.EmbeddedServer", slowly)
+    monkeypatch.setattr("service.llm.embedded.EmbeddedServer", slowly)
     app = create_app(Settings(deadline_ms=60_000))
     with serving(app) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client, gate:
         until(lambda: gate.came)

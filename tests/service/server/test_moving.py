@@ -169,5 +169,3 @@ def test_a_request_is_written_with_its_whole_body() -> None:
         "headers": [(b"host", b"edge"), (b"content-length", b"7"), (b"expect", b"100-continue")],
     }
     assert request_bytes(scope, b"body") == b"POST /decide HTTP/1.1\r\nhost: edge\r\ncontent-length: 4\r\n\r\nbody"
-
-
