@@ -75,7 +75,7 @@ async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[U
             found.append(Understood(note, Guidance.model_validate(row["guidance"]), llm, why, control(note), took))
     finally:
         await upstream.close()
-    return upstream.model, found
+    return upstream.active.model, found
 
 
 def control(note: str) -> Guidance | None:
