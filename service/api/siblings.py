@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import chain, zip_longest
@@ -20,7 +21,7 @@ from service.api.problem_details import problem_response
 from service.config.processes import Member
 from service.errors import Elsewhere
 from service.observability.gathered import gathered
-from service.server.moving import CONNECTION, MovableHttpProtocol, Mover, request_bytes
+from service.server.moving import ARRIVED, CONNECTION, MovableHttpProtocol, Mover, request_bytes
 from shared.missions import MissionList
 from shared.wire import Readiness
 
@@ -31,6 +32,10 @@ _ASKED_S = 2.0
 # When the process's newest decision was, in its answer to another process.
 _DECIDED_AT = "x-decided-at"
 _MOST_LISTED = 200
+# A mission's ID in a request that names one, as far as it can be seen without parsing the request.
+_IN_PATH = re.compile(r"/missions/([A-Za-z0-9][A-Za-z0-9._-]{0,63})(?:/|$)")
+_IN_BODY = re.compile(rb'"mission_id"\s*:\s*"([A-Za-z0-9][A-Za-z0-9._-]{0,63})"')
+_DECIDE = ("/decide", "/decide/batch")
 _PASSED_ON = (b"authorization", b"content-type", b"idempotency-key", b"accept-encoding", b"if-none-match")
 
 
@@ -76,28 +81,52 @@ class Siblings:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        body = b""
+        waiting: list[Message] = []
+        if scope["method"] in ("POST", "PUT"):
+            waiting.append(await receive())
+        body: bytes = waiting[0].get("body", b"") if waiting else b""
 
-        async def remembered() -> Message:
-            nonlocal body
-            message = await receive()
-            body = message.get("body", body)
-            return message
+        async def replayed() -> Message:
+            return waiting.pop() if waiting else await receive()
 
-        request = scope["method"], scope["path"]
         try:
-            if _asked_by_sibling(scope):
-                await self.app(scope, remembered, _dated(scope, send) if request == ("GET", "/missions") else send)
-            elif request in self._merged:
-                await self._merge(scope, remembered, send)
-            elif request == ("POST", "/feedback"):
-                own = Answer()
-                await self.app(scope, remembered, own.send)
-                await (await self._known(own, scope, body)).forward(send)
-            else:
-                await self.app(scope, remembered, send)
+            other = self._other(scope, body)
+            if other is not None:
+                raise Elsewhere(other)
+            await self._answer(scope, body, replayed, send)
         except Elsewhere as elsewhere:
-            await self._send_there(elsewhere.slot, scope, body, receive, send)
+            await self._send_there(elsewhere.slot, scope, body, replayed, send)
+
+    def _other(self, scope: Scope, body: bytes) -> int | None:
+        """The process of the mission that a request seems to name, unless it is this one: parsing it would take longer.
+
+        The edge itself knows better. So a request that has already moved, perhaps wrongly, is left to it.
+        """
+        if scope.get(ARRIVED):
+            return None
+        found = _IN_PATH.match(scope["path"])
+        if found is not None:
+            name = found[1]
+        elif scope["path"] in _DECIDE:
+            told = _IN_BODY.search(body)
+            name = "default" if told is None else told[1].decode()
+        else:
+            return None
+        return None if self._member.decides(name) else self._member.slot_of(name)
+
+    async def _answer(self, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
+        """The answer of this process, or of all."""
+        request = scope["method"], scope["path"]
+        if _asked_by_sibling(scope):
+            await self.app(scope, receive, _dated(scope, send) if request == ("GET", "/missions") else send)
+        elif request in self._merged:
+            await self._merge(scope, receive, send)
+        elif request == ("POST", "/feedback"):
+            own = Answer()
+            await self.app(scope, receive, own.send)
+            await (await self._known(own, scope, body)).forward(send)
+        else:
+            await self.app(scope, receive, send)
 
     async def _send_there(self, slot: int, scope: Scope, body: bytes, receive: Receive, send: Send) -> None:
         """Give the connection with the request to another process; without it, pass the request and its answer on."""

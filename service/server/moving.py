@@ -23,6 +23,8 @@ from service.server.connection_limits import BoundedHttpProtocol
 
 # The entry of an ASGI scope with the request's connection.
 CONNECTION = "aicvds.connection"
+# The entry that says that the request has come here with its connection from another process.
+ARRIVED = "aicvds.arrived"
 # How long a process that has many connections to take over is waited for, and how often it is tried.
 _WAIT_S, _RETRY_S = 1.0, 0.002
 _LEFT_OUT = (b"expect", b"content-length", b"transfer-encoding")
@@ -38,17 +40,20 @@ class MovableHttpProtocol(BoundedHttpProtocol):
     def __init__(self, *args: Any, first: bytes = b"", **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._first = first
-        self._pipelined = False
+        self._pipelined = self._arriving = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         first, self._first = self._first, b""
         if first and not transport.is_closing():
+            self._arriving = True
             self.data_received(first)
+            self._arriving = False
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
         self.scope[CONNECTION] = self  # type: ignore[literal-required]
+        self.scope[ARRIVED] = self._arriving  # type: ignore[literal-required]
         if self.cycle is not None and not self.cycle.response_complete:
             self._pipelined = True
 
