@@ -239,10 +239,11 @@ def main(options: Processes) -> None:
                         for quantity, value in figures.items() if turn else ():
                             cell[quantity].append(value)
                         progress.advance(task)
-    result = {"command": sys.argv, "goal": GOAL, "rows": compared(found, options)}
+    rows = compared(found, options)
+    result = {"command": sys.argv, "goal": GOAL, "rows": rows}
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(result, indent=1) + "\n")
-    tell(console, result["rows"], options)
+    tell(console, rows, options)
 
 
 def compared(found: dict[tuple[str, str, int], dict[str, list[float]]], options: Processes) -> list[dict[str, Any]]:

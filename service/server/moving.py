@@ -147,10 +147,8 @@ class MovedConnections:
                         os.close(file)
 
     def _take(self, connection: int, memory: int) -> None:
-        with os.fdopen(memory, "rb") as file:
-            # The writer's position is the reader's.
-            file.seek(0)
-            first = file.read()
+        first = os.pread(memory, os.fstat(memory).st_size, 0)
+        os.close(memory)
         taken = socket.socket(fileno=connection)
         task = self._loop.create_task(
             self._loop.connect_accepted_socket(partial(self._protocol, first=first), taken), name="moved-connection"
