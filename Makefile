@@ -69,6 +69,7 @@ bench: install
 	$(BIN)/python benchmarks/llm.py --rounds 3
 	$(BIN)/python benchmarks/sensors.py
 	$(BIN)/python benchmarks/fleet.py
+	$(BIN)/python benchmarks/processes.py --rounds 3
 	$(BIN)/python benchmarks/world.py
 
 faults: install

@@ -19,12 +19,10 @@ from service.api.authentication import KeyAuthentication
 from service.api.openapi import schema_of
 from service.api.request_limits import RequestLimits
 from service.api.routes import decisions, router
-from service.api.siblings import Siblings
 from service.config.processes import Member
 from service.config.settings import Settings
 from service.edge.engine import Engine
-from service.llm.embedded import embedded
-from service.llm.hosted import hosted
+from service.llm.embedded import Embed, embedded
 from service.llm.server_pool import ServerPool
 from service.observability.metrics import Metrics
 from service.observability.tracing import Traced, Traces, provider_from_environment
@@ -60,7 +58,7 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
         # One thread computes the small modules faster than it can start others, and llama.cpp needs the other cores.
         torch.set_num_threads(1)
         metrics = Metrics()
-        embed = embedded if member is None else partial(hosted, member)
+        embed = embedded if member is None else _shared_llm(member)
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc, embed)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
         engine = Engine(settings, llm, counter, metrics, traces, store, member)
@@ -90,6 +88,8 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
     if member is not None:
+        from service.api.siblings import Siblings
+
         app.add_middleware(Siblings, member=member)
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if settings.keys is not None:
@@ -100,3 +100,10 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
     problem_details.install(app)
     app.openapi = lambda: schema_of(app)  # type: ignore[method-assign]
     return app
+
+
+def _shared_llm(member: Member) -> Embed:
+    """The embedded LLM of another process. Only an edge of several processes spends time on importing this."""
+    from service.llm.hosted import hosted
+
+    return partial(hosted, member)
