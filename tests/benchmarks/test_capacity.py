@@ -1,0 +1,21 @@
+"""benchmarks/capacity.py at its smallest: an edge on a PostgreSQL, what a decision costs, and what that predicts."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.running import figures
+
+pytestmark = pytest.mark.long
+
+
+def test_it_tells_costs_and_predicts_from_them(tmp_path: Path) -> None:
+    little = ("--edges", "1", "--missions", "2", "--connections", "2", "--seconds", "1", "--writers", "1")
+    found = figures("capacity", *little, "--pace", "0", "--flights", "0", "--leases", "5", out=tmp_path / "c.json")
+    told = found["full"]["1"]
+    spent = told["edge_s"] + told["database_s"] + told["client_s"]
+    assert told["edge_s"] > told["database_s"] > 0 and told["log_bytes"] > 0
+    assert told["predicted_a_s"] == pytest.approx(min(1 / told["edge_s"], found["cores"] / spent))
+    # No more than what is there can have been used.
+    assert 0 < told["decisions_a_s"] * spent == pytest.approx(told["cores_used"])
+    assert found["commits_a_s"]["1"] > 0 and found["renewal"]["leases"] == 5
