@@ -22,7 +22,7 @@ from pathlib import Path
 
 from service.config.processes import Member
 from service.config.settings import Settings
-from service.storage.locks import FileLock, sqlite_file
+from service.storage.locks import FileLock, StoreUnusable, sqlite_file
 
 # The pause before a process is started again, doubled with each failure up to the most, and how long a process must
 # have lasted for the next failure to be the first.
@@ -33,6 +33,8 @@ _MOST_FAILURES = 8
 _UNUSABLE = 2
 _SIGNALS = {signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGCHLD}
 _PR_SET_PDEATHSIG = 1
+# Characters of the folder's path at most: a Unix socket's path has at most 107.
+_MOST_PATH = 90
 
 
 @dataclass(slots=True)
@@ -55,8 +57,8 @@ class Parent:
         host_llm: serves the embedded LLM from the folder's file and returns an exit code; None where there is none.
 
     Raises:
-        StoreUnusable: another edge uses the SQLite file.
-        OSError: its lock cannot be made.
+        StoreUnusable: another edge uses the SQLite file, or its lock cannot be made.
+        OSError: there is no folder for the processes' sockets.
     """
 
     def __init__(
@@ -65,11 +67,8 @@ class Parent:
         self._settings = settings
         self._listener = listener
         self._host_llm = host_llm
-        file = sqlite_file(settings.store)
-        if file is not None:
-            Path(file).parent.mkdir(parents=True, exist_ok=True)
-        self._lock = None if file is None else FileLock(file)
-        self._folder = Path(tempfile.mkdtemp(prefix="aicvds-"))
+        self._lock = _locked(settings.store)
+        self._folder = _folder()
         slots: list[int | None] = [*range(settings.processes)]
         self._children = [_Child(slot) for slot in ([None, *slots] if host_llm else slots)]
         self._ending = False
@@ -139,7 +138,7 @@ class Parent:
         child.failures = 1 if lasted else child.failures + 1
         why = f"by signal {-code}" if code < 0 else f"with exit code {code}"
         name = "the process of the LLM" if child.slot is None else f"process {child.slot}"
-        if child.failures > _MOST_FAILURES and child.slot is not None:
+        if child.failures >= _MOST_FAILURES and child.slot is not None:
             self._say("error", f"{name} has ended {why}, {child.failures} times in a row: the edge ends")
             self._end(1)
             return
@@ -173,3 +172,24 @@ class Parent:
         else:
             text = f"aicvds serve: {text}"
         print(text, file=sys.stderr, flush=True)
+
+
+def _locked(store: str) -> FileLock | None:
+    """The lock of the store's SQLite file, if it is one; raises ``StoreUnusable``."""
+    file = sqlite_file(store)
+    if file is None:
+        return None
+    try:
+        Path(file).parent.mkdir(parents=True, exist_ok=True)
+        return FileLock(file)
+    except OSError as error:
+        raise StoreUnusable(str(error)) from None
+
+
+def _folder() -> Path:
+    """A new folder that only this user can open; raises ``OSError``."""
+    folder = tempfile.mkdtemp(prefix="aicvds-")
+    if len(folder) > _MOST_PATH:
+        os.rmdir(folder)
+        raise OSError(f"{folder} is too long a path for sockets: set TMPDIR to a shorter one")
+    return Path(folder)

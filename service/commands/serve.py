@@ -126,8 +126,10 @@ def _share_out(settings: Settings, listener: socket.socket) -> Member | int:
     embeds = settings.llm_url is None and settings.mode in ("guided", "llm")
     try:
         parent = Parent(settings, listener, partial(_host_llm, settings) if embeds else None)
-    except (StoreUnusable, OSError) as error:
+    except StoreUnusable as error:
         return _refused(_store_fault(error))
+    except OSError as error:
+        return _refused(f"--processes {settings.processes}: {error}")
     return parent.run()
 
 

@@ -129,6 +129,22 @@ def test_missions_go_on_in_one_process_after_the_parent_was_killed(tmp_path: Pat
             assert client.get(f"/missions/{name}").json()["decisions"] == 2
 
 
+def test_what_keeps_the_processes_from_starting_is_one_clear_line(tmp_path: Path) -> None:
+    far = tmp_path / ("x" * 100)
+    far.mkdir()
+    lock = FileLock(str(tmp_path / "m.db"))
+    for env, said in (
+        ({"TMPDIR": str(far)}, "set TMPDIR to a shorter one"),
+        ({"AICVDS_STORE": str(tmp_path / "m.db")}, "AICVDS_STORE: another edge uses"),
+        ({"AICVDS_STORE": "/proc/nowhere/m.db"}, "AICVDS_STORE: "),
+    ):
+        refused = run("serve", "--port", "0", "--processes", "2", **env)
+        assert refused.returncode == 2
+        assert said in refused.stderr and "Traceback" not in refused.stderr
+    lock.close()
+    assert not list(far.iterdir())
+
+
 @pytest.mark.parametrize("processes", ["0", "65", "two"])
 def test_a_number_of_processes_that_cannot_be_is_refused(processes: str) -> None:
     refused = run("serve", "--port", "0", "--processes", processes)
