@@ -141,8 +141,11 @@ class StoredMissions:
         """Take a mission's lease, if it is free. The mission stays in memory only if nobody else has had it since."""
         try:
             epoch = await self._read(self.ownership.claim, mission_id)
-        except Misdirected:
+        except Misdirected as other:
             self.drop(mission_id)
+            if other.owner is not None and other.owner == self._settings.advertise_url:
+                # One that has ended. A client that is sent to its address would come back here.
+                raise Unavailable("mission_id", "its owner at this address has ended: send it again") from None
             raise
         if mission_id in self._missions and self._journal.epoch(mission_id) != epoch:
             self._unload(mission_id)

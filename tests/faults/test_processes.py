@@ -15,7 +15,7 @@ pytestmark = pytest.mark.faults
 def test_a_killed_process_loses_nothing_in_postgresql(tmp_path: Path, report: Report) -> None:
     database = Database(tmp_path / "postgres")
     try:
-        with serving(database.url, AICVDS_LEASE_S="1") as edge:
+        with serving(database.url, AICVDS_LEASE_S="8") as edge:
             outlive_a_kill(edge, report)
     finally:
         database.close()

@@ -315,3 +315,17 @@ def test_an_edge_that_was_paused_past_its_term_writes_nothing(
         # It was not recorded by the former owner.
         told = successor.post("/feedback", json=outcome)
         assert told.json()["result"] == "applied"
+
+
+def test_no_client_is_sent_back_to_the_edge_that_it_asked(
+    start: Start, report: Report, database: sa.Connection
+) -> None:
+    """An edge in place of a killed one has its address, and waits for the end of its leases."""
+    killed, _ = start("one")
+    kept(killed, report())
+    client, _ = start("one")
+    refused = client.post("/decide", json=report(step=1))
+    assert (refused.status_code, refused.headers["Retry-After"]) == (503, "1")
+    leave(database)
+    assert client.post("/decide", json=report(step=1)).status_code == 200
+    assert mission(client)["decisions"] == 2
