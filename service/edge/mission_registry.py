@@ -126,7 +126,8 @@ class MissionRegistry:
             Refused: as :meth:`Reports.complete`; nothing is recorded.
         """
         mission_id = request.mission_id
-        self.check_place(mission_id)
+        if self._member is not None:
+            self.check_place(mission_id)
         mission = self._missions.get(mission_id)
         if mission is not None and not self._ownership.owns(mission_id):
             mission = None

@@ -56,7 +56,7 @@ class ServerPool:
 
     def serving(self, mission_id: str) -> LlmServer:
         """The first server of a mission that is ready, or its first of all."""
-        each = self._ordered(mission_id, self._each)
+        each = self._each if len(self._each) == 1 else self._ordered(mission_id, self._each)
         return next((server for server in each if server.status.llm == "ready"), each[0])
 
     @property
@@ -155,7 +155,7 @@ class ServerPool:
 
     def _ordered(self, mission_id: str, servers: list[LlmServer]) -> list[LlmServer]:
         """Servers in a mission's order: the one of the settings, or by rendezvous hashing."""
-        if not self._by_mission or len(servers) == 1:
+        if not self._by_mission:
             return servers
         return sorted(servers, key=lambda server: weight(mission_id, server.url), reverse=True)
 
