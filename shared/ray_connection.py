@@ -24,6 +24,9 @@ class RayUnusable(ValueError):
 def connected(address: str, cores: int) -> Iterator[None]:
     """Within the context, this process is connected to Ray, without usage statistics and dashboard.
 
+    A Ray that is started here has a token of its own. Ray reads it when it is imported, so nothing may import Ray (as
+    ``torchrl.envs`` does) before.
+
     Args:
         address: ``local`` to start Ray on this machine, or the address of a cluster of which this machine is a part.
         cores: of a Ray that is started here, whatever the machine has.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import secrets
 import shutil
 import signal
 import ssl
@@ -27,6 +28,9 @@ from tests.waiting import PATIENCE_S
 
 # An edge started as a process has no store unless a test gives one: otherwise all would share the user's store.
 os.environ["AICVDS_STORE"] = "none"
+
+# Ray reads its token when it is imported, and TorchRL imports it: one token for all tests, before any of them.
+os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
 
 # A shell starts `make test &` with SIGINT ignored, and every process of a test would inherit that and outlive Ctrl-C.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

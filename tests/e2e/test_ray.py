@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import secrets
 import signal
 import subprocess
 import sys
@@ -44,16 +43,12 @@ SCHEMES, SEEDS = ("eof", "random", "madqn"), 16
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
-    """Ray on this machine with two cores; it takes many seconds to start."""
+    """Ray on this machine with two cores, with this process's token; it takes many seconds to start."""
     command = [sys.executable, "-m", "tests.e2e.ray_here", "2"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_AUTH_MODE", "token")
-        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        with process:
-            assert process.stdout is not None
-            yield process.stdout.readline().decode().strip()
-            process.communicate(timeout=PATIENCE_S)
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().decode().strip()
+        process.communicate(timeout=PATIENCE_S)
 
 
 @pytest.fixture(scope="class")
