@@ -108,8 +108,8 @@ class Siblings:
         if found is not None:
             name = found[1]
         elif scope["path"] in _DECIDE:
-            told = _IN_BODY.search(body)
-            name = "default" if told is None else told[1].decode()
+            mission_id = _IN_BODY.search(body)
+            name = "default" if mission_id is None else mission_id[1].decode()
         else:
             return None
         return None if self._member.decides(name) else self._member.slot_of(name)

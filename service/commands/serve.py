@@ -150,8 +150,8 @@ def _serve(listener: socket.socket, settings: Settings, url: str, member: Member
     hand_back_memory()
     logs.configure(settings.log_level, settings.log_format)
     # A machine reads a log of JSON: it gets no banner.
-    tells = settings.log_format == "text" and (member is None or (member.slot == 0 and not member.replaces))
-    loaded = _say if tells else lambda text: None
+    prints = settings.log_format == "text" and (member is None or (member.slot == 0 and not member.replaces))
+    loaded = _say if prints else lambda text: None
     server = Server(partial(_application, settings, url, loaded, member), settings.log_level, member)
     server.run(sockets=[listener])
     if isinstance(server.error, _Unusable):
