@@ -11,57 +11,25 @@ import json
 import logging
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from itertools import chain, zip_longest
 
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.api.merging import DECIDED_AT, Answer, merged_metrics, merged_missions, merged_readiness
 from service.api.problem_details import problem_response
 from service.config.processes import Member
 from service.errors import Elsewhere
-from service.observability.gathered import gathered
 from service.server.moving import ARRIVED, CONNECTION, MovableHttpProtocol, Mover, request_bytes
-from shared.missions import MissionList
-from shared.wire import Readiness
 
 log = logging.getLogger(__name__)
 
 # The longest wait for another process's answer: one that is paused counts as away.
 _ASKED_S = 2.0
-# When the process's newest decision was, in its answer to another process.
-_DECIDED_AT = "x-decided-at"
-_MOST_LISTED = 200
 # A mission's ID in a request that names one, as far as it can be seen without parsing the request.
 _IN_PATH = re.compile(r"/missions/([A-Za-z0-9][A-Za-z0-9._-]{0,63})(?:/|$)")
 _IN_BODY = re.compile(rb'"mission_id"\s*:\s*"([A-Za-z0-9][A-Za-z0-9._-]{0,63})"')
 _DECIDE = ("/decide", "/decide/batch")
 _PASSED_ON = (b"authorization", b"content-type", b"idempotency-key", b"accept-encoding", b"if-none-match")
-
-
-@dataclass
-class Answer:
-    """An answer that is not sent yet."""
-
-    status: int = 0
-    headers: list[tuple[bytes, bytes]] = field(default_factory=list)
-    body: bytes = b""
-
-    async def send(self, message: Message) -> None:
-        """Take a message of the application."""
-        if message["type"] == "http.response.start":
-            self.status, self.headers = message["status"], list(message.get("headers", ()))
-        else:
-            self.body += message.get("body", b"")
-
-    async def forward(self, send: Send) -> None:
-        """Send it."""
-        await send({"type": "http.response.start", "status": self.status, "headers": self.headers})
-        await send({"type": "http.response.body", "body": self.body})
-
-    def header(self, name: str) -> str | None:
-        """The value of a header in lower case."""
-        return next((value.decode("latin-1") for key, value in self.headers if key.lower() == name.encode()), None)
 
 
 class Siblings:
@@ -155,29 +123,15 @@ class Siblings:
         await self._merged[scope["method"], scope["path"]](dict(sorted(answers.items())), own)(scope, receive, send)
 
     def _metrics(self, answers: dict[int, Answer], own: Answer) -> Response:
-        texts = {slot: answer.body.decode() for slot, answer in answers.items() if answer.status == 200}
-        return Response(gathered(texts), media_type=own.header("content-type"))
+        return merged_metrics({str(slot): answer for slot, answer in answers.items()}, own)
 
     def _readiness(self, answers: dict[int, Answer], own: Answer) -> Response:
-        """Ready where all are; its LLM is ready where all have reached it."""
-        found = [Readiness.model_validate_json(a.body) for a in answers.values() if a.status in (200, 503)]
-        shown = min(found, key=lambda one: (one.ready, one.llm == "ready"))
-        if away := [slot for slot in range(self._member.slots) if slot not in answers]:
-            detail = f"process {away[0]} of {self._member.slots} is away"
-            shown = shown.model_copy(update={"ready": False, "detail": detail})
-        return Response(shown.model_dump_json(), 200 if shown.ready else 503, media_type="application/json")
+        away = [slot for slot in range(self._member.slots) if slot not in answers]
+        detail = f"process {away[0]} of {self._member.slots} is away" if away else None
+        return merged_readiness(answers.values(), detail)
 
     def _missions(self, answers: dict[int, Answer], own: Answer) -> Response:
-        """The missions of all, each process's in its order, one of each in turn: the one that decided last first."""
-        listed = [answer for answer in answers.values() if answer.status == 200]
-        listed.sort(key=lambda answer: -float(answer.header(_DECIDED_AT) or 0.0))
-        lists = [MissionList.model_validate_json(answer.body) for answer in listed]
-        lines = [line for line in chain.from_iterable(zip_longest(*(one.missions for one in lists))) if line]
-        more = sum(one.more for one in lists) + max(0, len(lines) - _MOST_LISTED)
-        newest = next((one.newest for one in lists if one.newest is not None), None)
-        may_command = MissionList.model_validate_json(own.body).may_command
-        merged = MissionList(missions=lines[:_MOST_LISTED], more=more, newest=newest, may_command=may_command)
-        return Response(merged.model_dump_json(), media_type="application/json")
+        return merged_missions(answers.values(), own)
 
     async def _known(self, own: Answer, scope: Scope, body: bytes) -> Answer:
         """The answer to an outcome: where it names no mission, of the process that knows its decision."""
@@ -228,7 +182,7 @@ def _dated(scope: Scope, send: Send) -> Send:
     async def dated(message: Message) -> None:
         if message["type"] == "http.response.start":
             at: float = scope["state"]["engine"].live.history.decided_at
-            message = {**message, "headers": [*message["headers"], (_DECIDED_AT.encode(), repr(at).encode())]}
+            message = {**message, "headers": [*message["headers"], (DECIDED_AT.encode(), repr(at).encode())]}
         await send(message)
 
     return dated

@@ -51,6 +51,12 @@ class Serve:
     processes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Processes that decide, at most one a core; each has missions of its own. Default: AICVDS_PROCESSES, or 1."""
 
+    ray: Annotated[str | None, tyro.conf.arg(metavar="local|auto|HOST:PORT", help_behavior_hint="")] = None
+    """Be the ingress of edges on Ray: on one that starts here (local), or on the cluster of this machine. Needs the
+    extra `ray`, and PostgreSQL."""
+    replicas: Annotated[str, tyro.conf.arg(metavar="N|N-M")] = "1-4"
+    """With --ray: how many edges, or from how many to how many, by load."""
+
     def settings(self) -> dict[str, Any]:
         """The settings that were given as options; the environment has the others."""
         names = ("mode", "llm_url", "llm_model", "store", "processes")
@@ -63,9 +69,15 @@ def main(argv: list[str]) -> int:
     args = tyro.cli(Serve, prog="aicvds serve", args=argv)
     if not 0 <= args.port <= 65535:
         return _refused(f"--port {args.port} is not between 0 and 65535")
-    settings = checked_settings(args.settings(), args.host)
+    # The edges on a cluster listen on their machines' addresses.
+    settings = checked_settings(args.settings(), args.host if args.ray in (None, "local") else f"Ray at {args.ray}")
     if settings is None:
         return 2
+    replicas = _bounds(args.replicas)
+    if replicas is None:
+        return _refused(f"--replicas {args.replicas}: give a number from 1 to 1000, or two such as 2-8")
+    if args.ray is not None and (fault := _fault_with_ray(settings)) is not None:
+        return _refused(fault)
     try:
         family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
         listener = socket.create_server((args.host, args.port), family=family)
@@ -80,6 +92,8 @@ def main(argv: list[str]) -> int:
         # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
         with listener:
+            if args.ray is not None:
+                return _serve_cluster(listener, settings, args.ray, *replicas)
             place = None if settings.processes == 1 else _share_out(settings, listener)
             return place if isinstance(place, int) else _serve(listener, settings, url, place)
     except KeyboardInterrupt:
@@ -159,6 +173,41 @@ def _serve(listener: socket.socket, settings: Settings, url: str, member: Member
     if server.error is not None:
         raise server.error
     return 0
+
+
+def _serve_cluster(listener: socket.socket, settings: Settings, ray: str, least: int, most: int) -> int:
+    from service.cluster.serving import serve_cluster
+    from service.observability import logs
+    from shared.ray_connection import RayUnusable
+
+    logs.configure(settings.log_level, settings.log_format)
+    try:
+        server = serve_cluster(listener, settings, ray, least, most)
+    except RayUnusable as error:
+        return _refused(str(error))
+    if isinstance(server.error, RayUnusable):
+        return _refused(str(server.error))
+    if server.error is not None:
+        raise server.error
+    return 0
+
+
+def _fault_with_ray(settings: Settings) -> str | None:
+    """Why edges on Ray cannot have these settings."""
+    if not settings.store.startswith("postgresql"):
+        return "--ray: edges on several machines share a store only in PostgreSQL: set AICVDS_STORE"
+    if settings.processes != 1:
+        return "--ray and --processes: leave --processes (AICVDS_PROCESSES) out; --replicas says how many edges"
+    return None
+
+
+def _bounds(replicas: str) -> tuple[int, int] | None:
+    """The least and the most of ``--replicas``; None where it is malformed."""
+    least, _, most = replicas.partition("-")
+    if not (least.isdecimal() and (most or least).isdecimal()):
+        return None
+    bounds = int(least), int(most or least)
+    return bounds if 1 <= bounds[0] <= bounds[1] <= 1000 else None
 
 
 def _application(settings: Settings, url: str, loaded: Callable[[str], None], member: Member | None) -> FastAPI:

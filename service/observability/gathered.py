@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 
-def gathered(texts: Mapping[int, str]) -> str:
+def gathered(texts: Mapping[str, str]) -> str:
     """One exposition of several processes' ones, by process, in Prometheus's text format.
 
     The samples of a metric follow each other after one HELP and one TYPE, as the format demands. A process that is away
@@ -25,7 +25,7 @@ def gathered(texts: Mapping[int, str]) -> str:
     return "".join(f"{line}\n" for name in heads for line in (*heads[name], *samples.get(name, ())))
 
 
-def _labelled(sample: str, process: int) -> str:
+def _labelled(sample: str, process: str) -> str:
     """A sample with one label more; no metric's name has a brace or a space."""
     name, brace, rest = sample.partition("{")
     if brace and " " not in name:

@@ -31,15 +31,18 @@ class Server(uvicorn.Server):
         load: imports and makes the edge's application, in a thread.
         log_level: of uvicorn; at ``debug`` requests are logged too.
         member: which of several processes of the edge this is; None where it is the only one.
+
+    Attributes:
+        gate: the application as it is served, also while it loads.
     """
 
     def __init__(self, load: Callable[[], Starlette], log_level: str, member: Member | None = None) -> None:
-        self._gate = StartupGate(load, self._end)
+        self.gate = StartupGate(load, self._end)
         self._member = member
         self._moved: MovedConnections | None = None
         self._joining: asyncio.Task[None] | None = None
         config = uvicorn.Config(
-            self._gate,
+            self.gate,
             # uvicorn takes a plain function for an older interface.
             interface="asgi3",
             log_config=None,
@@ -55,7 +58,7 @@ class Server(uvicorn.Server):
     @property
     def error(self) -> Exception | None:
         """Why the edge could not be loaded, if so; the server ends then."""
-        return self._gate.error
+        return self.gate.error
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen; in place of a process that has ended only once the edge is loaded, as the others answer meanwhile."""
@@ -69,7 +72,7 @@ class Server(uvicorn.Server):
             self._joining = asyncio.create_task(self._join_loaded(self._member, sockets or []), name="join")
 
     async def _join_loaded(self, member: Member, sockets: list[socket.socket]) -> None:
-        await self._gate.opened()
+        await self.gate.opened()
         if not self.should_exit:
             await self._join(member, sockets)
 
@@ -89,9 +92,9 @@ class Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer the connected clients, with less time for the LLM; then end the application, which saves its state."""
-        self._gate.open()
-        if self._gate.app is not None:
-            self._gate.app.state.engine.hurry()
+        self.gate.open()
+        if self.gate.app is not None:
+            self.gate.app.state.engine.hurry()
         await self._stop_accepting(sockets or [])
         await super().shutdown(sockets)
         # After this uvicorn only logs its end, and raises the signal again.

@@ -58,6 +58,7 @@ KEYED = [
 # Their command lines are parsed and no more; by how they begin.
 PARSED = {
     "aicvds doctor": "its result is this machine's; tests/service/commands/test_doctor.py runs it",
+    "aicvds serve --ray": "it needs a PostgreSQL; tests/faults/test_ray.py runs it",
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
     "aicvds fly": "it waits for vehicles; tests/simulator/vehicles and tests/e2e/test_fly.py fly it",
     "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",

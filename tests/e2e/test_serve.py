@@ -5,6 +5,7 @@ import json
 import re
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -122,6 +123,26 @@ def test_nothing_runs_before_the_settings_are_checked(tmp_path: Path) -> None:
         refused = run("serve", "--port", "0", *args, **env)
         assert refused.returncode == 2
         assert "listening" not in refused.stderr and "Value error" not in refused.stderr
+
+
+@pytest.mark.usefixtures("unmarked")
+@pytest.mark.parametrize(
+    ("args", "env", "why"),
+    [
+        (["--ray", "local"], {}, "a store only in PostgreSQL"),
+        (["--ray", "local", "--processes", "2"], {"AICVDS_STORE": "postgresql://h/d"}, "leave --processes"),
+        (["--ray", "local", "--replicas", "4-2"], {"AICVDS_STORE": "postgresql://h/d"}, "--replicas 4-2"),
+        (["--ray", "local"], {"AICVDS_STORE": "postgresql://h/d"}, "ray is not installed. Install the extra"),
+        # The edges on a cluster listen on their machines' addresses, even where the ingress does not.
+        (["--ray", "10.0.0.7:6379"], {"AICVDS_STORE": "postgresql://h/d"}, "anyone who reaches Ray at 10.0.0.7:6379"),
+    ],
+)
+def test_what_edges_on_ray_cannot_have_is_refused(
+    args: list[str], env: dict[str, str], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    refused = run_here("serve", "--port", "0", *args, **env)
+    assert refused.returncode == 2 and why in refused.stderr and "Traceback" not in refused.stderr
 
 
 def test_the_banner_says_what_runs_and_what_to_type_next(tmp_path: Path) -> None:

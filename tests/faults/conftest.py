@@ -18,7 +18,7 @@ def tables(request: pytest.FixtureRequest) -> Iterator[Tables]:
     session = request.session
     ran = {Path(item.path).name for item in session.items}
     whole = (
-        ran >= {"test_kills.py", "test_owners.py", "test_sigterm.py", "test_upstreams.py"}
+        ran >= {"test_kills.py", "test_owners.py", "test_ray.py", "test_sigterm.py", "test_upstreams.py"}
         and not session.config.option.keyword
     )
     text = kept.page()

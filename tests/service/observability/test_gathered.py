@@ -16,11 +16,11 @@ def _exposed(count: int) -> str:
 
 
 def test_every_sample_has_its_process() -> None:
-    texts = {0: _exposed(1), 2: _exposed(5)}
+    texts = {"0": _exposed(1), "2": _exposed(5)}
     merged = list(text_string_to_metric_families(gathered(texts)))
     assert len({family.name for family in merged}) == len(merged)
     alone = {
-        (sample.name, frozenset({**sample.labels, "process": str(process)}.items())): sample.value
+        (sample.name, frozenset({**sample.labels, "process": process}.items())): sample.value
         for process, text in texts.items()
         for family in text_string_to_metric_families(text)
         for sample in family.samples
@@ -31,7 +31,7 @@ def test_every_sample_has_its_process() -> None:
 
 
 def test_the_edges_own_metrics_are_gathered() -> None:
-    texts = {slot: generate_latest(Metrics().registry).decode() for slot in range(2)}
+    texts = {slot: generate_latest(Metrics().registry).decode() for slot in "01"}
     families = {family.name: family for family in text_string_to_metric_families(gathered(texts))}
     assert {s.labels["process"] for s in families["aicvds_missions"].samples} == {"0", "1"}
     assert families["aicvds_link_excess_db"].type == "histogram"

@@ -1,0 +1,82 @@
+"""Answers for a whole edge that has several processes, or a cluster's edges, from what each of them answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, zip_longest
+
+from starlette.responses import Response
+from starlette.types import Message, Send
+
+from service.observability.gathered import gathered
+from shared.missions import MissionLine, MissionList
+from shared.wire import Readiness
+
+# When a process's newest decision was, in its answer to another process.
+DECIDED_AT = "x-decided-at"
+_MOST_LISTED = 200
+
+
+@dataclass
+class Answer:
+    """An answer that is not sent yet."""
+
+    status: int = 0
+    headers: list[tuple[bytes, bytes]] = field(default_factory=list)
+    body: bytes = b""
+
+    async def send(self, message: Message) -> None:
+        """Take a message of the application."""
+        if message["type"] == "http.response.start":
+            self.status, self.headers = message["status"], list(message.get("headers", ()))
+        else:
+            self.body += message.get("body", b"")
+
+    async def forward(self, send: Send) -> None:
+        """Send it."""
+        await send({"type": "http.response.start", "status": self.status, "headers": self.headers})
+        await send({"type": "http.response.body", "body": self.body})
+
+    def header(self, name: str) -> str | None:
+        """The value of a header in lower case."""
+        return next((value.decode("latin-1") for key, value in self.headers if key.lower() == name.encode()), None)
+
+
+def merged_metrics(answers: Mapping[str, Answer], own: Answer) -> Response:
+    """All samples, each with the name of its process as a label; ``own`` is one of the answers."""
+    texts = {name: answer.body.decode() for name, answer in answers.items() if answer.status == 200}
+    return Response(gathered(texts), media_type=own.header("content-type"))
+
+
+def merged_readiness(answers: Iterable[Answer], away: str | None) -> Response:
+    """Ready where all are; the LLM is ready where all have reached it.
+
+    Args:
+        away: what is missing, if something is; nobody is ready then.
+    """
+    found = [Readiness.model_validate_json(a.body) for a in answers if a.status in (200, 503)]
+    shown = min(found, key=lambda one: (one.ready, one.llm == "ready"))
+    if away is not None:
+        shown = shown.model_copy(update={"ready": False, "detail": away})
+    return Response(shown.model_dump_json(), 200 if shown.ready else 503, media_type="application/json")
+
+
+def merged_missions(answers: Iterable[Answer], own: Answer) -> Response:
+    """The missions of all, each process's in its order, one of each in turn: the one that decided last first.
+
+    A mission that is only in the store may be in several lists.
+    """
+    listed = [answer for answer in answers if answer.status == 200]
+    listed.sort(key=lambda answer: -float(answer.header(DECIDED_AT) or 0.0))
+    lists = [MissionList.model_validate_json(answer.body) for answer in listed]
+    lines = dict[str, MissionLine]()
+    for line in chain.from_iterable(zip_longest(*(one.missions for one in lists))):
+        if line is not None and (line.mission_id not in lines or line.mode is not None):
+            lines[line.mission_id] = line
+    more = sum(one.more for one in lists) + max(0, len(lines) - _MOST_LISTED)
+    newest = next((one.newest for one in lists if one.newest is not None), None)
+    may_command = MissionList.model_validate_json(own.body).may_command
+    shown = list(lines.values())[:_MOST_LISTED]
+    merged = MissionList(missions=shown, more=more, newest=newest, may_command=may_command)
+    return Response(merged.model_dump_json(), media_type="application/json")

@@ -1,0 +1,119 @@
+"""The owners of missions as replicas of a Ray Serve deployment."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from hashlib import blake2b
+from importlib.metadata import version
+from typing import Any, TypeVar
+
+from ray import serve
+from ray.exceptions import RayError
+from ray.serve.config import AutoscalingConfig, RequestRouterConfig
+from ray.serve.exceptions import RayServeException
+
+from service.api.merging import Answer
+from service.cluster.exchange import Exchanged
+from service.cluster.ingress import OwnersGone
+from service.cluster.owner import Owner
+from service.config.settings import Settings
+from shared.ray_connection import RayUnusable
+
+_NAME = "aicvds-"
+_ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
+# Requests at once of an edge, on average, from which on there is another one.
+_ONGOING = 8
+# An edge that is killed is replaced once a health check finds it gone.
+_HEALTH_PERIOD_S, _HEALTH_TIMEOUT_S = 1.0, 10.0
+# The edge's own end takes up to 9 s.
+_SHUTDOWN_S = 15.0
+
+Answered = TypeVar("Answered")
+
+
+class ServeOwners:
+    """As :class:`service.cluster.ingress.Owners` has it: the replicas of the deployment, by a handle."""
+
+    def __init__(self, handle: Any) -> None:
+        self._handle = handle
+
+    async def ask(self, request: Exchanged, within_s: float) -> Answer:
+        return await _in_time(lambda: self._of(request.mission_id).answer.remote(request), within_s)
+
+    async def ask_all(self, request: Exchanged, within_s: float) -> dict[str, Answer]:
+        async def found() -> dict[str, Answer]:
+            asked = self._handle.broadcast("named_answer", request)
+            answers = await asked.results_async(return_exceptions=True)
+            return dict(sorted(answer for answer in answers if not isinstance(answer, BaseException)))
+
+        answers = await _in_time(found, within_s)
+        if not answers:
+            raise OwnersGone("none")
+        return answers
+
+    async def address(self, mission_id: str | None, within_s: float) -> str:
+        return await _in_time(lambda: self._of(mission_id).address.remote(), within_s)
+
+    def _of(self, mission_id: str | None) -> Any:
+        return self._handle.options(session_id=mission_id or "")
+
+
+async def _in_time(ask: Callable[[], Awaitable[Answered]], within_s: float) -> Answered:
+    try:
+        async with asyncio.timeout(within_s):
+            return await ask()
+    except (RayError, RayServeException, TimeoutError) as error:
+        raise OwnersGone(repr(error)) from None
+
+
+def deployed(settings: Settings, host: str | None, least: int, most: int) -> ServeOwners:
+    """From ``least`` to ``most`` replicas, by load, on the Ray to which this process is connected.
+
+    Those that another ingress has started with the same settings are used.
+
+    Args:
+        host: as of :class:`Owner`.
+
+    Raises:
+        RayUnusable: replicas with other settings are there, or those that are to start cannot be loaded.
+    """
+    serve.start(proxy_location="Disabled")
+    name = _NAME + _digest(settings, least, most)
+    running = {known: app.status for known, app in serve.status().applications.items() if known.startswith(_NAME)}
+    if running.keys() - {name}:
+        raise RayUnusable(
+            "--ray: edges with other settings, or of another release, run on this cluster: "
+            "give the same AICVDS_* variables and --replicas, or end them by `serve shutdown`"
+        )
+    if name in running and running[name] == "RUNNING":
+        return ServeOwners(serve.get_app_handle(name))
+    deployment: Any = serve.deployment(
+        name="owner",
+        ray_actor_options={"num_cpus": 1},
+        max_ongoing_requests=settings.max_requests,
+        health_check_period_s=_HEALTH_PERIOD_S,
+        health_check_timeout_s=_HEALTH_TIMEOUT_S,
+        graceful_shutdown_timeout_s=_SHUTDOWN_S,
+        autoscaling_config=AutoscalingConfig(min_replicas=least, max_replicas=most, target_ongoing_requests=_ONGOING),
+        request_router_config=RequestRouterConfig.model_validate(
+            {"request_router_class": _ROUTER, "request_router_kwargs": {"num_fallback_replicas": 0}}
+        ),
+    )(Owner)
+    try:
+        return ServeOwners(serve.run(deployment.bind(settings, host), name=name, route_prefix=None))
+    except RuntimeError as error:
+        raise RayUnusable(f"--ray: {error}") from None
+
+
+def _digest(settings: Settings, least: int, most: int) -> str:
+    """The same for ingresses that may share replicas."""
+    key = None if settings.llm_api_key is None else settings.llm_api_key.get_secret_value()
+    known = settings.model_dump(mode="json", exclude={"llm_api_key", "advertise_url"})
+    told = repr((version("aic-vds"), sorted(known.items()), key, least, most))
+    return blake2b(told.encode(), digest_size=6).hexdigest()
+
+
+def ended() -> None:
+    """End the replicas: they store what they have, and give their missions up."""
+    serve.shutdown()  # type: ignore[no-untyped-call]
