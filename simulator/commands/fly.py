@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,7 +23,7 @@ from simulator.cli.options import (
 )
 from simulator.cli.running import INTERRUPTED, command_main
 from simulator.errors import UsageError
-from simulator.records.run_folder import DECISIONS, REQUESTS, refuse_old_result
+from simulator.records.run_folder import DECISIONS, refuse_old_result
 
 if TYPE_CHECKING:
     from simulator.sites.site import Site
@@ -60,7 +60,9 @@ class Fly:
 
       aicvds fly --mavlink serial:///dev/ttyACM0:57600 --uav 2 --world line --edge URL --mission line-1
 
-    Written to --out: decisions.jsonl and requests.jsonl, for `aicvds replay`. The environment variable AICVDS_API_KEY
+    Written to --out, as by `aicvds simulate`: summary.json, decisions.jsonl (one decision a line, written at once),
+    report.html (open it in a browser) and requests.jsonl (for `aicvds replay`). The losses are those that the beacons
+    told of. Ctrl-C and SIGTERM still write the report of the steps flown. The environment variable AICVDS_API_KEY
     has the key for an edge that needs one. It needs the extra `mavlink`: pip install 'aic-vds[mavlink]'. Exit code: 0
     flown, 1 no vehicle, 2 bad use, 130 interrupted.
     """
@@ -106,10 +108,11 @@ class Fly:
 
 def main(argv: list[str]) -> int:
     """Run ``aicvds fly``; returns the exit code."""
-    return command_main(Fly, "aicvds fly", argv, fly)
+    command = shlex.join(["aicvds", "fly", *argv])
+    return command_main(Fly, "aicvds fly", argv, lambda options, console: fly(options, command, console))
 
 
-def fly(options: Fly, console: Console) -> int:
+def fly(options: Fly, command: str, console: Console) -> int:
     """Fly, write, print; returns the exit code.
 
     Raises:
@@ -127,7 +130,7 @@ def fly(options: Fly, console: Console) -> int:
         flown, code = cut.flown, INTERRUPTED
         console.print("interrupted; the UAVs are on their missions", highlight=False)
     if flown is not None:
-        show(flown, job, console)
+        conclude(flown, job, command, console)
     return code
 
 
@@ -142,7 +145,7 @@ def job_of(options: Fly) -> FieldJob:
     require_mavsdk()
     site = flown_site(options)
     from simulator.vehicles.field_run import FieldJob
-    from simulator.vehicles.radio import radio_named
+    from simulator.vehicles.radio import SIMULATED, radio_named
 
     step_s = site.scenario.step_s / options.speedup
     patience_s = min(MOST_PATIENCE_S, step_s / 2) if options.patience_s is None else options.patience_s
@@ -157,6 +160,7 @@ def job_of(options: Fly) -> FieldJob:
         edge=edge,
         mission_id=mission_id,
         out=out,
+        seed=options.seed if options.radio == SIMULATED else None,
         mode=options.mode,
         deadline_ms=in_time_ms if options.deadline_ms is None else options.deadline_ms,
         patience_s=patience_s,
@@ -195,28 +199,30 @@ def flown_site(options: Fly) -> Site:
     return site
 
 
-def show(flown: Flown, job: FieldJob, console: Console) -> None:
-    """Print the sums of a flight."""
-    from simulator.records.statistics import percentile
-    from simulator.records.summary import is_late
+def conclude(flown: Flown, job: FieldJob, command: str, console: Console) -> None:
+    """Write a flight's summary and report, and print its outcome; raises ``UsageError``: the folder is unusable."""
+    from simulator.flying.run import write_results
+    from simulator.records.real_uavs import RealUavs, sums_by_uav
+    from simulator.records.summary import summarise
     from simulator.vehicles.simulated_radio import SimulatedRadio
 
-    decisions = flown.decisions
-    by = ", ".join(f"{count} {name}" for name, count in Counter(d.source for d in decisions).most_common()) or "none"
-    late = flown.late + sum(is_late(d) for d in decisions)
-    packets, failed = sum(d.collected for d in decisions), sum(d.failed for d in decisions)
-    lines = [
-        f"{len(decisions)} decisions: {by}; {late} late.",
-        f"{packets} packets collected, {failed} transfers failed.",
-    ]
-    trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
-    if trips:
-        lines.append(f"Round trip: p50 {percentile(trips, 50):.0f} ms, p99 {percentile(trips, 99):.0f} ms.")
-    if isinstance(job.radio, SimulatedRadio):
-        lines.append(f"{job.radio.lost} packets lost by the simulated sensors.")
-    lines += [f"{count} waypoints without a decision: {why}." for why, count in flown.untold.most_common()]
-    if flown.disobeyed:
-        lines.append(f"{len(flown.disobeyed)} commands not carried out; the last: {flown.disobeyed[-1]}.")
-    lines += [f"Wrote {job.out / name}" for name in (DECISIONS, REQUESTS)]
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    facts = flown.facts(
+        policy="edge",
+        edge=job.edge,
+        uplink="full",
+        mission_id=job.mission_id,
+        mode=flown.mode,
+        model=None,
+        deadline_ms=job.deadline_ms,
+        command=command,
+    ).model_copy(update={"seed": job.seed, "uavs": len(job.mavlink)})
+    tallies = {"aic_vds": flown.tally}
+    real = RealUavs(
+        uavs=sums_by_uav(flown.decisions),
+        late=flown.late,
+        undecided=dict(flown.untold.most_common()),
+        not_carried_out=flown.disobeyed,
+        simulated_lost=job.radio.lost if isinstance(job.radio, SimulatedRadio) else None,
+    )
+    summary = summarise(facts, flown.decisions, tallies).model_copy(update={"real_uavs": real})
+    write_results(job.out, summary, flown, tallies, console)

@@ -28,12 +28,13 @@ from simulator.world.sensors import Sensors
 class Flight:
     """The whole steps of a mission that were flown.
 
-    ``decisions`` are in order of step and UAV. ``tally`` has one entry a step. ``sensor_xy`` has shape (J, 2), metres.
-    ``track`` has the true state before the first step and after each.
+    ``seed`` is ``None`` where the sensors are real. ``decisions`` are in order of step and UAV. ``tally`` has one entry
+    a step. ``sensor_xy`` has shape (J, 2), metres. ``track`` has the true state before the first step and after each,
+    as far as it is known.
     """
 
     scenario: Scenario
-    seed: int
+    seed: int | None
     decisions: list[Decision] = field(default_factory=list)
     tally: list[StepTally] = field(default_factory=list)
     sensor_xy: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))

@@ -6,7 +6,7 @@ import os
 import secrets
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ from simulator.records.decision_log import DecisionLog
 from simulator.records.operator import Operator, recounted
 from simulator.records.request_log import RequestLog, resolved
 from simulator.records.run_folder import DECISIONS, FIGURES, REPORT, REQUESTS, SUMMARY, fresh_folder, naming_out
-from simulator.records.summary import BySource, Summary, sources_text, summarise
+from simulator.records.summary import BySource, Summary, Tally, sources_text, summarise
 from simulator.sites.site import Site
 
 # The world and matplotlib take a second to import; `--help` and usage errors do without them.
@@ -319,14 +319,25 @@ def _conclude(
     )
     flown = summarise(facts, flight.decisions, tallies).model_copy(update={"operator": operator})
     summary = _bounded(job, flight, flown, console)
-    with console.status("Drawing the report"), naming_out(job.out):
-        (job.out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    write_results(job.out, summary, flight, tallies, console)
+    return INTERRUPTED if flight.interrupted else 0
+
+
+def write_results(
+    out: Path, summary: Summary, flight: Flight, tallies: Mapping[str, Sequence[Tally]], console: Console
+) -> None:
+    """Write a flight's summary and report beside its log, and print its outcome and the files' names.
+
+    Raises:
+        UsageError: the folder cannot be written.
+    """
+    with console.status("Drawing the report"), naming_out(out):
+        (out / SUMMARY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
         from simulator.reporting.html_report import write_report
         from simulator.reporting.terminal_table import show
 
         world = (flight.sensor_xy, flight.track)
-        write_report(job.out / REPORT, summary, job.site.scenario, flight.decisions, tallies, *world)
+        write_report(out / REPORT, summary, flight.scenario, flight.decisions, tallies, *world)
     show(summary, console)
-    for name in (SUMMARY, DECISIONS, REPORT, FIGURES, *((REQUESTS,) if job.edge else ())):
-        console.print(f"Wrote {job.out / name}", markup=False, highlight=False, soft_wrap=True)
-    return INTERRUPTED if flight.interrupted else 0
+    for name in (SUMMARY, DECISIONS, REPORT, FIGURES, *((REQUESTS,) if summary.edge else ())):
+        console.print(f"Wrote {out / name}", markup=False, highlight=False, soft_wrap=True)

@@ -7,9 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Protocol
 
+from pydantic import Field
+
 from shared.wire import Tokens, Uplink
 from simulator.records.decision import Decision, queried_llm
 from simulator.records.operator import Operator
+from simulator.records.real_uavs import RealUavs
 from simulator.records.record import Record
 from simulator.records.statistics import jain_index, mean, percentile, visits_per_sensor
 
@@ -73,13 +76,13 @@ class LossBound(Record):
 class FlightFacts(Record):
     """The facts of a mission beyond its decisions.
 
-    ``steps`` is the planned and ``steps_flown`` the actual number of steps. ``policy`` is ``edge`` or a local policy's
-    name. ``deadline_ms`` is the last deadline that the edge reported, or the requested one. ``uplink`` is ``null``
-    without an edge.
+    ``seed`` is ``null`` where the sensors are real. ``steps`` is the planned and ``steps_flown`` the actual number of
+    steps. ``policy`` is ``edge`` or a local policy's name. ``deadline_ms`` is the last deadline that the edge reported,
+    or the requested one. ``uplink`` is ``null`` without an edge.
     """
 
     scenario: str
-    seed: int
+    seed: int | None
     steps: int
     steps_flown: int
     uavs: int
@@ -108,7 +111,8 @@ class Summary(FlightFacts):
     ``uplink_bytes_mean`` is the mean size of a request, ``attention_bytes_mean`` the mean size of the attention weights
     that a UAV fetched for its decision. ``trust`` is the mean weight of each adviser over the decisions of source
     ``guided``. ``bound`` is ``null`` where ``bound_missing`` says why. ``operator`` is ``null`` without a note and
-    orders.
+    orders. ``real_uavs`` is left out of a simulated mission; with it, losses are those that beacons told of, and
+    ``uavs`` are those of one command.
     """
 
     decisions: int
@@ -128,6 +132,7 @@ class Summary(FlightFacts):
     bound: LossBound | None = None
     bound_missing: str | None = None
     operator: Operator | None = None
+    real_uavs: RealUavs | None = Field(None, exclude_if=lambda value: value is None)
 
 
 class Tally(Protocol):

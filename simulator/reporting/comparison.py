@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from simulator.errors import UsageError
 from simulator.records.run_folder import FIGURES, SUMMARY
 from simulator.records.summary import Summary
-from simulator.reporting.wording import deciders_text, number
+from simulator.reporting.wording import deciders_text, number, world_text
 
 # The figures of a mission's report, in its order, with their titles.
 TITLES = {
@@ -60,7 +60,7 @@ def read_run(folder: Path) -> Run:
 
 # fmt: off
 ROWS: dict[str, Callable[[Run], str]] = {
-    "world": lambda run: f"{run.summary.scenario}, seed {run.summary.seed}",
+    "world": lambda run: world_text(run.summary),
     "steps flown": lambda run: f"{run.summary.steps_flown} of {run.summary.steps}",
     "policy, mode": lambda run: run.summary.policy + (f", {run.summary.mode}" if run.summary.mode else ""),
     "LLM": lambda run: run.summary.model or "–" if run.summary.mode in (None, "guided", "llm") else "–",
@@ -89,6 +89,8 @@ def rows(runs: Sequence[Run]) -> dict[str, list[str]]:
 def caution(runs: Sequence[Run]) -> str:
     """What the losses of these runs can be compared for."""
     worlds = {(run.summary.scenario, run.summary.seed, run.summary.steps_flown) for run in runs}
+    if any(run.summary.real_uavs is not None for run in runs):
+        return "Real UAVs know only the losses that beacons told them of, so these losses cannot be compared."
     if len(worlds) > 1:
         return "These missions flew different worlds or numbers of steps, so their losses cannot be compared."
     return "One world is an example, not a result: docs/results.md compares over many."

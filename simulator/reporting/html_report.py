@@ -21,12 +21,14 @@ from simulator.reporting.playback import Playback, playback
 from simulator.reporting.wording import (
     ADVISERS,
     bound_text,
+    late_text,
     llm_notice,
     number,
     orders_text,
     percent,
     policy_labels,
     verdict,
+    world_text,
 )
 
 COSTLIEST_DECISIONS = 15
@@ -86,6 +88,8 @@ def render_report(
         ours=next(iter(summary.lost_packets)),
         labels=labels,
         verdict=verdict(summary),
+        world=world_text(summary),
+        late=late_text(summary),
         bound=bound_text(summary),
         orders=orders_text(summary),
         advisers={name: ADVISERS.get(name, name) for name in summary.trust},

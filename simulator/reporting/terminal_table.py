@@ -5,21 +5,34 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Table
 
+from simulator.records.real_uavs import RealUavs
 from simulator.records.summary import Summary
-from simulator.reporting.wording import bound_text, deciders_text, llm_notice, orders_text, policy_labels
+from simulator.reporting.wording import (
+    bound_text,
+    deciders_text,
+    late_text,
+    llm_notice,
+    number,
+    orders_text,
+    policy_labels,
+    world_text,
+)
 
 
 def show(summary: Summary, console: Console) -> None:
     """Print the outcome beside those of EOF and WQCS, and the sources of the decisions."""
-    steps = f"{summary.steps_flown} of {summary.steps} steps" if summary.interrupted else f"{summary.steps} steps"
-    table = Table(title=f"Scenario {summary.scenario}, seed {summary.seed}, {steps}")
+    whole = summary.steps_flown == summary.steps and not summary.interrupted
+    steps = f"{summary.steps} steps" if whole else f"{summary.steps_flown} of {summary.steps} steps"
+    table = Table(title=f"Scenario {world_text(summary)}, {steps}")
     table.add_column("policy")
-    table.add_column("lost packets", justify="right")
+    table.add_column("lost packets" if summary.real_uavs is None else "lost packets heard of", justify="right")
     table.add_column("loss events", justify="right")
     labels = policy_labels(summary)
     for name, lost in summary.lost_packets.items():
         table.add_row(labels[name], f"{lost:,}", f"{summary.loss_events[name]:,}")
     console.print(table)
+    if summary.real_uavs is not None:
+        _show_real_uavs(summary, summary.real_uavs, console)
     if (notice := llm_notice(summary)) is not None:
         console.print(
             notice, style="yellow" if summary.mode == "llm" else None, markup=False, highlight=False, soft_wrap=True
@@ -45,3 +58,26 @@ def show(summary: Summary, console: Console) -> None:
             f"{tokens.state_uncompressed_mean:.0f}{cached}",
             soft_wrap=True,
         )
+
+
+def _show_real_uavs(summary: Summary, real: RealUavs, console: Console) -> None:
+    """Print each UAV's sums, what was late, and what did not go as decided."""
+    table = Table(title="UAVs")
+    table.add_column("UAV")
+    for column in ("decisions", "collected", "failed", "lost in range", "round trip, ms"):
+        table.add_column(column, justify="right")
+    for one in real.uavs:
+        sums = (one.decisions, one.collected, one.failures, one.lost_packets)
+        table.add_row(str(one.uav_id), *(f"{count:,}" for count in sums), number(one.rtt_ms, 0))
+    lost = sum(summary.lost_packets.values())
+    whole = (summary.decisions, sum(one.collected for one in real.uavs), summary.failures, lost)
+    table.add_row("all", *(f"{count:,}" for count in whole), number(summary.rtt_ms.p50, 0), style="bold")
+    console.print(table)
+    lines = [late_text(summary)]
+    if real.simulated_lost is not None:
+        lines.append(f"The simulated sensors lost {real.simulated_lost:,} packets, with those that no UAV heard of.")
+    lines += [f"{count} waypoints without a decision: {why}." for why, count in real.undecided.items()]
+    if real.not_carried_out:
+        lines.append(f"{len(real.not_carried_out)} commands not carried out; the last: {real.not_carried_out[-1]}.")
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -18,6 +18,11 @@ NAMES = {
 ADVISERS = {"llm": "LLM", "planner": "planner", "value": "learned values", "policy": "look-ahead"}
 
 
+def world_text(summary: Summary) -> str:
+    """The world that was flown: ``paper, seed 0``; real sensors have no seed."""
+    return summary.scenario + (", real sensors" if summary.seed is None else f", seed {summary.seed}")
+
+
 def deciders_text(summary: Summary) -> str:
     """The sources of the decisions, and the adviser that weighed most: ``87 guided (planner 97%), 3 policy``."""
     leading = next(iter(summary.trust.items()), None)
@@ -78,6 +83,8 @@ def verdict(summary: Summary) -> str:
     if not summary.steps_flown:
         return "Nothing was flown, so there is nothing to compare."
     name, *others = summary.lost_packets
+    if summary.real_uavs is not None:
+        return f"The UAVs heard that sensors lost {_packets(summary.lost_packets[name])} in this flight."
     labels = {**dict(zip(summary.lost_packets, summary.lost_packets, strict=True)), **NAMES}
     lost, rivals = summary.lost_packets[name], [summary.lost_packets[other] for other in others]
     outcome = f"In this one example {labels[name]} lost {_packets(lost)}"
@@ -115,6 +122,16 @@ def orders_text(summary: Summary) -> str | None:
     if not summary.operator.orders:
         return "No order of the operator was in force at the end: none was confirmed, or the last were withdrawn."
     return f"The fleet obeyed the operator's orders, which may cost packets: {summary.operator.orders}"
+
+
+def late_text(summary: Summary) -> str | None:
+    """The late decisions of real UAVs; ``None`` for a simulated mission, whose steps wait for the decisions."""
+    if summary.real_uavs is None:
+        return None
+    return (
+        f"Late: {summary.real_uavs.late} decisions after their waypoint's step, {summary.late} after their deadline + "
+        "50 ms."
+    )
 
 
 def _packets(count: int) -> str:

@@ -7,33 +7,39 @@ told its speed for the next ``step_s`` seconds. At their end it collects from th
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from shared.wire import Mode
 from simulator.errors import VehicleError
-from simulator.flying.flight import exchange_fields
+from simulator.flying.flight import Flight, exchange_fields
 from simulator.flying.pilots import Choice
 from simulator.records.decision import Decision
 from simulator.sites.site import Site
 from simulator.vehicles.field_pilot import FieldPilot
 from simulator.vehicles.field_uav import FieldUav
+from simulator.vehicles.heard_beacons import LossCounters
 from simulator.vehicles.mission_clock import Clock, MissionClock
-from simulator.vehicles.radio import Radio, Spot
+from simulator.vehicles.radio import Collected, Radio, Spot
+from simulator.world import StepTally
 
 
 @dataclass
-class Flown:
-    """A flight so far.
+class Flown(Flight):
+    """A flight so far. Its ``tally`` counts a sensor's losses once, when a UAV hears of them; its ``track`` is empty.
 
     Attributes:
-        decisions: with their outcomes, in the order of step and UAV.
+        mode: the mission's at the edge; ``None`` where neither the command nor the edge said it.
         late: decisions that came after their step.
         untold: waypoints at which a UAV was told nothing, by the reason.
         disobeyed: texts of the commands that a vehicle did not carry out.
     """
 
-    decisions: list[Decision] = field(default_factory=list)
+    mode: Mode | None = None
     late: int = 0
     untold: Counter[str] = field(default_factory=Counter)
     disobeyed: list[str] = field(default_factory=list)
@@ -71,15 +77,17 @@ class FieldFlight:
         on_decision: Callable[[Decision], None] = lambda decision: None,
         on_event: Callable[[int, str], None] = lambda uav, text: None,
     ) -> None:
-        self.flown = Flown()
+        self.flown = Flown(site.scenario, None, sensor_xy=np.array(site.scenario.sites))
         self._scenario, self._uavs, self._radio, self._pilot = site.scenario, uavs, radio, pilot
         self._clock = clock or MissionClock()
         self._on_decision, self._on_event = on_decision, on_event
         self._away: dict[int, str | None] = {}
+        self._counters = LossCounters()
 
     async def fly(self) -> Flown:
         """Fly the steps, or until every UAV has landed. A cancelled flight ends like a flown one, and then raises."""
         legs: list[_Leg] = []
+        took_off = time.monotonic()
         step_s, began = self._scenario.step_s, self._clock.now()
         try:
             await self._look(step_s)
@@ -98,6 +106,8 @@ class FieldFlight:
         finally:
             # If the flight is cut short, the outcomes of its last decisions stay unknown.
             await self._end()
+            self.flown.mode = self._pilot.mode
+            self.flown.duration_s = time.monotonic() - took_off
         return self.flown
 
     async def _look(self, seconds: float) -> None:
@@ -131,7 +141,7 @@ class FieldFlight:
             if leg.uav.away == "the link is lost":
                 leg.uav.expect(leg.choice.velocity, self._scenario.step_s)
             collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
-        lost = await self._listen(step + 1)
+        lost, grown = await self._listen(step + 1)
         for leg in legs:
             got, index = collected[leg.uav.index], leg.uav.index
             cost = float(got.failed) + lost[index] / self._scenario.queue_capacity
@@ -152,11 +162,34 @@ class FieldFlight:
             )
             self.flown.decisions.append(decision)
             self._on_decision(decision)
+        self.flown.tally.append(self._tally(step, legs, collected, grown))
 
-    async def _listen(self, step: int) -> dict[int, int]:
-        """Hear the sensors in range of each UAV; returns the packets that they lost since that UAV last heard them."""
+    def _tally(
+        self, step: int, legs: Sequence[_Leg], collected: Mapping[int, Collected], lost: Mapping[int, int]
+    ) -> StepTally:
+        packets = np.zeros(self._scenario.sensors, dtype=np.int64)
+        for leg in legs:
+            packets[leg.choice.sensor] += collected[leg.uav.index].packets
+        return StepTally(
+            step=step,
+            failures=sum(got.failed for got in collected.values()),
+            overflows=sum(count > 0 for count in lost.values()),
+            lost_packets=sum(lost.values()),
+            collected=packets,
+        )
+
+    async def _listen(self, step: int) -> tuple[dict[int, int], dict[int, int]]:
+        """Hear the sensors in range of each UAV.
+
+        Returns the packets that they lost: by UAV, since that UAV last heard them; by sensor, since any UAV did.
+        """
         heard = {uav.index: await self._radio.beacons(uav.spot(step)) for uav in self._uavs}
-        return {uav.index: uav.heard.hear(step, heard[uav.index]) for uav in self._uavs}
+        counters: dict[int, int] = {}
+        for beacons in heard.values():
+            for sensor, beacon in beacons.items():
+                counters[sensor] = max(beacon.lost, counters.get(sensor, 0))
+        own = {uav.index: uav.heard.hear(step, heard[uav.index]) for uav in self._uavs}
+        return own, self._counters.grow(counters)
 
     async def _end(self) -> None:
         """Let the UAVs go on with their missions, and send the last outcomes."""

@@ -29,6 +29,7 @@ class FieldPilot:
 
     Attributes:
         spec: the mission to make at the edge.
+        mode: the mission's, as far as this command or the edge has said it.
         on_request: called with each request before it is sent.
         last_error: the text of the last failure of asking the edge.
         outcomes_told: the number of outcomes that the edge has taken.
@@ -44,6 +45,7 @@ class FieldPilot:
         deadline_ms: int | None = None,
     ) -> None:
         self.spec = MissionSpec(scenario=scenario, mode=mode)
+        self.mode = mode
         self.on_request: Callable[[DecideRequest], None] = lambda request: None
         self.last_error: str | None = None
         self.outcomes_told = 0
@@ -76,7 +78,7 @@ class FieldPilot:
             )
         if self.spec.mode is not None and there.mode != self.spec.mode:
             raise UsageError(f"--mission {self._mission_id}: the edge has it in mode {there.mode}; leave out --mode")
-        self._joined = True
+        self._joined, self.mode = True, there.mode
         return there
 
     async def decide(self, observations: Mapping[int, Observation]) -> dict[int, Choice]:

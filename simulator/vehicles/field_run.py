@@ -32,7 +32,11 @@ from simulator.vehicles.uploaded_path import check_uploaded
 
 @dataclass(frozen=True)
 class FieldJob:
-    """A flight to conduct: ``mavlink`` has the connections of UAVs ``first_uav`` and the ones after it."""
+    """A flight to conduct.
+
+    ``mavlink`` has the connections of UAVs ``first_uav`` and the ones after it. ``seed`` is the simulated sensors';
+    ``None`` for real ones.
+    """
 
     site: Site
     radio: Radio
@@ -41,6 +45,7 @@ class FieldJob:
     edge: str
     mission_id: str
     out: Path
+    seed: int | None
     mode: Mode | None
     deadline_ms: int
     patience_s: float
@@ -85,6 +90,8 @@ async def conduct_field(job: FieldJob) -> Flown:
                     tell(f"the edge's last failure: {pilot.last_error}")
                 return flown
     except asyncio.CancelledError:
+        if flight is not None:
+            flight.flown.interrupted = True
         raise FlightCut(None if flight is None else flight.flown) from None
 
 

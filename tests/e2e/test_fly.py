@@ -14,6 +14,8 @@ import pytest
 from simulator.commands.replay import logged_mission
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
+from simulator.records.real_uavs import sums_by_uav
+from simulator.records.summary import Summary
 from simulator.sites.plans.plan_folder import export_plans
 from tests.e2e.processes import serving_edge, started
 from tests.simulator.edge_stub import free_port
@@ -89,6 +91,31 @@ def test_every_waypoint_is_decided_though_the_edge_is_gone_for_twenty_seconds(tm
     assert {d.source for d in decisions if d.step >= 25} >= {"policy"}, "the edge decides again"
     assert len(logged_mission(tmp_path / "out").decisions) == STEPS * UAVS
     check_wire(peers, decisions)
+    check_report(tmp_path / "out", decisions, told)
+
+
+def check_report(out: Path, decisions: list[Decision], told: str) -> None:
+    """Summary, page and terminal agree with the log."""
+    summary = Summary.model_validate_json((out / "summary.json").read_bytes())
+    assert (summary.steps_flown, summary.decisions, summary.uavs, summary.mode) == (STEPS, STEPS * UAVS, UAVS, "policy")
+    onboard = sum(d.source == "onboard" for d in decisions)
+    assert summary.by_source.onboard == onboard and summary.by_source.policy == STEPS * UAVS - onboard
+    real = summary.real_uavs
+    assert real is not None and real.uavs == sums_by_uav(decisions)
+    # Each UAV's share has what it heard of; the whole has each packet once, and no more than the sensors lost.
+    lost = summary.lost_packets["aic_vds"]
+    assert real.simulated_lost is not None and lost <= real.simulated_lost
+    assert max(one.lost_packets for one in real.uavs) <= lost <= sum(one.lost_packets for one in real.uavs)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert 'id="uavs"' in page and "WQCS fly at a constant" not in page and f"Late: {real.late} decisions" in page
+    assert {path.name for path in (out / "figures").glob("*.svg")} == {
+        f"{name}.svg" for name in ("losses", "visits", "latency-map", "latency-steps", "deciders")
+    }
+    assert f"The UAVs heard that sensors lost {lost:,} packet" in page
+    printed = " ".join(told.split())
+    assert f"Late: {real.late} decisions after their waypoint's step" in printed
+    assert f"{STEPS * UAVS} decisions: " in printed and "Round trip: median" in printed
+    assert f"Wrote {out / 'report.html'}" in printed
 
 
 def check_wire(peers: list[PymavlinkPeer], decisions: list[Decision]) -> None:

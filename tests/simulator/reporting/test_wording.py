@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+from io import StringIO
+from pathlib import Path
+
 import pytest
+from rich.console import Console
 
 from shared.scenario import Scenario
 from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import LocalPilot
 from simulator.records.operator import Operator
+from simulator.records.real_uavs import RealUavs, sums_by_uav
 from simulator.records.summary import BySource, LossBound, Summary, summarise
-from simulator.reporting.wording import bound_text, deciders_text, llm_notice, number, orders_text, percent, verdict
+from simulator.reporting.comparison import Run, caution
+from simulator.reporting.terminal_table import show
+from simulator.reporting.wording import (
+    bound_text,
+    deciders_text,
+    late_text,
+    llm_notice,
+    number,
+    orders_text,
+    percent,
+    verdict,
+    world_text,
+)
 from simulator.sites.site import Site
 
 SHORT = Scenario(steps=5)
@@ -32,6 +49,38 @@ def flight() -> Flight:
         for n, d in enumerate(flown.decisions)
     ]
     return flown
+
+
+def test_real_uavs_claim_only_what_they_heard(flight: Flight, tmp_path: Path) -> None:
+    simulated = summary_of(flight, None)
+    assert "real_uavs" not in simulated.model_dump_json() and late_text(simulated) is None
+    real = RealUavs(
+        uavs=sums_by_uav(flight.decisions), late=2, undecided={"it lands": 3}, not_carried_out=["UAV 1 denied"],
+        simulated_lost=None,
+    )  # fmt: skip
+    changes = {
+        "real_uavs": real,
+        "seed": None,
+        "steps_flown": 4,
+        "lost_packets": {"aic_vds": 1},
+        "loss_events": {"aic_vds": 1},
+    }
+    summary = Summary.model_validate_json(simulated.model_copy(update=changes).model_dump_json())
+    assert summary.real_uavs == real and world_text(summary) == "paper, real sensors"
+    assert verdict(summary) == "The UAVs heard that sensors lost 1 packet in this flight."
+    assert "these losses cannot be compared" in caution([Run(tmp_path, simulated), Run(tmp_path, summary)])
+    console = Console(width=120, file=StringIO())
+    show(summary, console)
+    assert isinstance(console.file, StringIO)
+    shown = console.file.getvalue()
+    for text in (
+        "4 of 5 steps",
+        "lost packets heard of",
+        "Late: 2 decisions",
+        "3 waypoints without a decision: it lands",
+    ):
+        assert text in shown
+    assert "1 commands not carried out; the last: UAV 1 denied." in shown and "simulated sensors" not in shown
 
 
 def test_the_verdict_ranks(flight: Flight) -> None:

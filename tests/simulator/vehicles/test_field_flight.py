@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,13 @@ from shared.wire import DecideRequest
 from simulator.client import AsyncEdgeClient, EdgeClient
 from simulator.errors import UsageError, VehicleError
 from simulator.records.decision import Decision
+from simulator.records.real_uavs import sums_by_uav
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.site import Site
 from simulator.vehicles.field_flight import FieldFlight, Flown
 from simulator.vehicles.field_pilot import FieldPilot
 from simulator.vehicles.field_uav import FieldUav
-from simulator.vehicles.radio import Beacon, Collected, Spot, radio_named
+from simulator.vehicles.radio import Beacon, Collected, Radio, Spot, radio_named
 from simulator.vehicles.simulated_radio import SimulatedRadio
 from tests.conftest import Edge
 from tests.simulator.edge_stub import free_port
@@ -32,12 +34,12 @@ STEPS = 12
 class Trial:
     """Three stub vehicles over the example's sensors."""
 
-    def __init__(self, wind: float = 1.0) -> None:
-        self.site: Site = site_from_folder(EXAMPLE, STEPS)
+    def __init__(self, wind: float = 1.0, steps: int = STEPS) -> None:
+        self.site: Site = site_from_folder(EXAMPLE, steps)
         self.clock = SimulatedClock()
         self.vehicles = [StubVehicle(self.site, uav, self.clock, wind) for uav in range(3)]
         self.uavs = [FieldUav(uav, vehicle, self.site) for uav, vehicle in enumerate(self.vehicles)]
-        self.radio = SimulatedRadio(self.site, seed=0)
+        self.radio: Radio = SimulatedRadio(self.site, seed=0)
         self.events: list[tuple[int, str]] = []
         self.requests: list[DecideRequest] = []
         self.last_error: str | None = None
@@ -75,12 +77,49 @@ async def test_the_edge_decides_every_waypoint_and_hears_every_outcome(edge: Edg
         status = operator.mission("field")
     assert (status.decisions, status.feedback) == (3 * STEPS, 3 * STEPS)
     assert sum(d.collected for d in flown.decisions) > 0 and flown.late == 0 and not flown.untold
+    assert flown.mode == "policy" and flown.steps_flown == STEPS
+    assert isinstance(trial.radio, SimulatedRadio)
+    assert sum(t.lost_packets for t in flown.tally) <= trial.radio.lost
     for uav, vehicle in enumerate(trial.vehicles):
         own = [d for d in flown.decisions if d.uav_id == uav]
         assert [told for told in vehicle.told if isinstance(told, float)] == [d.velocity for d in own if d.velocity]
         assert vehicle.mode == "mission"
         for decision in own:
             assert trajectories(trial.site.scenario)[uav].locate(decision.position)[1] < 0.1
+
+
+class Counting:
+    """Sensors 0 and 1 with scripted counters of lost packets, by step; UAV 1 hears sensor 1 alone."""
+
+    def __init__(self, counters: Sequence[tuple[int, int]]) -> None:
+        self.counters = counters
+
+    async def beacons(self, spot: Spot) -> dict[int, Beacon]:
+        counted = enumerate(self.counters[spot.step])
+        return {j: Beacon(30, 40.0, -90.0, lost) for j, lost in counted if spot.uav == 0 or j == 1}
+
+    async def collect(self, spot: Spot, sensor: int) -> Collected:
+        return Collected(5, failed=spot.uav == 1)
+
+
+async def test_what_a_sensor_lost_counts_once_and_from_its_first_beacon_on() -> None:
+    trial = Trial(steps=4)
+    trial.uavs = trial.uavs[:2]
+    # In the third step sensor 1 starts again: its counter falls, and no loss is negative.
+    trial.radio = Counting([(100, 7), (103, 9), (103, 9), (103, 0), (103, 4)])
+    flown = await trial.fly(nobody(), attempts=1)
+    assert [(t.lost_packets, t.overflows, t.failures) for t in flown.tally] == [
+        (5, 2, 1),
+        (0, 0, 1),
+        (0, 0, 1),
+        (4, 1, 1),
+    ]
+    assert [d.lost_packets for d in flown.decisions] == [5, 2, 0, 0, 0, 0, 4, 4]
+    assert all(int(t.collected.sum()) == 10 for t in flown.tally)
+    assert [(u.uav_id, u.decisions, u.collected, u.failures, u.lost_packets) for u in sums_by_uav(flown.decisions)] == [
+        (0, 4, 20, 0, 9),
+        (1, 4, 20, 4, 6),
+    ]
 
 
 async def test_an_edge_that_forgot_the_mission_decides_on(edge: Edge) -> None:

@@ -15,6 +15,7 @@ from simulator.client import EdgeClient
 from simulator.commands.replay import logged_mission
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
+from simulator.records.summary import Summary
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.plan_folder import export_plans
 from simulator.vehicles.field_run import FieldJob, conduct_field
@@ -62,7 +63,8 @@ def patient_job(port: int, edge: str, out: Path, steps: int) -> FieldJob:
     site = site_from_folder(EXAMPLE, steps)
     return FieldJob(
         site=site, radio=SimulatedRadio(site, seed=0), mavlink=(f"udpin://127.0.0.1:{port}",), first_uav=0, edge=edge,
-        mission_id="m", out=out, mode=None, deadline_ms=60_000, patience_s=PATIENCE_S, speedup=20.0, wait_s=PATIENCE_S,
+        mission_id="m", out=out, seed=0, mode=None, deadline_ms=60_000, patience_s=PATIENCE_S, speedup=20.0,
+        wait_s=PATIENCE_S,
     )  # fmt: skip
 
 
@@ -193,7 +195,11 @@ def test_sigterm_leaves_the_vehicle_on_its_mission(
         process.terminate()
         assert process.wait(60) == 130
         assert peer.airframe.mode == "mission"
-    assert len(logged_mission(tmp_path).decisions) >= 3
+    logged = logged_mission(tmp_path).decisions
+    assert len(logged) >= 3
+    summary = Summary.model_validate_json((tmp_path / "summary.json").read_bytes())
+    assert summary.interrupted and summary.steps_flown == summary.decisions == len(logged) < summary.steps
+    assert "The mission was interrupted after step" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_mission_that_is_not_the_worlds_is_refused(missions: list[list[Item]], port: int, tmp_path: Path) -> None:
