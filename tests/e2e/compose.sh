@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Builds the containers, flies the paper's mission in them, and checks what came of it. Needs a Docker engine, Compose
-# (either one) and python3; fails without them. Prometheus and PostgreSQL are Debian's packages in images made here, unless
-# PROMETHEUS_IMAGE and POSTGRES_IMAGE name others. What needs other images (profiles grafana, llama, vllm, ollama, mqtt) is only
-# read.
+# (either one) and python3; fails without them. Prometheus, PostgreSQL and mosquitto are Debian's packages in images made
+# here, unless PROMETHEUS_IMAGE, POSTGRES_IMAGE and MOSQUITTO_IMAGE name others. What needs other images (profiles grafana,
+# llama, vllm, ollama) is only read.
 #   compose.sh          all of it
 #   compose.sh build    the images alone, which the engine then has for the whole run
 set -euo pipefail
@@ -34,7 +34,7 @@ docker buildx version >/dev/null 2>&1 || export DOCKER_BUILDKIT=0 COMPOSE_DOCKER
 # Neither this shell's settings nor a .env in the checkout take part, and ports are whatever is free.
 build_network=${AICVDS_BUILD_NETWORK:-default}
 unset "${!AICVDS_@}"
-export AICVDS_BUILD_NETWORK=$build_network AICVDS_PORT=0 PROMETHEUS_PORT=0
+export AICVDS_BUILD_NETWORK=$build_network AICVDS_PORT=0 PROMETHEUS_PORT=0 MOSQUITTO_PORT=0
 : >"$WORK/env"
 COMPOSE+=(--project-name "$PROJECT" --env-file "$WORK/env")
 compose() { "${COMPOSE[@]}" "$@"; }
@@ -46,7 +46,7 @@ clean_up() {
     compose logs --no-color --tail 40 >&2 || true
   fi
   docker rm --force "$OFFLINE" >/dev/null 2>&1 || true
-  compose --profile postgres down --volumes --remove-orphans >/dev/null 2>&1 || true
+  compose --profile postgres --profile mqtt down --volumes --remove-orphans >/dev/null 2>&1 || true
   rm -rf "$WORK"
   exit "$status"
 }
@@ -115,10 +115,21 @@ CMD ["bash", "-ec", "\
 DOCKERFILE
   say "Debian's PostgreSQL is built"
 fi
-compose --profile postgres down --volumes --remove-orphans >/dev/null 2>&1 || true
+if [[ -z ${MOSQUITTO_IMAGE:-} ]]; then
+  # The official image's programs, and its command without the script before it, which only root's container needs.
+  export MOSQUITTO_IMAGE=aicvds-test-mosquitto
+  quietly docker build --network "$AICVDS_BUILD_NETWORK" --tag "$MOSQUITTO_IMAGE" - <<'DOCKERFILE'
+FROM python:3.11-slim-bookworm
+RUN apt-get update -q && apt-get install -y -q --no-install-recommends mosquitto mosquitto-clients && rm -rf /var/lib/apt/lists/*
+CMD ["/usr/sbin/mosquitto", "-c", "/mosquitto/config/mosquitto.conf"]
+DOCKERFILE
+  say "Debian's mosquitto is built"
+fi
+compose --profile postgres --profile mqtt down --volumes --remove-orphans >/dev/null 2>&1 || true
 for profile in grafana llama vllm ollama postgres mqtt; do quietly compose --profile "$profile" config; done
 say "Compose accepts the file with every profile"
-quietly compose build
+# `uplinks` is the edge's image under another name.
+quietly compose --profile mqtt build edge simulator uplinks
 say "edge and simulator are built"
 [[ $ONLY != build ]] || exit 0
 
@@ -169,6 +180,38 @@ for query in 'sum(aicvds_decisions_total)' 'sum(last_over_time(aicvds_flight_dec
 done
 [[ $(asked 'aicvds:edge:up') == 1 ]] || fail "Prometheus has not read the rules"
 say "/metrics counts 90 decisions, and Prometheus has scraped them from the edge and from the simulator"
+
+# --- sensors' uplinks ------------------------------------------------------------------------------------------------
+# As docs/lorawan.md says it, with the example's file: its second device is sensor 1 of mission `patrol`.
+quietly compose --profile mqtt up --detach --no-deps mosquitto uplinks
+docker exec "$edge" python -c '
+import json, urllib.request as u
+def ask(method, path, body):
+    u.urlopen(u.Request(f"http://127.0.0.1:8000{path}", json.dumps(body).encode(), {"Content-Type": "application/json"}, method=method))
+spec = json.load(u.urlopen("http://127.0.0.1:8000/openapi.json"))
+body = spec["paths"]["/decide"]["post"]["requestBody"]["content"]["application/json"]["examples"]["paper"]["value"]
+ask("PUT", "/missions/patrol", {"mode": "policy"})
+ask("POST", "/decide", body | {"mission_id": "patrol", "step": 1})'
+uplinks=$(container uplinks)
+for _ in {1..50}; do
+  [[ $(docker logs "$uplinks" 2>&1) == *"subscribed at"* ]] && break
+  sleep 0.2
+done
+application=ae5ba7f1-53a6-4f0e-9f3b-6f1f3a7c2b10 tenant=52f14cd4-c6f1-4fbd-8f87-4025e1d49242 device=0004a30b001c0531
+docker exec "$(container mosquitto)" mosquitto_pub --qos 1 --topic "application/$application/device/$device/event/up" \
+  --message '{"deduplicationId": "3ac7e3c4-4401-4b8d-9386-000000000001", "time": "'"$(date --utc +%Y-%m-%dT%H:%M:%S.%NZ)"'",
+    "deviceInfo": {"tenantId": "'$tenant'", "applicationId": "'$application'", "devEui": "'$device'"},
+    "fCnt": 1, "fPort": 1, "object": {"queue": 33}}' || fail "the broker refuses the uplink"
+merged() { fetch "$(published edge 8000)/metrics" | awk '/^aicvds_readings_total{result="merged"}/ {print int($NF)}'; }
+for _ in {1..50}; do
+  [[ $(merged) == 1 ]] && break
+  sleep 0.2
+done
+[[ $(merged) == 1 && $(fetch "$(published edge 8000)/missions/patrol") == *'"readings":1'* ]] ||
+  { docker logs "$uplinks" >&2; fail "the uplink is not in the mission's belief"; }
+result=$(stopped "$uplinks" compose --profile mqtt stop --timeout "$STOP_S" uplinks)
+compose --profile mqtt stop --timeout "$STOP_S" mosquitto >/dev/null 2>&1
+say "a sensor's uplink went through the broker into a mission's belief; its forwarder stopped: $result"
 
 # --- killed in mid-mission -------------------------------------------------------------------------------------------
 flown=$(answered)
@@ -254,7 +297,7 @@ say "an edge whose PostgreSQL came later found it, and its mission is there"
 # --- SIGTERM ---------------------------------------------------------------------------------------------------------
 result=$(stopped "$edge" compose stop --timeout "$STOP_S" edge)
 say "the edge stopped: $result"
-compose --profile postgres down --volumes >/dev/null 2>&1
+compose --profile postgres --profile mqtt down --volumes >/dev/null 2>&1
 
 # --- without a network -----------------------------------------------------------------------------------------------
 start_offline() { # as locked up as the compose file has it, and with no network at all
