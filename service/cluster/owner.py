@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 import socket
 from functools import partial
+from typing import TYPE_CHECKING
 
-from fastapi import FastAPI
-
-from service.api.app import create_app
 from service.api.merging import DECIDED_AT, Answer
 from service.cluster.exchange import Exchanged, answer_of
 from service.config.settings import Settings
 from service.observability import logs
 from service.server.server import Server
-from service.storage.store import Store
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 
 class Owner:
@@ -71,4 +71,8 @@ class Owner:
 
 
 def _application(settings: Settings) -> FastAPI:
+    # The ingress imports this module too, and needs no torch.
+    from service.api.app import create_app
+    from service.storage.store import Store
+
     return create_app(settings, Store(settings.store))

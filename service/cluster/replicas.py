@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable
 from hashlib import blake2b
 from importlib.metadata import version
@@ -12,6 +13,7 @@ from ray import serve
 from ray.exceptions import RayError
 from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.exceptions import RayServeException
+from ray.serve.schema import LoggingConfig
 
 from service.api.merging import Answer
 from service.cluster.exchange import Exchanged
@@ -78,6 +80,7 @@ def deployed(settings: Settings, host: str | None, least: int, most: int) -> Ser
     Raises:
         RayUnusable: replicas with other settings are there, or those that are to start cannot be loaded.
     """
+    logging.getLogger("ray.serve").setLevel(logging.WARNING)
     serve.start(proxy_location="Disabled")
     name = _NAME + _digest(settings, least, most)
     running = {known: app.status for known, app in serve.status().applications.items() if known.startswith(_NAME)}
@@ -95,6 +98,8 @@ def deployed(settings: Settings, host: str | None, least: int, most: int) -> Ser
         health_check_period_s=_HEALTH_PERIOD_S,
         health_check_timeout_s=_HEALTH_TIMEOUT_S,
         graceful_shutdown_timeout_s=_SHUTDOWN_S,
+        # The edge has a log of its own.
+        logging_config=LoggingConfig(log_level="WARNING", enable_access_log=False),
         autoscaling_config=AutoscalingConfig(min_replicas=least, max_replicas=most, target_ongoing_requests=_ONGOING),
         request_router_config=RequestRouterConfig.model_validate(
             {"request_router_class": _ROUTER, "request_router_kwargs": {"num_fallback_replicas": 0}}

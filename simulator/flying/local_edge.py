@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,13 +23,13 @@ class EdgeDied(EdgeError):
 
 @contextmanager
 def edge_process(
-    port: int, log: Path, environment: Mapping[str, str] | None = None
+    port: int, log: Path, environment: Mapping[str, str] | None = None, options: Sequence[str] = ()
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Within the context, run an edge on the loopback's ``port`` with its output in ``log``.
 
-    ``environment`` has its settings; ``None`` inherits this process's environment.
+    ``environment`` has its settings; ``None`` inherits this process's environment. ``options`` are of ``aicvds serve``.
     """
-    command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+    command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port), *options]
     with naming_out(log.parent):
         output = log.open("wb")
     with output:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import threading
 import uuid
 from collections.abc import Callable, Iterator
@@ -51,6 +52,19 @@ def _slot(process: psutil.Process) -> int | None:
     return next((int(path.stem) for path in sockets(process) if path.suffix == ".moved"), None)
 
 
+def drained(process: subprocess.Popen[str]) -> None:
+    """Let nothing wait for a reader of its output from here on."""
+    assert process.stdout is not None
+    threading.Thread(target=process.stdout.read, daemon=True).start()
+
+
+def first_event(client: httpx.Client, mission: str) -> str:
+    """The first event of a mission's stream."""
+    with client.stream("GET", f"/missions/{mission}/events") as stream:
+        assert stream.status_code == 200
+        return next(line for line in stream.iter_lines() if line.startswith("data:"))
+
+
 @contextmanager
 def serving(store: Path | str, processes: int = 2, **env: str) -> Iterator[Processes]:
     """So many deciding processes, ready; they must end when asked to."""
@@ -59,9 +73,7 @@ def serving(store: Path | str, processes: int = 2, **env: str) -> Iterator[Proce
     with started("serve", "--port", "0", "--processes", str(processes), **settings) as process:
         url = output_until(process, r"listening on (http://[\d.:]+)")[1]
         edge = Processes(url, psutil.Process(process.pid))
-        # Nobody reads it from here on.
-        assert process.stdout is not None
-        threading.Thread(target=process.stdout.read, daemon=True).start()
+        drained(process)
         until(edge.ready)
         yield edge
         process.send_signal(signal.SIGTERM)

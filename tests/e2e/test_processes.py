@@ -12,19 +12,9 @@ import pytest
 
 from service.storage.locks import FileLock, StoreUnusable
 from tests.e2e.processes import output_until, run, run_here, started
-from tests.e2e.shared_out import NAMES, Report, outlive_a_kill, serving, sockets
+from tests.e2e.shared_out import NAMES, Report, first_event, outlive_a_kill, serving, sockets
 from tests.service.stub_llm import wait_for
 from tests.waiting import PATIENCE_S, until
-
-
-def _events(url: str, mission: str) -> str:
-    """The first event of a mission's stream."""
-    with (
-        httpx.Client(timeout=PATIENCE_S) as client,
-        client.stream("GET", f"{url}/missions/{mission}/events") as stream,
-    ):
-        assert stream.status_code == 200
-        return next(line for line in stream.iter_lines() if line.startswith("data:"))
 
 
 def test_every_mission_is_decided_by_its_own_process(tmp_path: Path, report: Report) -> None:
@@ -49,7 +39,7 @@ def test_every_mission_is_decided_by_its_own_process(tmp_path: Path, report: Rep
             assert client.post("/feedback", json=outcome).json()["result"] == "duplicate"
             assert client.get(f"/missions/{name}").json()["decisions"] == 4
             assert client.get(f"/missions/{name}/decisions/{decided[name][2]}/prompt").json()["state"]
-            assert name in _events(edge.url, name)
+            assert name in first_event(client, name)
         assert client.post("/feedback", json={"decision_id": uuid.uuid4().hex, "cost": 0.5}).status_code == 404
         listed = client.get("/missions").json()
         assert {line["mission_id"]: line["decisions"] for line in listed["missions"]} == dict.fromkeys(NAMES, 4)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ import psutil
 import pytest
 
 from tests.e2e.processes import output_until, started
+from tests.e2e.shared_out import drained
 from tests.faults.fleet import Report
 from tests.faults.shared_fleet import LEASE_S, flying
 from tests.faults.shared_store import DEADLINE_MS, Database
@@ -50,9 +50,7 @@ def ingress(database: Database, ray: str) -> Iterator[str]:
     }
     with started("serve", "--port", "0", "--ray", ray, "--replicas", "2", **settings) as process:
         url = output_until(process, r"listening on (http://[\d.:]+)")[1]
-        # Nobody reads it from here on.
-        assert process.stdout is not None
-        threading.Thread(target=process.stdout.read, daemon=True).start()
+        drained(process)
         until(lambda: both_ready(url))
         yield url
         process.terminate()
