@@ -24,7 +24,7 @@ from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.scenario import Scenario
-from shared.wire import MissionSpec, Outcome, PromptStyle
+from shared.schemas import MissionSpec, Outcome, PromptStyle
 from simulator.client.observation_report import decide_request
 from simulator.flying.flight import fly
 from simulator.flying.pilots import Choice, LocalPilot

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from service.prompting.experiences import Experiences
-from service.prompting.prompt import Prompt, Template
+from service.prompting.paper_prompt import Template
+from service.prompting.prompt import Prompt
 from service.prompting.row_formats import UNKNOWN, Cells
 from service.prompting.token_accounting import UnprunedState
 from shared.actions import Action

@@ -41,7 +41,7 @@ from rich.table import Table
 
 from shared.missions import MissionAttention
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, MissionSpec, Mode, Outcome, Uplink
+from shared.schemas import DecideRequest, MissionSpec, Mode, Outcome, Uplink
 from simulator.client import EdgeClient
 from simulator.client.pruned_reports import PrunedReports
 from simulator.client.report_encoders import DeltaReports

@@ -25,14 +25,14 @@ from rich.progress import track
 
 from service.api.app import create_app
 from service.config.settings import Settings
-from service.deciding.decision_time import Deadline
 from service.deciding.deliberation import LlmAdvice
+from service.deciding.stopwatch import Deadline
 from service.edge.engine import Engine
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.scenario import Scenario, scenario_named
-from shared.wire import Mode
+from shared.schemas import Mode
 from simulator.client import EdgeClient
 from simulator.experiments.intervals import interval, paired
 from simulator.flying.flight import fly

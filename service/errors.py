@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from http import HTTPStatus
 
-from shared.wire import INCOMPLETE
+from shared.schemas import INCOMPLETE
 
 
 class Refused(Exception):

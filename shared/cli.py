@@ -6,7 +6,7 @@ import sys
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
 
-from shared.faults import suggestion
+from shared.validation_messages import suggestion
 
 _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",

@@ -14,8 +14,8 @@ from shared.drift import Drift
 from shared.fleetplan import FleetBelief
 from shared.learned_channel import LIKELY, ExpectedLinks, LearnedChannel
 from shared.scenario import Point, Scenario
+from shared.schemas import Features, SensorColumns, UavState
 from shared.trajectory import progress_of, trajectories
-from shared.wire import Features, SensorColumns, UavState
 
 # The number of features of a sensor in each preset.
 FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}

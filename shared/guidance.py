@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from shared.channel import FloatArray
 from shared.scenario import Scenario
-from shared.wire import MissionId, Note, Received, SensorId, Wire
+from shared.schemas import MissionId, Note, Received, SensorId, Wire
 
 Level = Annotated[int, Field(ge=0, le=14)]
 MAX_WISHES = 1000

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import ConfigDict, Field
 
 from shared.scenario import Scenario
-from shared.wire import (
+from shared.schemas import (
     Belief,
     DecisionId,
     Features,

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from shared.wire import Received, SensorId, Step, Wire
+from shared.schemas import Received, SensorId, Step, Wire
 
 # A day: an older reading says nothing about a queue.
 MAX_AGE_S = 86_400.0

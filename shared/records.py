@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from shared.channel import FloatArray
 from shared.features import beacon_columns
 from shared.fleetplan import FleetBelief
-from shared.fleetplan.measured import Measured
+from shared.fleetplan.gain_measurements import Measured
 from shared.scenario import Scenario
-from shared.wire import UavState
+from shared.schemas import UavState
 
 # The weight, in steps, of the scenario's mean arrival rate against the observations.
 _PRIOR_STEPS = 2.0

@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field, ValidationError
 
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, SensorId, Wire
+from shared.schemas import DecideRequest, SensorId, Wire
 
 
 class Header(Wire):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.wire import Problem
+from shared.schemas import Problem
 
 
 class UsageError(Exception):

@@ -16,10 +16,10 @@ from service.api import live_routes as live_routes
 from service.api import problem_details
 from service.api.api_keys import ApiKeys
 from service.api.authentication import KeyAuthentication
+from service.api.load_limits import RequestLimits
 from service.api.openapi import schema_of
-from service.api.request_limits import RequestLimits
 from service.api.routes import decisions, router
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.config.settings import Settings
 from service.edge.engine import Engine
 from service.llm.embedded import Embed, embedded
@@ -88,7 +88,7 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
     if member is not None:
-        from service.api.siblings import Siblings
+        from service.api.process_routing import Siblings
 
         app.add_middleware(Siblings, member=member)
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)

@@ -14,8 +14,8 @@ from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from service.api.api_keys import ApiKey, ApiKeys, Scope
+from service.api.load_limits import READING
 from service.api.problem_details import problem_response
-from service.api.request_limits import READING
 
 # Resources without mission data. Probes of containers and load balancers carry no key.
 _OPEN = frozenset(("/healthz", "/readyz", "/"))

@@ -22,7 +22,7 @@ from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
 from shared.missions import DecisionPrompt, MissionLine, MissionList
 from shared.reasons import LLM_NOT_ASKED
-from shared.wire import DecisionId, MissionId
+from shared.schemas import DecisionId, MissionId
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from starlette.types import Message, Send
 
 from service.observability.gathered import gathered
 from shared.missions import MissionLine, MissionList
-from shared.wire import Readiness
+from shared.schemas import Readiness
 
 # When a process's newest decision was, in its answer to another process.
 DECIDED_AT = "x-decided-at"

@@ -6,7 +6,7 @@ from http import HTTPStatus
 from typing import Any
 
 from shared.scenario import SCENARIOS
-from shared.wire import Problem
+from shared.schemas import Problem
 
 Example = dict[str, Any]
 

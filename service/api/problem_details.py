@@ -15,11 +15,19 @@ from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
 from service.errors import Misdirected, Refused, Unavailable
-from shared.faults import problem_of
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
 from shared.readings import ReadingsRequest, SensorReading
 from shared.scenario import Scenario
-from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Problem, PromptStyle, SensorColumns
+from shared.schemas import (
+    BatchRequest,
+    DecideRequest,
+    FeedbackRequest,
+    MissionSpec,
+    Problem,
+    PromptStyle,
+    SensorColumns,
+)
+from shared.validation_messages import problem_of
 
 log = logging.getLogger(__name__)
 

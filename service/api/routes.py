@@ -22,7 +22,7 @@ from service.observability.metrics import Metrics
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionAttention, MissionStatus
 from shared.readings import ReadingsRequest, ReadingsResponse
-from shared.wire import (
+from shared.schemas import (
     BatchRequest,
     BatchResponse,
     DecideRequest,

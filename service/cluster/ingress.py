@@ -16,9 +16,9 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route
 from starlette.types import Receive, Scope, Send
 
+from service.api.load_limits import RequestLimits
 from service.api.merging import Answer, merged_metrics, merged_missions, merged_readiness
 from service.api.problem_details import problem_response
-from service.api.request_limits import RequestLimits
 from service.cluster.exchange import Exchanged
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders

@@ -18,7 +18,7 @@ import tyro
 from pydantic import ValidationError
 
 from service.config.settings import Settings, unknown_variables
-from shared.faults import problem_of
+from shared.validation_messages import problem_of
 
 _ASKED_S = 3.0
 _SUPPORTED = ((3, 11), (3, 13))

@@ -80,9 +80,9 @@ def _forward(configuration: Configuration, options: Mqtt) -> int:
     from prometheus_client import start_http_server
 
     from service.lorawan.counts import Counts
-    from service.lorawan.intake import Intake
-    from service.lorawan.reporting import Reporting
+    from service.lorawan.edge_sender import Reporting
     from service.lorawan.subscription import Subscription
+    from service.lorawan.waiting_readings import Intake
 
     counts = Counts()
     intake = Intake(configuration, counts)

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from pydantic import ValidationError
 
-from shared.faults import problem_of
-from shared.wire import Mode
+from shared.schemas import Mode
+from shared.validation_messages import problem_of
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from service.config.processes import Member
+    from service.config.process_member import Member
     from service.config.settings import Settings
 
 
@@ -134,7 +134,7 @@ def checked_settings(given: dict[str, Any], host: str) -> Settings | None:
 
 def _share_out(settings: Settings, listener: socket.socket) -> Member | int:
     """Start the edge's processes; returns the exit code in the parent, and in each of them its place."""
-    from service.commands.processes import Parent
+    from service.commands.process_parent import Parent
     from service.storage.locks import StoreUnusable
 
     embeds = settings.llm_url is None and settings.mode in ("guided", "llm")

@@ -11,8 +11,8 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.config.cores import usable_cores
 from service.config.prompt_budget import prompt_tokens
-from shared.faults import suggestion
-from shared.wire import Mode, Selection
+from shared.schemas import Mode, Selection
+from shared.validation_messages import suggestion
 
 # The adapter that this package ships, if it ships one.
 SHIPPED_ADAPTER = Path(__file__).parents[1] / "checkpoints" / "adapter.gguf"

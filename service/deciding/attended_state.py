@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from service.deciding.decision_time import Stopwatch
+from service.deciding.stopwatch import Stopwatch
 from service.guidance.step_guidance import StepGuidance
 from service.learning.modules import Sample, top_k
 from service.mission.decisions import Pending
@@ -19,7 +19,7 @@ from service.mission.mission import Mission
 from service.prompting.row_formats import cells
 from shared.actions import Action
 from shared.features import Reach, State, augment
-from shared.wire import Candidate, UavState
+from shared.schemas import Candidate, UavState
 
 
 @dataclass(frozen=True)

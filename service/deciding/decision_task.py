@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from service.deciding.decision_time import Deadline, Stopwatch
 from service.deciding.deliberation import LlmAdvice
+from service.deciding.stopwatch import Deadline, Stopwatch
 from service.learning.trust import Advice
 from service.llm.answers import Completion
 from service.mission.mission import Mission
 from shared.actions import Action
 from shared.reasons import Reason
-from shared.wire import Guided, UavState
+from shared.schemas import Guided, UavState
 
 # Kept back of a deadline for the check, the answer and the way through the event loop.
 RESERVE_S = 0.02

@@ -37,7 +37,7 @@ from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.reasons import Reason
-from shared.wire import Guided, Weighed
+from shared.schemas import Guided, Weighed
 
 # Candidates that a response names.
 _REPORTED = 5

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
-import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.decision_time import Deadline
 from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
+from service.deciding.llm_timeout import QueryLimits
+from service.deciding.stopwatch import Deadline
 from service.llm.answers import Completion, NoDecision
 from service.llm.calibration import LabelReader
 from service.llm.server_pool import ServerPool
@@ -23,8 +22,6 @@ from shared.reasons import Reason
 
 log = logging.getLogger(__name__)
 
-# The most that a query may take after SIGTERM, so that every UAV is answered before the process is killed.
-_CLOSING_S = 4.0
 # Queries about a whole fleet that may be late in a row before the LLM is asked about one UAV at a time.
 _LATE = 2
 
@@ -49,21 +46,14 @@ class LlmQueries:
 
     def __init__(self, llm: ServerPool, metrics: Metrics, limit: int) -> None:
         self._llm = llm
-        self._limit = limit
         self._metrics = metrics
         self._labels = LabelReader()
         self._late = 0
-        self._waiting: set[asyncio.Timeout] = set()
-        self._closing = False
+        self._limits = QueryLimits(limit)
 
     def hurry(self) -> None:
         """The service is closing: a query that waits for the LLM gets a few seconds more."""
-        self._closing = True
-        ends = asyncio.get_running_loop().time() + _CLOSING_S
-        for limit in self._waiting:
-            # A limit that has just expired cannot be changed.
-            if not limit.expired():
-                limit.reschedule(min(limit.when() or ends, ends))
+        self._limits.hurry()
 
     async def close(self) -> None:
         """Give up the queries in the background."""
@@ -74,7 +64,7 @@ class LlmQueries:
     ) -> Completion:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``."""
         query = partial(self._llm.ask, mission.mission_id, prompt.static, prompt.user, sensor_ids, levels)
-        return await self._within(query, deadline)
+        return await self._limits.within(query, deadline)
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
@@ -144,7 +134,7 @@ class LlmQueries:
         completion, by_label, reason = None, None, None
         try:
             query = partial(self._llm.ask_labels, mission.mission_id, static, user, labels)
-            completion = await self._within(query, deadline)
+            completion = await self._limits.within(query, deadline)
             by_label = self._labels.read(completion, static, labels)
         except NoDecision as error:
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
@@ -156,16 +146,3 @@ class LlmQueries:
         known = bool(completion.positions) and self._labels.bias(completion.model, static, len(labels)) is not None
         unknown = by_label is not None and bool(completion.positions) and not known
         return _Answer(completion, by_label, reason, calibrated=known, to_calibrate=unknown, model=completion.model)
-
-    async def _within(self, query: Callable[[], Awaitable[Completion]], deadline: Deadline) -> Completion:
-        if len(self._waiting) >= self._limit:
-            raise NoDecision("llm_busy", f"{self._limit} decisions wait for it already")
-        limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))
-        try:
-            async with limit:
-                self._waiting.add(limit)
-                return await query()
-        except TimeoutError:
-            raise NoDecision("llm_timeout", "no answer within the deadline") from None
-        finally:
-            self._waiting.discard(limit)

@@ -18,6 +18,7 @@ from service.llm.answers import Completion, NoDecision, check_answer
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.actions import Action
+from shared.schemas import Mode as ModeName
 
 log = logging.getLogger(__name__)
 
@@ -204,3 +205,12 @@ class Guided(Policy):
         # Other UAVs may have every sensor that the LLM named by now.
         missing = advice.reason or ("answer_reserved" if llm is None else None)
         return Choice(verdict.action, missing, advice.completion, advice.model, verdict.report, verdict.advice)
+
+
+def modes_by_name(queries: LlmQueries, evaluating: Executor) -> dict[tuple[ModeName, bool], Mode]:
+    """Every mode, by its name and by whether the mission has the compact prompt."""
+    guided, value, policy = Guided(queries, evaluating), Value(), Policy()
+    modes: dict[tuple[ModeName, bool], Mode] = {("llm", False): Llm(queries), ("llm", True): LlmByLetter(queries)}
+    for compact in (False, True):
+        modes |= {("guided", compact): guided, ("value", compact): value, ("policy", compact): policy}
+    return modes

@@ -14,17 +14,16 @@ from service.config.settings import Settings
 from service.deciding.advisers import look_ahead
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
-from service.deciding.decision_time import Deadline
 from service.deciding.llm_query import LlmQueries
-from service.deciding.modes import Guided, Llm, LlmByLetter, Mode, Policy, Value
+from service.deciding.modes import modes_by_name
+from service.deciding.stopwatch import Deadline
 from service.mission.events import AdviserReport
 from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
 from shared.guidance import Guidance
-from shared.wire import Mode as ModeName
-from shared.wire import Tokens
+from shared.schemas import Tokens
 
 # The initial estimate of a decision's own seconds, and the length of its average.
 _OWN_S, _OWN_MEMORY = 0.03, 20
@@ -62,14 +61,7 @@ class Pipeline:
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._evaluating = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="evaluator")
         self._plans: set[asyncio.Task[None]] = set()
-        guided, value, policy = Guided(queries, self._evaluating), Value(), Policy()
-        # By the mission's mode, and whether it has the compact prompt.
-        self._modes: dict[tuple[ModeName, bool], Mode] = {
-            ("llm", False): Llm(queries),
-            ("llm", True): LlmByLetter(queries),
-        }
-        for compact in (False, True):
-            self._modes |= {("guided", compact): guided, ("value", compact): value, ("policy", compact): policy}
+        self._modes = modes_by_name(queries, self._evaluating)
 
     async def decide_one(self, task: DecisionTask) -> Decided:
         """Decide for one UAV, and record the decision in its mission; raises as :meth:`Mission.commit`."""

@@ -17,7 +17,7 @@ from service.distilling.adapter_training import Agreement, Student, agreement, t
 from service.distilling.examples import PromptExample
 from service.distilling.examples_file import examples_of
 from service.distilling.options import Distill
-from service.llm.adapter import PROMPT_VERSION
+from service.llm.adapter_version import PROMPT_VERSION
 from service.llm.model_file import embedded_model, sha256
 from service.prompting.compact_prompt import STATIC
 from shared.executors import ordered_map

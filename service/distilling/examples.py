@@ -25,7 +25,7 @@ from service.training.recorded_states import recorded_states
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.rollouts import Header, Reference, RolloutStep
-from shared.wire import Belief, MissionSpec
+from shared.schemas import Belief, MissionSpec
 
 # The teacher's own action has this share of a target; the rest goes by regret.
 _REFERENCE_SHARE = 0.6

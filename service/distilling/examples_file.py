@@ -21,7 +21,7 @@ from service.distilling.examples import (
     prompt_examples,
     view_of,
 )
-from service.llm.adapter import PROMPT_VERSION
+from service.llm.adapter_version import PROMPT_VERSION
 from service.llm.model_file import sha256
 from shared.executors import OrderedMap
 from shared.rollouts import Header, RolloutStep, read_rollouts

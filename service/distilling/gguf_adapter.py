@@ -9,7 +9,7 @@ import gguf
 import numpy as np
 from numpy.typing import NDArray
 
-from service.llm.adapter import PROMPT_VERSION, VERSION_KEY
+from service.llm.adapter_version import PROMPT_VERSION, VERSION_KEY
 
 # The model's matrices: transformers' names, and llama.cpp's.
 _NAMES = {

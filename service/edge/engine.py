@@ -10,12 +10,12 @@ from functools import partial
 from pydantic import TypeAdapter
 from structlog.contextvars import bind_contextvars, clear_contextvars
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.config.settings import Settings
 from service.deciding.decision_task import RESERVE_S, DecisionTask
-from service.deciding.decision_time import Deadline, Stopwatch
 from service.deciding.llm_query import LlmQueries
 from service.deciding.pipeline import Decided, Pipeline
+from service.deciding.stopwatch import Deadline, Stopwatch
 from service.edge.batch import BatchDecider
 from service.edge.feedback import Feedback
 from service.edge.mission_registry import MissionRegistry
@@ -33,7 +33,7 @@ from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
 from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.reasons import Reason
-from shared.wire import (
+from shared.schemas import (
     BatchRequest,
     DecideRequest,
     DecideResponse,

@@ -6,10 +6,10 @@ import asyncio
 from collections.abc import Callable
 from typing import TypeVar
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.config.settings import Settings
 from service.deciding.decision_task import RESERVE_S
-from service.deciding.decision_time import Deadline
+from service.deciding.stopwatch import Deadline
 from service.edge.ownership import LeasedOwnership, SoleOwnership
 from service.edge.stored_missions import StoredMissions
 from service.errors import Conflict, Elsewhere, NotFound, Unavailable
@@ -17,7 +17,7 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
-from shared.wire import BatchRequest, DecideRequest, MissionSpec
+from shared.schemas import BatchRequest, DecideRequest, MissionSpec
 
 AnyRequest = TypeVar("AnyRequest", DecideRequest, BatchRequest)
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.config.settings import Settings
 from service.edge.ownership import LeasedOwnership, SoleOwnership
 from service.errors import Conflict, Misdirected, Unavailable

@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from service.config.cores import usable_cores
 from shared.features import FEATURES, LEVEL_FEATURES
-from shared.wire import Features
+from shared.schemas import Features
 
 Array = NDArray[np.float32]
 

@@ -14,7 +14,7 @@ from shared.channel import FloatArray
 from shared.features import overflow_probability
 from shared.fleetplan import FleetBelief
 from shared.scenario import Scenario
-from shared.wire import UavState
+from shared.schemas import UavState
 
 # Missions that are watched, and the steps that are remembered of each.
 _MOST_MISSIONS = 1000

@@ -12,7 +12,7 @@ from typing import Any
 import xllamacpp
 
 from service.config.settings import Settings
-from service.llm.adapter import check_adapter
+from service.llm.adapter_version import check_adapter
 from service.llm.model_file import embedded_model
 
 # By default llama.cpp uses up to 8 GB of host memory for old prompts.

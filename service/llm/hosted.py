@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from service.config.processes import Member, llm_file
+from service.config.process_member import Member, llm_file
 from service.config.settings import Settings
-from service.llm.adapter import AdapterUnusable
+from service.llm.adapter_version import AdapterUnusable
 from service.llm.embedded import EmbeddedServer, LoadFailed, embed
 from service.llm.model_file import ModelMissing
 

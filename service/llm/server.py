@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
-from service.llm.adapter import AdapterUnusable
+from service.llm.adapter_version import AdapterUnusable
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
@@ -29,7 +29,7 @@ from service.llm.request_bodies import (
     warm_up_body,
 )
 from shared.reasons import Reason
-from shared.wire import Readiness
+from shared.schemas import Readiness
 
 if TYPE_CHECKING:
     from service.llm.client import LLMClient

@@ -20,7 +20,7 @@ from service.llm.embedded import Embed, embedded
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
 from shared.rendezvous import weight
-from shared.wire import Readiness
+from shared.schemas import Readiness
 
 Answer = Coroutine[Any, Any, Completion]
 Call = Callable[[LlmServer], Answer]

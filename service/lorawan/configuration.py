@@ -10,8 +10,8 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from shared.faults import problem_of
-from shared.wire import MissionId, SensorId
+from shared.schemas import MissionId, SensorId
+from shared.validation_messages import problem_of
 
 _MAX_BYTES = 4_000_000
 # Ports that brokers listen on by default.

@@ -12,7 +12,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from service.lorawan.configuration import Configuration
 from service.lorawan.counts import Counts
-from service.lorawan.intake import Intake
+from service.lorawan.waiting_readings import Intake
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from service.learning.modules import Sample
 from service.prompting.row_formats import Cells
 from shared.bounded import BoundedDict
 from shared.scenario import Scenario
-from shared.wire import Outcome
+from shared.schemas import Outcome
 
 # UAVs of one fleet may be this many steps apart.
 MAX_STEPS_APART = 64

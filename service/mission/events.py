@@ -8,8 +8,8 @@ from typing import Any
 from service.learning.trust import Advice
 from service.mission.decisions import Pending
 from service.mission.idempotency import Answered
-from service.mission.readings import Reading
-from shared.wire import Outcome, UavState
+from service.mission.sensor_readings import Reading
+from shared.schemas import Outcome, UavState
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,23 +21,23 @@ from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.mission.decisions import PENDING_PER_UAV, Pending, PendingDecisions, Reservation, Reservations
 from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled, ignore_event
 from service.mission.idempotency import IdempotentAnswers
-from service.mission.learned_world import learned_world
+from service.mission.learned_world_status import learned_world
 from service.mission.planner import Planner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
-from service.mission.readings import Reading, Readings
 from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
+from service.mission.sensor_readings import Reading, Readings
 from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
 from shared.actions import Action
 from shared.fleetplan import FleetBelief
-from shared.fleetplan.measured import Measured
+from shared.fleetplan.gain_measurements import Measured
 from shared.guidance import Guidance, GuidanceAnswer
 from shared.missions import MissionStatus, VisitDeadline
 from shared.readings import ReadingResult, SensorReading
 from shared.records import Records, take_report
 from shared.scenario import Scenario, scenario_named
-from shared.wire import Belief, Features, MissionSpec, Mode, Outcome, UavState
+from shared.schemas import Belief, Features, MissionSpec, Mode, Outcome, UavState
 
 log = logging.getLogger(__name__)
 

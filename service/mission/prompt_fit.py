@@ -12,7 +12,8 @@ from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.demonstrations import solved
 from service.prompting.experiences import NEAREST
 from service.prompting.guided_prompt import GuidedTemplate
-from service.prompting.prompt import Template, note_block
+from service.prompting.paper_prompt import Template
+from service.prompting.prompt import note_block
 from shared.scenario import Scenario
 
 

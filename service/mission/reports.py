@@ -16,7 +16,7 @@ from service.mission.decisions import MAX_STEPS_APART, PendingDecisions
 from shared.channel import FloatArray
 from shared.fleetplan import FleetBelief
 from shared.scenario import Scenario
-from shared.wire import SensorColumns, UavState
+from shared.schemas import SensorColumns, UavState
 
 AnyReport = TypeVar("AnyReport", bound=UavState)
 

@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import Field
 
 from service.config.settings import Settings
-from shared.wire import Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
+from shared.schemas import Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
 
 _LLM_MODES = ("llm", "guided")
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import structlog
 from structlog.typing import Processor
 
-from shared.wire import DecideResponse
+from shared.schemas import DecideResponse
 
 log = logging.getLogger(__name__)
 

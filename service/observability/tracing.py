@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.config.settings import Settings
 from shared.reasons import LLM_FAILURES
-from shared.wire import DecideResponse
+from shared.schemas import DecideResponse
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider

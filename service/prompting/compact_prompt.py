@@ -8,7 +8,7 @@ First the experiences, which end with ``X`` or ``Y``: see :meth:`CompactTemplate
 six digits, and a row's first choice letter its sensor's eight: a causal model has read a row where it reads the row's
 letter. :func:`fleet_digits` and :func:`row_digits` define the digits. The second place of an experience and of a row is
 its sensor's sign, by which the model finds what came of the sensor. An adapter names the version of this prompt that it
-was trained on: :data:`service.llm.adapter.PROMPT_VERSION` changes whenever a text here does.
+was trained on: :data:`service.llm.adapter_version.PROMPT_VERSION` changes whenever a text here does.
 """
 
 from __future__ import annotations

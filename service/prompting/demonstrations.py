@@ -17,7 +17,7 @@ from service.learning.modules import Weights, top_k
 from service.prompting.row_formats import Cells, cells
 from shared.features import State, augment
 from shared.scenario import Scenario
-from shared.wire import Features, MissionSpec, SensorId, Step, UavState, Wire
+from shared.schemas import Features, MissionSpec, SensorId, Step, UavState, Wire
 
 PACKAGED = "demonstrations.json"
 

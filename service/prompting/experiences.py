@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.wire import Selection
+from shared.schemas import Selection
 
 # Experiences to select from: three missions of the paper's length.
 _REMEMBERED = 270

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from service.prompting.candidates import CandidateSet, Letters, Viewpoint
-from service.prompting.prompt import Prompt, Template, note_block
+from service.prompting.paper_prompt import Template
+from service.prompting.prompt import Prompt, note_block
 from service.prompting.row_formats import FORMATS, Cells, cells
 from service.prompting.token_accounting import UnprunedState
 from shared.actions import Action

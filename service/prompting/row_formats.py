@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.features import State
-from shared.wire import Features, PromptFormat
+from shared.schemas import Features, PromptFormat
 
 # The text of each column, by name: a whole number or UNKNOWN.
 Cells = Mapping[str, str]

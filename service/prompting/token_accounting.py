@@ -24,7 +24,7 @@ from service.llm.answers import Completion
 from service.prompting.row_formats import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
 from service.prompting.tokenizer import ENCODING, encoding
 from shared.features import State
-from shared.wire import Tokens
+from shared.schemas import Tokens
 
 if TYPE_CHECKING:
     from service.prompting.prompt import Prompt

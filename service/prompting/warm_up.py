@@ -6,7 +6,7 @@ from service.config.settings import Settings
 from service.llm.request_bodies import WarmUp
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.guided_prompt import GuidedTemplate
-from service.prompting.prompt import Template
+from service.prompting.paper_prompt import Template
 from shared.scenario import SCENARIOS
 
 

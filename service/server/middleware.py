@@ -15,7 +15,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.wire import Problem
+from shared.schemas import Problem
 
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",

@@ -11,11 +11,11 @@ from pathlib import Path
 import uvicorn
 from starlette.applications import Starlette
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.observability import logs
+from service.server.connection_handover import MovableHttpProtocol, MovedConnections
 from service.server.connection_limits import BoundedHttpProtocol
 from service.server.middleware import StartupGate
-from service.server.moving import MovableHttpProtocol, MovedConnections
 
 # At shutdown, the longest time from an accepted connection to the first bytes of its request.
 _ARRIVING_S = 0.25

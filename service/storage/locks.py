@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from service.config.processes import Member
+from service.config.process_member import Member
 
 # How long a lock that another process has is tried, and how often.
 _LAST_COMMIT_S, _RETRY_S = 1.0, 0.02

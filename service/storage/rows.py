@@ -18,10 +18,10 @@ from service.learning.trust import Advice
 from service.mission.decisions import Pending
 from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled
 from service.mission.idempotency import Answered
-from service.mission.readings import Reading
+from service.mission.sensor_readings import Reading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, leases, missions
-from shared.wire import Outcome, UavState
+from shared.schemas import Outcome, UavState
 
 # The first size of a packer's buffer, which grows as it must.
 PACK_BYTES = 4096

@@ -18,7 +18,7 @@ from shared.channel import FloatArray
 from shared.features import State
 from shared.rollouts import Header, RolloutStep
 from shared.scenario import Scenario
-from shared.wire import MissionSpec, UavState
+from shared.schemas import MissionSpec, UavState
 
 # A function of a recorded decision, the edge's state, the scenario and the reserved sensors. It returns an action, or
 # None where the teacher has no answer.

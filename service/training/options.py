@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import arg
 
 from service.training.reward import Speed, Target
-from shared.wire import Belief, Features
+from shared.schemas import Belief, Features
 
 
 @dataclass(frozen=True)

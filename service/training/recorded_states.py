@@ -8,7 +8,7 @@ from service.deciding.attended_state import AttendedState
 from service.mission.mission import Mission
 from shared.actions import Action
 from shared.rollouts import RolloutStep
-from shared.wire import Outcome
+from shared.schemas import Outcome
 
 
 def recorded_states(mission: Mission, steps: Iterable[RolloutStep]) -> Iterator[tuple[RolloutStep, AttendedState]]:

@@ -22,7 +22,7 @@ from shared.actions import Action
 from shared.features import Reach, State, distances_between, places_ahead
 from shared.rollouts import Header, Reference, RolloutStep
 from shared.scenario import Scenario
-from shared.wire import Belief, Features, MissionSpec
+from shared.schemas import Belief, Features, MissionSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from shared.channel import FloatArray, IntArray, Links
 from shared.drift import Drift
 from shared.fleetplan.arrivals import Arrivals, Which
-from shared.fleetplan.measured import NOTHING_MEASURED, Measured
+from shared.fleetplan.gain_measurements import NOTHING_MEASURED, Measured
 from shared.fleetplan.whereabouts import Visit, Whereabouts
 from shared.learned_channel import ExpectedLinks, LearnedChannel
 from shared.scenario import Scenario

@@ -9,8 +9,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from shared.scenario import Scenario, scenario_named
-from shared.wire import MissionId, Note
-from simulator.client.calls import edge_url
+from shared.schemas import MissionId, Note
+from simulator.client.retries_and_redirects import edge_url
 from simulator.errors import UsageError
 from simulator.sites.site import Site
 

@@ -12,7 +12,7 @@ import httpx
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
 from shared.readings import ReadingsRequest, ReadingsResponse
-from shared.wire import (
+from shared.schemas import (
     BatchRequest,
     BatchResponse,
     DecideRequest,
@@ -22,7 +22,7 @@ from shared.wire import (
     Readiness,
     Uplink,
 )
-from simulator.client.calls import Call, Calls, Exchange, Pause, Result
+from simulator.client.retries_and_redirects import Call, Calls, Exchange, Pause, Result
 
 
 class EdgeClient:

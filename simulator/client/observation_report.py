@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from shared.channel import FloatArray
-from shared.wire import DecideRequest, Outcome, SensorColumns
+from shared.schemas import DecideRequest, Outcome, SensorColumns
 from simulator.world import Observation
 
 

@@ -14,7 +14,7 @@ from shared.fleetplan import FleetBelief
 from shared.missions import MissionAttention, MissionStatus
 from shared.records import Records, take_report
 from shared.scenario import Scenario
-from shared.wire import DecideResponse, Outcome, UavState
+from shared.schemas import DecideResponse, Outcome, UavState
 from simulator.client.report_encoders import Fetch, FullReports, Report, without_positions
 
 # Steps between a UAV's checks that its weights are still current.

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel
 
-from shared.wire import DecideResponse, SensorColumns, UavState
+from shared.schemas import DecideResponse, SensorColumns, UavState
 
 Report = TypeVar("Report", bound=UavState)
 

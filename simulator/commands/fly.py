@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
-from shared.wire import Mode
+from shared.schemas import Mode
 from simulator.cli.options import (
     check_between,
     check_deadline,

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import arg
 
-from shared.wire import DecideRequest, MissionSpec, Mode
+from shared.schemas import DecideRequest, MissionSpec, Mode
 from simulator.cli.options import check_mission, check_note, check_seed, checked_edge, chosen_site
 from simulator.cli.running import command_main
 from simulator.flying.run import API_KEY, new_mission_id

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from shared.wire import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
+from shared.schemas import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
 from simulator.cli.options import check_deadline, check_wait, checked_edge
 from simulator.cli.running import INTERRUPTED, command_main
 from simulator.client import EdgeClient, Exchange

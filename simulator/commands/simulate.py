@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
-from shared.wire import Mode, Uplink
+from shared.schemas import Mode, Uplink
 from simulator.cli.options import (
     check_between,
     check_deadline,

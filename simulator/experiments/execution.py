@@ -14,7 +14,7 @@ from simulator.experiments.flight import BoundFound, DecisionRecord, FlightRecor
 from simulator.experiments.plan import Planned
 from simulator.experiments.schemes import Clairvoyant, Informed, Local, OverEdge
 from simulator.flying.flight import Flight, fly
-from simulator.flying.informed import InformedPilot
+from simulator.flying.informed_planner import InformedPilot
 from simulator.flying.pilots import Choice, EdgePilot, LocalPilot, Pilot
 from simulator.flying.run import new_mission_id
 from simulator.flying.sensor_uplinks import SensorUplinks

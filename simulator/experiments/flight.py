@@ -24,7 +24,7 @@ _TORN_S = 3600.0
 
 
 class TokenCounts(Record):
-    """Token counts of one decision; see ``shared.wire.Tokens``."""
+    """Token counts of one decision; see ``shared.schemas.Tokens``."""
 
     prompt: int
     uncompressed: int

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from simulator.experiments.operators import Operator
 from simulator.flying.sensor_uplinks import UplinkPlan
 from simulator.records.record import Record
@@ -54,7 +54,7 @@ class Clairvoyant(Record):
 
 
 class Informed(Record):
-    """The planner that is told every true link, a reference for all schemes: see ``simulator.flying.informed``."""
+    """The planner that is told every true link, a reference: see ``simulator.flying.informed_planner``."""
 
     kind: Literal["informed"] = "informed"
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from shared.scenario import Scenario
-from shared.wire import Uplink
+from shared.schemas import Uplink
 from simulator.client import Exchange
 from simulator.flying.pilots import Choice, Pilot
 from simulator.records.decision import Decision

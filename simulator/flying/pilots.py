@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
+from shared.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from simulator.client import EdgeClient, Exchange
 from simulator.client.observation_report import decide_request
 from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable

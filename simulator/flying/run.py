@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from shared.guidance import GuidanceAnswer
 from shared.missions import MissionStatus
 from shared.scenario import Scenario
-from shared.wire import MissionSpec, Mode, Uplink
+from shared.schemas import MissionSpec, Mode, Uplink
 from simulator.cli.running import INTERRUPTED
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport

@@ -6,7 +6,7 @@ from shared.channel import FloatArray, IntArray
 from shared.drift import Drift
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.arrivals import Arrivals
-from shared.fleetplan.measured import NOTHING_MEASURED, Measured
+from shared.fleetplan.gain_measurements import NOTHING_MEASURED, Measured
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory
 from simulator.policies.mpc import RecedingHorizon

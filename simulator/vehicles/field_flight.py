@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shared.wire import Mode
+from shared.schemas import Mode
 from simulator.errors import VehicleError
 from simulator.flying.flight import Flight, exchange_fields
 from simulator.flying.pilots import Choice

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from shared.missions import MissionStatus
 from shared.scenario import Scenario
-from shared.wire import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
+from shared.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from simulator.client import AsyncEdgeClient, Exchange
 from simulator.client.observation_report import decide_request
 from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable, UsageError

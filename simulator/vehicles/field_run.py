@@ -11,7 +11,7 @@ from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextma
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared.wire import Mode
+from shared.schemas import Mode
 from simulator.client import AsyncEdgeClient
 from simulator.errors import EdgeError
 from simulator.flying.run import API_KEY

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import psutil
 
-from service.config.processes import slot_of
+from service.config.process_member import slot_of
 from tests.e2e.processes import output_until, started
 from tests.waiting import PATIENCE_S, until
 

@@ -14,7 +14,7 @@ from service.training.teacher_agreement import recall, references
 from service.training.training_loop import losses
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS, Scenario
-from shared.wire import Features
+from shared.schemas import Features
 from simulator.flying.exploration import explore
 from tests.e2e.processes import run, run_here
 

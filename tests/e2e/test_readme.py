@@ -11,7 +11,7 @@ import pytest
 from service.config.settings import Settings
 from shared.guidance import GuidanceStatus
 from shared.reasons import Reason
-from shared.wire import DecideResponse
+from shared.schemas import DecideResponse
 from tests.conftest import Edge
 from tests.e2e.processes import serving_edge
 from tests.waiting import until

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from shared.scenario import SCENARIOS
-from shared.wire import FeedbackRequest, Uplink
+from shared.schemas import FeedbackRequest, Uplink
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport
 from simulator.flying.flight import Flight, fly

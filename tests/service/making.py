@@ -8,7 +8,7 @@ from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.mission.mission import Mission
 from shared.scenario import SCENARIOS
-from shared.wire import MissionSpec, SensorColumns, UavState
+from shared.schemas import MissionSpec, SensorColumns, UavState
 
 PAPER = SCENARIOS["paper"]
 

@@ -17,7 +17,7 @@ from starlette.routing import Route
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
 from shared.scenario import Scenario, scenario_named
-from shared.wire import (
+from shared.schemas import (
     BatchRequest,
     BatchResponse,
     Candidate,

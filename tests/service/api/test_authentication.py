@@ -14,7 +14,7 @@ import pytest
 
 from service.api.api_keys import ApiKeys, BadKeys, KeyFile, Scope, editing
 from service.commands.keys import main
-from shared.wire import DecideRequest
+from shared.schemas import DecideRequest
 from simulator.client import EdgeClient, EdgeRefused
 
 Report = Callable[..., dict[str, Any]]

@@ -19,7 +19,7 @@ from service.cluster.exchange import Exchanged
 from service.cluster.ingress import OwnersGone, ingress_application
 from service.config.settings import Settings
 from shared.missions import MissionLine, MissionList
-from shared.wire import Readiness
+from shared.schemas import Readiness
 from tests.running import serving
 from tests.simulator.edge_stub import free_port
 

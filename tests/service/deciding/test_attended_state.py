@@ -3,7 +3,7 @@ import numpy as np
 from shared.actions import Action
 from shared.channel import channel_gain_db
 from shared.features import FEATURES, urgency
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.service.making import PAPER, attended, mission, uav
 
 

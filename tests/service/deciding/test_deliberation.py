@@ -14,10 +14,10 @@ from fastapi.responses import Response
 
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
-from service.deciding.decision_time import Deadline
 from service.deciding.deliberation import Deliberation, LlmAdvice
 from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
+from service.deciding.stopwatch import Deadline
 from service.learning.trust import LLM
 from service.llm.answers import Completion, NoDecision, TokenPosition
 from service.llm.calibration import calibrated, probabilities
@@ -29,8 +29,8 @@ from shared.actions import Action
 from shared.channel import channel_gain_db
 from shared.features import Reach
 from shared.learned_channel import ExpectedLinks
+from shared.schemas import MissionSpec, Outcome
 from shared.trajectory import trajectories
-from shared.wire import MissionSpec, Outcome
 from tests.running import listening, serving
 from tests.service.making import PAPER, attended, uav
 from tests.service.stub_llm import FAULTS, StubLlm, misbehaving, said, wait_for

@@ -60,7 +60,7 @@ def test_the_policy_decides_for_a_late_critic(
 
         with monkeypatch.context() as late:
             # The LLM has all the time that it needs, and the evaluator none after it.
-            late.setattr("service.deciding.decision_time.time", clock)
+            late.setattr("service.deciding.stopwatch.time", clock)
             late.setattr(LlmQueries, "ask", until_all_time_is_over)
             answer = client.post("/decide", json=report(step=1)).json()
         assert (answer["source"], answer["model"], answer.get("guided")) == ("policy", None, None)
@@ -124,7 +124,7 @@ def test_in_a_batch_the_critic_may_take_what_the_others_do_not_need(
         return told
 
     monkeypatch.setattr(LlmQueries, "ask", lingering)
-    monkeypatch.setattr("service.deciding.decision_time.time", clock)
+    monkeypatch.setattr("service.deciding.stopwatch.time", clock)
     client = edge(mode="guided", llm_url=NOBODY)
     stuck.gate.shut()
     decisions = client.post("/decide/batch", json={**fleet(report), "deadline_ms": 60_000}).json()["decisions"]

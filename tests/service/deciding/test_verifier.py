@@ -13,7 +13,7 @@ from service.deciding.verifier import verify
 from service.llm.answers import NoDecision
 from service.mission.mission import Mission
 from shared.actions import Action
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.running import serving
 from tests.service.making import attended, mission, uav
 from tests.service.stub_llm import StubLlm, wait_for

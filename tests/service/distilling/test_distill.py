@@ -34,7 +34,7 @@ from service.distilling.examples import (
 from service.distilling.examples_file import examples_of
 from service.distilling.loss import Outputs, Targets, answer_loss, loss_of
 from service.distilling.options import Distill
-from service.llm.adapter import PROMPT_VERSION, check_adapter
+from service.llm.adapter_version import PROMPT_VERSION, check_adapter
 from service.llm.answers import Completion
 from service.llm.calibration import probabilities
 from service.llm.client import LLMClient

@@ -13,9 +13,9 @@ import pytest
 from fastapi.responses import JSONResponse, Response
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.decision_time import Deadline
 from service.deciding.deliberation import LlmAdvice
 from service.deciding.llm_query import LlmQueries
+from service.deciding.stopwatch import Deadline
 from service.llm.request_bodies import constrain_labels
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
@@ -161,7 +161,7 @@ def test_a_server_that_hangs_keeps_no_fleet_waiting(
         return await ask_for_fleet(self, mission, states, deadline)
 
     clock = Clock()
-    monkeypatch.setattr("service.deciding.decision_time.time", clock)
+    monkeypatch.setattr("service.deciding.stopwatch.time", clock)
     monkeypatch.setattr(LlmQueries, "ask_for_fleet", timed)
     # The rest of the deadline passes in real time, and eight evaluations are slow on a busy machine.
     monkeypatch.setattr("service.deciding.rollout_evaluator._FUTURES", 1)

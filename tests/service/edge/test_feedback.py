@@ -19,7 +19,7 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import NullJournal
 from shared.actions import Action
-from shared.wire import MissionSpec, Outcome
+from shared.schemas import MissionSpec, Outcome
 from tests.service.keeping import fly, running, same, settled, state
 from tests.service.making import attended, uav
 

@@ -23,10 +23,10 @@ from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import LlmServer
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
-from service.prompting.prompt import Template
+from service.prompting.paper_prompt import Template
 from shared.actions import Action
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.running import serving
 from tests.service.api.test_routes import fields
 from tests.service.making import PAPER, attended, mission, uav

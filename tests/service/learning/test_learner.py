@@ -13,7 +13,7 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner, descend
 from service.learning.modules import Modules, Sample
 from shared.features import FEATURES, LEVEL_FEATURES
-from shared.wire import Features
+from shared.schemas import Features
 
 Scores = tuple[float, ...]
 
@@ -204,7 +204,7 @@ def test_nothing_brings_torchs_compiler_into_the_process() -> None:
     # Its import takes seconds, on a busy machine longer than a decision may.
     script = (
         "import sys; from service.mission.mission import Mission; from service.config.settings import Settings;"
-        "from shared.wire import MissionSpec; from tests.service.learning.test_learner import sample;"
+        "from shared.schemas import MissionSpec; from tests.service.learning.test_learner import sample;"
         "Mission('m', MissionSpec(), Settings()).learner.update(sample('reach'), 0.3);"
         "print([m for m in ('torch._dynamo', 'torch._inductor', 'sympy') if m in sys.modules])"
     )

@@ -26,7 +26,7 @@ from service.prompting.prompt import Prompt
 from service.prompting.row_formats import FORMATS
 from service.prompting.token_accounting import UnprunedState
 from service.storage.rows import decode, encode, pack
-from shared.wire import DecideResponse, Outcome, Tokens
+from shared.schemas import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge
 from tests.service.making import attended, mission, uav
 from tests.waiting import PATIENCE_S, Gate, until

@@ -6,7 +6,7 @@ import pytest
 
 from service.live.fleet_watch import FleetWatch
 from service.mission.mission import Mission
-from shared.wire import UavState
+from shared.schemas import UavState
 from tests.service.making import mission, uav
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.config.settings import Settings
 from service.llm.embedded import EmbeddedServer, LoadFailed
 from service.llm.hosted import host, hosted

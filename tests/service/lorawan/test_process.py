@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-_MODULES = ("service.commands.mqtt", *(f"service.lorawan.{name}" for name in ("reporting", "subscription")))
+_MODULES = ("service.commands.mqtt", *(f"service.lorawan.{name}" for name in ("edge_sender", "subscription")))
 _ABSENT = ("torch", "fastapi", "sqlalchemy", "structlog", "pydantic_settings", "scipy", "uvicorn", "simulator")
 
 

@@ -3,7 +3,7 @@ import pytest
 from service.errors import Conflict, NotFound
 from service.mission.mission import Mission
 from shared.actions import Action
-from shared.wire import Outcome
+from shared.schemas import Outcome
 from tests.service.making import attended, mission, uav
 
 

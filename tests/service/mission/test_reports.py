@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from shared.wire import INCOMPLETE
+from shared.schemas import INCOMPLETE
 from tests.service.keeping import running
 
 Body = dict[str, Any]

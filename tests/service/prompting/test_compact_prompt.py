@@ -18,7 +18,7 @@ from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, di
 from service.prompting.experiences import Experience
 from shared.actions import Action
 from shared.scenario import SCENARIOS, Scenario
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from simulator.client.observation_report import decide_request
 from simulator.world import PipelineWorld
 from tests.service.making import PAPER, attended

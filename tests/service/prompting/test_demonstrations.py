@@ -14,7 +14,7 @@ from shared.actions import Action
 from shared.features import State
 from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from shared.scenario import SCENARIOS, Scenario
-from shared.wire import MissionSpec, Outcome, PromptStyle
+from shared.schemas import MissionSpec, Outcome, PromptStyle
 from simulator.flying.exploration import explore
 from tests.service.making import PAPER, attended, mission, uav
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from service.prompting.experiences import Experience, Experiences
 from shared.actions import Action
-from shared.wire import MissionSpec, Outcome, PromptStyle, Selection
+from shared.schemas import MissionSpec, Outcome, PromptStyle, Selection
 from tests.service.making import attended, mission, uav
 
 SELECTIONS: tuple[Selection, ...] = get_args(Selection)

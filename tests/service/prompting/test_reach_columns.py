@@ -11,8 +11,8 @@ from service.prompting.row_formats import columns
 from shared.channel import link_holds, packets_per_step
 from shared.features import FEATURES, LEVEL_FEATURES, distances_between, places_ahead
 from shared.scenario import SCENARIOS, Point
+from shared.schemas import Features, MissionSpec, PromptStyle, UavState
 from shared.trajectory import trajectories
-from shared.wire import Features, MissionSpec, PromptStyle, UavState
 from tests.service.making import PAPER, attended, mission, uav
 
 PATH = trajectories(PAPER)[0]

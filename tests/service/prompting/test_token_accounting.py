@@ -10,7 +10,7 @@ from service.prompting.row_formats import FORMATS
 from service.prompting.token_accounting import TokenCounter, UnprunedState, price_usd
 from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
 from shared.scenario import Scenario
-from shared.wire import Features, MissionSpec, PromptStyle
+from shared.schemas import Features, MissionSpec, PromptStyle
 from tests.service.making import attended, mission, uav
 
 COUNTER = TokenCounter(Settings().cache_dir)

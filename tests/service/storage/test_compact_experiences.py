@@ -10,7 +10,7 @@ from typing import Any
 
 from service.config.settings import Settings
 from service.mission.mission import Mission
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.running import serving
 from tests.service.keeping import copy_of, fly, running, state
 from tests.service.stub_llm import StubLlm, wait_for

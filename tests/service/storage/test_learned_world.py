@@ -16,8 +16,8 @@ from service.storage.store import Store
 from shared.actions import Action
 from shared.channel import channel_gain_db
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
+from shared.schemas import MissionSpec, Outcome, SensorColumns, UavState
 from shared.trajectory import trajectories
-from shared.wire import MissionSpec, Outcome, SensorColumns, UavState
 from tests.service.keeping import same, state
 from tests.service.making import PAPER, attended
 from tests.waiting import PATIENCE_S

@@ -19,7 +19,7 @@ from service.storage.locks import StoreUnusable
 from service.storage.operations import Deleted, Made
 from service.storage.schema import SCHEMA
 from service.storage.store import Store
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.service.keeping import written
 
 TERM_S = 3600.0

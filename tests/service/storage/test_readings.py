@@ -14,7 +14,7 @@ from service.storage.recovery import restore_mission
 from service.storage.rows import decode
 from service.storage.store import Store
 from shared.readings import SensorReading
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.service.keeping import state
 from tests.service.storage.test_learned_world import SENSORS, Flight, the_same
 from tests.waiting import PATIENCE_S

@@ -28,7 +28,7 @@ from service.storage.store import Store, StoredMission
 from service.storage.writer import Done, WriteFailed, Writer
 from shared.actions import Action
 from shared.scenario import Scenario
-from shared.wire import MissionSpec, Outcome
+from shared.schemas import MissionSpec, Outcome
 from tests.running import serving
 from tests.service.keeping import copy_of, fly, locked, running, same, settled, state, writers
 from tests.service.making import attended, uav

@@ -20,7 +20,7 @@ from service.storage.locks import StoreUnusable
 from service.storage.operations import Change, Checkpoint, Deleted, Made
 from service.storage.store import Store
 from service.storage.writer import WriteFailed
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from tests.e2e.processes import serving_edge
 from tests.service.keeping import fly, kept, running, writers, written
 from tests.waiting import PATIENCE_S

@@ -9,7 +9,7 @@ from service.mission.mission import Mission
 from service.training.recorded_states import recorded_states
 from shared.rollouts import RolloutStep
 from shared.scenario import SCENARIOS, Scenario
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from simulator.flying.exploration import explore
 
 SHORT = SCENARIOS["paper"].model_copy(update={"steps": 8})

@@ -13,11 +13,11 @@ import httpx
 import pytest
 
 from shared.scenario import SCENARIOS
-from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, UavState
+from shared.schemas import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, UavState
 from simulator.client import AsyncEdgeClient, EdgeClient
-from simulator.client.calls import edge_url
 from simulator.client.lossy_transport import LossyTransport
 from simulator.client.observation_report import decide_request
+from simulator.client.retries_and_redirects import edge_url
 from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from simulator.world import PipelineWorld
 from tests.running import Handler, listening
@@ -86,7 +86,7 @@ def test_an_exchange_is_measured(
     stub: EdgeStub, request_: DecideRequest, client: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = Clock()
-    monkeypatch.setattr("simulator.client.calls.time", clock)
+    monkeypatch.setattr("simulator.client.retries_and_redirects.time", clock)
     stub.script = ["slow"]
 
     def take_an_hour() -> None:

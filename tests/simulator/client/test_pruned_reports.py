@@ -19,7 +19,7 @@ from service.mission.mission import Mission
 from shared.features import FEATURES
 from shared.missions import MissionAttention
 from shared.scenario import SCENARIOS
-from shared.wire import Belief, Features, FeedbackRequest, MissionSpec, Outcome
+from shared.schemas import Belief, Features, FeedbackRequest, MissionSpec, Outcome
 from simulator.client import EdgeClient
 from simulator.client.observation_report import decide_request
 from simulator.client.pruned_reports import REFRESH_STEPS, Attention, PrunedReports

@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from shared.scenario import SCENARIOS
-from shared.wire import BatchRequest, DecideRequest, MissionSpec, UavState
+from shared.schemas import BatchRequest, DecideRequest, MissionSpec, UavState
 from simulator.client import EdgeClient
 from simulator.client.observation_report import decide_request
 from simulator.client.report_encoders import DeltaReports

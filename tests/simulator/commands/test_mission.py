@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.wire import DecideRequest
+from shared.schemas import DecideRequest
 from simulator.commands import mission
 from tests.simulator.edge_stub import EdgeStub, stub_edge
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from shared.wire import DecideRequest, MissionSpec
+from shared.schemas import DecideRequest, MissionSpec
 from simulator.commands import replay, simulate
 from simulator.commands.replay import logged_mission
 from simulator.records.decision_log import read_decisions

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from shared.scenario import SCENARIOS
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from simulator.commands import simulate
 from simulator.records.decision_log import read_decisions
 from simulator.records.run_folder import DRAWN

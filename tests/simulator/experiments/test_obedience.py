@@ -10,7 +10,7 @@ import pytest
 from service.guidance.order_examples import EXAMPLES
 from service.guidance.order_grammar import admissible
 from shared.guidance import NO_GUIDANCE, Guidance, SensorWish
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from simulator.client import EdgeClient
 from simulator.experiments.edges import EdgeAt
 from simulator.experiments.execution import fly_with_edge

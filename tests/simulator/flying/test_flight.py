@@ -69,7 +69,7 @@ def test_an_interrupt_keeps_the_whole_steps(stub: EdgeStub, client: EdgeClient, 
 
 def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
-    monkeypatch.setattr("simulator.client.calls.time", clock)
+    monkeypatch.setattr("simulator.client.retries_and_redirects.time", clock)
     stub.script = ["slow"]
 
     def take_an_hour() -> None:

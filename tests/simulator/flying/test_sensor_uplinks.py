@@ -13,7 +13,7 @@ import pytest
 from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.records import Records, take_readings
 from shared.scenario import scenario_named
-from shared.wire import MissionSpec
+from shared.schemas import MissionSpec
 from simulator.client import EdgeClient
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from shared.schemas import DecideRequest
 from shared.trajectory import trajectories
-from shared.wire import DecideRequest
 from simulator.client import AsyncEdgeClient, EdgeClient
 from simulator.errors import UsageError, VehicleError
 from simulator.records.decision import Decision

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from service.config.settings import SHIPPED_ADAPTER, Settings
-from service.llm.adapter import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+from service.llm.adapter_version import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
 from service.llm.answers import Completion
 from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
@@ -19,7 +19,7 @@ from service.llm.model_file import GGUF_NAME, GGUF_SHA256, sha256
 from service.llm.request_bodies import Rewriting
 from service.llm.server import LlmServer, ServerStatus
 from service.prompting.compact_prompt import CompactTemplate
-from service.prompting.prompt import Template
+from service.prompting.paper_prompt import Template
 from service.prompting.warm_up import warm_up
 from shared.scenario import SCENARIOS
 from tests.waiting import soon

@@ -10,12 +10,12 @@ from tests.waiting import PATIENCE_S
 # Each child is this program after the fork: it ends as the test says.
 _PROGRAM = """
 import os, signal, socket, sys
-from service.commands import processes
+from service.commands import process_parent
 from service.config.settings import Settings
-processes._FIRST_PAUSE_S = 0.001
+process_parent._FIRST_PAUSE_S = 0.001
 with socket.create_server(("127.0.0.1", 0)) as listener:
     settings = Settings(store="none", processes=2, log_format=sys.argv[2])
-    member = processes.Parent(settings, listener).run()
+    member = process_parent.Parent(settings, listener).run()
 if isinstance(member, int):
     sys.exit(member)
 {ends}

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from service.lorawan.configuration import Configuration
 from service.lorawan.counts import Counts
-from service.lorawan.intake import Intake, Taken, Waiting
 from service.lorawan.uplinks import Uplink, chirpstack, the_things_stack
+from service.lorawan.waiting_readings import Intake, Taken, Waiting
 from tests.service.lorawan.messages import (
     APPLICATION,
     NOW,

@@ -16,8 +16,8 @@ import uvicorn
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
 
-from service.config.processes import Member
-from service.server.moving import CONNECTION, MovableHttpProtocol, MovedConnections, Mover, request_bytes
+from service.config.process_member import Member
+from service.server.connection_handover import CONNECTION, MovableHttpProtocol, MovedConnections, Mover, request_bytes
 from tests.waiting import PATIENCE_S
 
 HERE, THERE = 0, 1

@@ -9,10 +9,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.lorawan.intake import Intake, Waiting
-from service.lorawan.reporting import Reporting
+from service.lorawan.edge_sender import Reporting
+from service.lorawan.waiting_readings import Intake, Waiting
 from tests.service.lorawan.messages import chirpstack_up, packed
-from tests.service.lorawan.test_intake import intake
+from tests.service.lorawan.test_waiting_readings import intake
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]
@@ -46,7 +46,7 @@ def counted(taking: Intake) -> dict[str, float]:
 
 
 def test_readings_enter_the_mission_of_a_real_edge(edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.lorawan.reporting._AGAIN_S", 0.0)
+    monkeypatch.setattr("service.lorawan.edge_sender._AGAIN_S", 0.0)
     client = edge()
     taking = taken(queue=33.0)
     taken(queue=7.0, device=1, age_s=130.0, into=taking)

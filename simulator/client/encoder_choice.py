@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.wire import Uplink
+from shared.schemas import Uplink
 from simulator.client.report_encoders import DeltaReports, FullReports
 
 

@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from service.config.processes import slot_of
+from service.config.process_member import slot_of
 
 MISSIONS = [f"mission-{number}" for number in range(2000)]
 

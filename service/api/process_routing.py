@@ -1,7 +1,8 @@
 """Requests where one edge has several processes: each reaches the process that decides its mission.
 
-A request about another process's mission moves there with its connection (:mod:`service.server.moving`). Requests about
-the whole edge are answered for all its processes: each is asked over its Unix socket, with the request's own key.
+A request about another process's mission moves there with its connection, by
+:mod:`service.server.connection_handover`. Requests about the whole edge are answered for all its processes: each is
+asked over its Unix socket, with the request's own key.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.merging import DECIDED_AT, Answer, merged_metrics, merged_missions, merged_readiness
 from service.api.problem_details import problem_response
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.errors import Elsewhere
-from service.server.moving import ARRIVED, CONNECTION, MovableHttpProtocol, Mover, request_bytes
+from service.server.connection_handover import ARRIVED, CONNECTION, MovableHttpProtocol, Mover, request_bytes
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,15 @@ import pytest
 from pydantic import ValidationError
 
 from shared.scenario import SCENARIOS
-from shared.wire import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, Outcome, PromptStyle, SensorColumns
+from shared.schemas import (
+    BatchRequest,
+    DecideRequest,
+    FeedbackRequest,
+    MissionSpec,
+    Outcome,
+    PromptStyle,
+    SensorColumns,
+)
 
 DECISION = "0123456789abcdef0123456789abcdef"
 

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.mission.learned_world import learned_world
+from service.mission.learned_world_status import learned_world
 from shared.channel import channel_gain_db
 from shared.fleetplan import FleetBelief
 from shared.missions import MissionStatus

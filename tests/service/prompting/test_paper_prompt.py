@@ -5,10 +5,11 @@ from typing import Any, Literal
 import pytest
 
 from service.errors import Refused
-from service.prompting.prompt import Prompt, Template
+from service.prompting.paper_prompt import Template
+from service.prompting.prompt import Prompt
 from shared.actions import Action
 from shared.scenario import SCENARIOS
-from shared.wire import MissionSpec, Outcome, PromptStyle
+from shared.schemas import MissionSpec, Outcome, PromptStyle
 from tests.service.making import PAPER, attended, mission, uav
 
 Format = Literal["csv", "json", "markdown"]

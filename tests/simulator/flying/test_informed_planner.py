@@ -7,7 +7,7 @@ import pytest
 
 from shared.scenario import SCENARIOS
 from simulator.flying.flight import Flight, fly
-from simulator.flying.informed import InformedPilot, InformedPlanner
+from simulator.flying.informed_planner import InformedPilot, InformedPlanner
 from simulator.flying.pilots import LocalPilot
 from simulator.sites.site import Site
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.config.settings import Settings
 from service.storage.locks import FileLock, StoreUnusable, sqlite_file
 

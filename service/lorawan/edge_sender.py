@@ -11,9 +11,9 @@ import httpx
 from pydantic import ValidationError
 
 from service.lorawan.counts import Counts
-from service.lorawan.intake import Intake, Waiting
+from service.lorawan.waiting_readings import Intake, Waiting
 from shared.readings import MAX_AGE_S, ReadingsRequest, ReadingsResponse, SensorReading
-from shared.wire import Problem
+from shared.schemas import Problem
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
 from shared.readings import ReadingsRequest, ReadingsResponse
-from shared.wire import (
+from shared.schemas import (
     INCOMPLETE,
     MAX_ROUND_TRIP_MS,
     BatchRequest,
@@ -39,7 +39,7 @@ from shared.wire import (
     UavState,
     Uplink,
 )
-from simulator.client.uplinks import encoder_of
+from simulator.client.encoder_choice import encoder_of
 from simulator.errors import EdgeAddressWrong, EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 
 RETRIED_STATUS = frozenset({408, 429, 502, 503, 504})

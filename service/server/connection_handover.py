@@ -18,7 +18,7 @@ from typing import Any
 
 from starlette.types import Scope
 
-from service.config.processes import Member
+from service.config.process_member import Member
 from service.server.connection_limits import BoundedHttpProtocol
 
 # The entry of an ASGI scope with the request's connection.

@@ -1,0 +1,112 @@
+"""The paper's long prompt, of mode ``llm``: a table of the sensors, answered by a sensor and a velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from service.prompting.demonstrations import Solved
+from service.prompting.prompt import Prompt, note_block
+from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
+from service.prompting.token_accounting import UnprunedState
+from shared.actions import Action
+from shared.features import State
+from shared.scenario import Scenario
+from shared.schemas import Features, PromptStyle
+
+_STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
+At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.
+
+Goal: lose no packets. A sensor's queue holds {capacity} packets; what arrives beyond that is lost. \
+A transmission fails beyond {radius:g} m, or at a channel gain of {limit:g} dB or below.
+
+{introduction}
+{meanings}
+
+Rules:
+1. Prefer a full queue, then a long age.
+2. The sensor must be in reach after the UAV has moved.
+3. Velocity is a whole number from 0 to {max_velocity} m/s. Fly slowly to stay near a far sensor with a full queue, \
+fast when the sensor is near or there is little to collect.
+
+{note}{experiences}{demonstrations}Answer with two whole numbers and nothing else: sensor_id velocity"""
+
+_EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
+
+
+class Template:
+    """The template of one mission's prompts.
+
+    Args:
+        scenario: the mission's world.
+        style: the rows' format; the caller orders the rows.
+        features: the preset, which determines a row's columns.
+        experiences: the most experiences of a prompt; with 0 the static block does not mention them.
+        ranked: whether the rows are ordered best first.
+        demonstrations: worked examples for the static block.
+        note: the operator's note.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        style: PromptStyle | None = None,
+        features: Features = "paper",
+        *,
+        experiences: int = 8,
+        ranked: bool = True,
+        demonstrations: Sequence[Solved] = (),
+        note: str | None = None,
+    ) -> None:
+        self._format = FORMATS[(style and style.format) or "csv"]
+        self._columns = columns(features)
+        self.demonstrations = "".join(map(self._demonstration, demonstrations))
+        examples = f"{_EXAMPLES}\n\n{self.demonstrations}" if demonstrations else ""
+        order = "the most promising first" if ranked else "in no particular order"
+        self.static = _STATIC.format(
+            step_s=scenario.step_s,
+            capacity=scenario.queue_capacity,
+            radius=scenario.radio_radius_m,
+            limit=-scenario.path_loss_limit_db,
+            max_velocity=scenario.max_velocity,
+            introduction=self._format.introduction(self._columns, order),
+            meanings=meanings(features),
+            note=note_block(note),
+            experiences=f"{self._format.experience_note}\n\n" if experiences else "",
+            demonstrations=examples,
+        )
+
+    def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
+        """One line of the experiences: the chosen sensor's row, the decision, and its cost, which has the failure."""
+        return self._format.experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.1f}")
+
+    def unreported_row(self, sensor_id: int) -> Cells:
+        """The row of a sensor that the report lacks."""
+        return {**dict.fromkeys(self._columns, UNKNOWN), "sensor_id": str(sensor_id)}
+
+    def prompt(
+        self, state: State, kept_rows: Sequence[int], experiences: Sequence[str], nearest: Sequence[str] = ()
+    ) -> Prompt:
+        """The prompt for one decision.
+
+        Args:
+            kept_rows: the rows of the state to show, in this order.
+            experiences: the lines of the block of experiences.
+            nearest: lines of experiences for this prompt alone.
+        """
+        header = self._format.experience_header(self._columns)
+        retrieved = "".join(nearest)
+        if nearest and not experiences:
+            retrieved = header + retrieved
+        last = retrieved + (self._format.gap if experiences or nearest else "")
+        return Prompt(
+            static=self.static,
+            experiences=(header if experiences else "") + "".join(experiences),
+            state=last + self._table(cells(state, kept_rows)),
+            uncompressed=UnprunedState(state, self._format.row, last + self._format.header(full_columns(state))),
+        )
+
+    def _demonstration(self, solved: Solved) -> str:
+        return f"{self._table(solved.rows)}Answer: {solved.sensor_id} {solved.velocity}\n\n"
+
+    def _table(self, rows: Sequence[Cells]) -> str:
+        return "".join((self._format.header(rows[0]), *map(self._format.row, rows))) if rows else ""
