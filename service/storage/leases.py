@@ -3,16 +3,22 @@
 A lease has an owner, an epoch and an end. The owner is one process's life. The epoch grows when another owner takes the
 lease, and never shrinks. Only the database's clock counts. The transaction that writes the journal locks the leases of
 its missions and compares their epochs (:meth:`Leases.fence`): an owner that was paused or cut off writes nothing into
-what its successor wrote, whatever its own clock says.
+what its successor wrote, whatever its own clock says. No transaction that locks a lease waits for its edge.
 """
 
 from __future__ import annotations
 
 import uuid
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
+
+if TYPE_CHECKING:
+    # The driver is of the extra `postgres`.
+    from psycopg import Connection
 
 # A lease's end is reckoned where its row is locked, not where the statement began, which may have waited for the lock.
 _ACQUIRE = sa.text("""
@@ -53,7 +59,15 @@ _UNOWNED = sa.text("""
         WHERE leases.mission_id = missions.mission_id AND owner <> :owner AND expires_at > clock_timestamp()
     )
 """)
-_FENCE = "SELECT mission_id, epoch FROM leases WHERE mission_id = ANY(%s) AND owner = %s ORDER BY mission_id FOR SHARE"
+# Fails by a division by zero unless every lease is there: the statements sent after it then have no effect.
+_FENCE = """
+    SELECT 1 / (count(*) = %s)::int FROM (
+        SELECT FROM leases
+        JOIN unnest(%s::text[], %s::bigint[]) AS written (mission_id, epoch) USING (mission_id, epoch)
+        WHERE owner = %s ORDER BY mission_id FOR SHARE OF leases
+    ) AS held
+"""
+_OWN = sa.text("SELECT mission_id, epoch FROM leases WHERE mission_id = ANY(:mission_ids) AND owner = :owner")
 
 
 class LeaseLost(Exception):
@@ -96,7 +110,7 @@ class Leases:
             term_s: seconds until the lease ends.
         """
         new = {"mission_id": mission_id, "owner": self._owner, "address": address, "term_s": term_s}
-        with self._engine.begin() as db:
+        with self._alone() as db:
             epoch = db.scalar(_ACQUIRE, new)
             if epoch is not None:
                 return int(epoch)
@@ -105,37 +119,50 @@ class Leases:
 
     def renew(self, term_s: float) -> dict[str, int]:
         """Prolong every lease of this owner that has not ended; returns their missions with their epochs."""
-        with self._engine.begin() as db:
+        with self._alone() as db:
             rows = db.execute(_RENEW, {"owner": self._owner, "term_s": term_s}).all()
         return {row.mission_id: row.epoch for row in rows}
 
     def release(self) -> None:
         """End every lease of this owner now; the epochs stay."""
-        with self._engine.begin() as db:
+        with self._alone() as db:
             db.execute(_RELEASE, {"owner": self._owner})
 
     def taken(self, mission_ids: Collection[str]) -> set[str]:
         """Those of the missions that other owners have taken over."""
-        with self._engine.connect() as db:
+        with self._alone() as db:
             return set(db.scalars(_FOREIGN, {"mission_ids": list(mission_ids), "owner": self._owner}))
 
     def unowned(self) -> list[str]:
         """The IDs of all stored missions that no other edge owns."""
-        with self._engine.connect() as db:
+        with self._alone() as db:
             return list(db.scalars(_UNOWNED, {"owner": self._owner}))
 
-    def fence(self, db: sa.Connection, missions: Collection[tuple[str, int]]) -> None:
+    def fence(self, db: Connection[tuple[Any, ...]], missions: Collection[tuple[str, int]]) -> None:
         """Keep the missions' leases from being taken over until the transaction ends.
 
-        A lease that has ended is no obstacle as long as nobody else has taken it.
+        A lease that has ended is no obstacle as long as nobody else has taken it. Where another owner has one of them,
+        or has had it since that epoch, the statement fails by a division by zero, and with it the transaction. In a
+        pipeline nothing waits for its answer.
 
         Args:
             missions: IDs and epochs.
-
-        Raises:
-            LeaseLost: another owner has one of the missions, or has had it since that epoch.
         """
-        names = sorted({mission_id for mission_id, _ in missions})
-        rows = db.exec_driver_sql(_FENCE, (names, self._owner)).all()
-        if lost := set(missions) - {(mission_id, epoch) for mission_id, epoch in rows}:
-            raise LeaseLost(lost)
+        names, epochs = zip(*missions, strict=True)
+        db.execute(_FENCE, (len(missions), list(names), list(epochs), self._owner))
+
+    def lost(self, missions: Collection[tuple[str, int]]) -> set[tuple[str, int]]:
+        """Those of the missions and epochs whose lease another owner has taken over."""
+        names = [mission_id for mission_id, _ in missions]
+        with self._alone() as db:
+            rows = db.execute(_OWN, {"mission_ids": names, "owner": self._owner}).all()
+        return set(missions) - {(row.mission_id, row.epoch) for row in rows}
+
+    @contextmanager
+    def _alone(self) -> Iterator[sa.Connection]:
+        """A connection on which each statement is a transaction.
+
+        An edge that is paused between a statement and its commit would keep the rows locked from its successors.
+        """
+        with self._engine.connect() as db:
+            yield db.execution_options(isolation_level="AUTOCOMMIT")

@@ -8,13 +8,18 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
 
-from service.storage.leases import Leases
+from service.storage.leases import LeaseLost, Leases
 from service.storage.operations import Change
 from service.storage.rows import Statement, Statements
 from service.storage.writer import Done
+
+if TYPE_CHECKING:
+    # The driver is of the extra `postgres`.
+    from psycopg import Connection
 
 
 class ThreadWriter:
@@ -32,7 +37,7 @@ class ThreadWriter:
         self._statements = statements
         self._leases = leases
         self._engine = engine
-        self._connection: sa.Connection | None = None
+        self._connection: sa.PoolProxiedConnection | None = None
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         # A daemon: the end of the edge does not wait for a database that hangs.
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
@@ -52,8 +57,7 @@ class ThreadWriter:
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             job()
-        if self._connection is not None:
-            self._connection.close()
+        self._disconnect()
 
     def _write(
         self,
@@ -64,16 +68,39 @@ class ThreadWriter:
     ) -> None:
         failure: Exception | None = None
         try:
-            # A connection of its own: one from the pool would be tried before each transaction.
-            if self._connection is None or self._connection.closed or self._connection.invalidated:
-                self._connection = self._engine.connect()
-            with self._connection.begin():
-                db = self._connection
-                self._leases.fence(db, missions)
-                for sql, rows in transaction:
-                    db.exec_driver_sql(sql, rows)
+            self._transact(missions, transaction)
         except Exception as error:
             failure = error
+            if not isinstance(error, LeaseLost):
+                self._disconnect()
         # The event loop is closed if the edge has ended meanwhile.
         with suppress(RuntimeError):
             loop.call_soon_threadsafe(done, failure)
+
+    def _transact(self, missions: set[tuple[str, int]], transaction: Sequence[Statement]) -> None:
+        """One transaction in one round trip: the database waits for nothing while it has rows locked."""
+        from psycopg.errors import DivisionByZero
+
+        # A connection of its own: one from the pool would be tried before each transaction.
+        if self._connection is None:
+            self._connection = self._engine.raw_connection()
+        db: Connection[tuple[Any, ...]] = self._connection.driver_connection  # type: ignore[assignment]
+        db.autocommit = True
+        try:
+            with db.pipeline():
+                db.execute("BEGIN")
+                self._leases.fence(db, missions)
+                for sql, rows in transaction:
+                    db.cursor().executemany(sql, rows)
+                db.execute("COMMIT")
+        except DivisionByZero:
+            db.rollback()
+            if lost := self._leases.lost(missions):
+                raise LeaseLost(lost) from None
+            raise
+
+    def _disconnect(self) -> None:
+        """Close the connection, which may be broken or in the midst of a transaction."""
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.invalidate()
