@@ -44,8 +44,9 @@ from shared.fleetplan.problem import Course, FleetProblem, expected_packets, fly
 Visits = list[tuple[Any, int, int]]
 Links = Literal["exact", "cautious", "hopeful"]
 
-# The lowest chances of the tiers of uncertain links, percent.
-_TIERS = (35, 80)
+# The lowest chances of the tiers of uncertain links, percent. The lowest tier is for sensors whose links are all weak:
+# without it no plan visits them, and 60 worlds of scenario `shadowed` lost 67 packets each instead of 57.
+_TIERS = (8, 35, 80)
 # The cost of a lost packet. CP-SAT's objective has integer coefficients, and an expected loss may be a fraction.
 SCALE = 100
 

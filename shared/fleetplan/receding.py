@@ -17,6 +17,7 @@ from shared.fleetplan.arrivals import Arrivals
 from shared.fleetplan.belief import FAR_M, FleetBelief
 from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import FleetProblem, price
+from shared.fleetplan.refinement import refined
 from shared.fleetplan.risk import neglect
 from shared.fleetplan.solver import Budget, Plan, plan
 from shared.guidance import NO_GUIDANCE, Guidance
@@ -76,7 +77,10 @@ class Draft:
         if not self.saved:
             greedy = look_ahead(self.problem)
             start = min(start, greedy, key=lambda actions: price(self.problem, actions)[1])
-        return plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
+        found = plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
+        if self.problem.chances is None:
+            return found
+        return refined(self.problem, found, seconds - found.seconds)
 
 
 class RecedingHorizon:
