@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from shared.channel import FloatArray, IntArray
 from shared.shadowing import KINDS, OFFSET_WEIGHT, PRIOR_DB, PRIOR_WEIGHT, likelihoods
 
 # Measurements that a map keeps, of all sensors together and of one.
-_MOST_KEPT, _MOST_OF_ONE = 4096, 24
+_MOST_KEPT, _MOST_OF_ONE = 4096, 36
 # A measurement counts as at most this much, dB: it bounds how far a wrong report moves the map.
 LARGEST_EXCESS_DB = 40.0
 # A measurement this many standard deviations off its prediction counts less, as in Huber's estimator.
@@ -24,8 +24,8 @@ _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
 # After so many measurements of all sensors, those of the sensors at hand are inverted anew.
 _REFRESH = 500
-# Measurements of a sensor within this distance are of the same place, metres.
-_SAME_PLACE_M = 10.0
+# Measurements of a sensor within this distance are of the same place, metres; so many of one place are kept.
+_SAME_PLACE_M, _MOST_OF_PLACE = 10.0, 2
 
 
 # A packed symmetric matrix has its upper triangle column by column, in half the memory, so that a leading block of it
@@ -110,15 +110,12 @@ class RadioMap:
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        slot = self.count[ids]
-        full = slot == self.excess.shape[1]
-        if full.any():
-            slot = np.where(full, self._dropped(ids, here), slot)
+        slot, dropped = self._slots(ids, here)
         if not self.exact:
             noise = self._replace(ids, slot, here, excess)
         self._taken[ids, slot] = self.heard
         self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
-        self.count[ids] += ~full
+        self.count[ids] += ~dropped
         if self.exact:
             self.deviation_db = 0.0
         elif self.heard >= self._compared:
@@ -160,16 +157,24 @@ class RadioMap:
         self._inverse[ids, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
         return noise
 
-    def _dropped(self, ids: IntArray, here: FloatArray) -> IntArray:
-        """The measurement that a full record of each sensor drops for one here.
+    def _slots(self, ids: IntArray, here: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+        """The slot of each sensor that takes a measurement here, and whether it drops another for it.
 
-        It is the oldest one of the same place, so that no wrong one stays, or else the nearest one, which tells the
-        most of what the new one tells.
+        Two measurements of the same place are kept. A third drops the oldest, so that no wrong one stays. A full record
+        without any of the place drops the nearest one, which tells the most of what the new one tells.
         """
-        apart = np.square(self.places[ids] - here).sum(axis=2)
+        slot, kept = self.count[ids], self.excess.shape[1]
+        used = int(slot.max())
+        if not used:
+            return slot, np.zeros(len(ids), dtype=np.bool_)
+        east, north = (self.places[ids, :used, axis] - here[axis] for axis in (0, 1))
+        apart = np.where(np.arange(used) < slot[:, None], east * east + north * north, np.inf)
         same = apart <= _SAME_PLACE_M**2
-        oldest = np.where(same, self._taken[ids], self.heard).argmin(axis=1)
-        return np.asarray(np.where(same.any(axis=1), oldest, apart.argmin(axis=1)))
+        full = slot == kept
+        repeated = same.sum(axis=1) >= np.where(full, 1, _MOST_OF_PLACE)
+        oldest = np.where(same, self._taken[ids, :used], self.heard).argmin(axis=1)
+        slot = np.where(repeated, oldest, np.where(full, apart.argmin(axis=1), slot))
+        return slot, repeated | full
 
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""

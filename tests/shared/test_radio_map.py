@@ -95,13 +95,34 @@ def test_a_lie_is_bounded_and_one_of_many_reports_hardly_counts() -> None:
     assert (np.abs(lied.predict(PLACES, ALL)[0]) <= LARGEST_EXCESS_DB + 1).all()
 
 
-def test_a_full_record_keeps_the_newest_measurement_of_a_place() -> None:
+def test_two_measurements_of_a_place_are_kept_the_newest() -> None:
     found = RadioMap(10)
     for lap in range(4):
         for place in PLACES:
+            found.measure(ALL, place + lap, np.full(10, 3.0 + lap))
+    assert found.count.tolist() == [2 * len(PLACES)] * 10
+    kept = np.sort(found.excess[0, : found.count[0]])
+    assert kept.tolist() == [5.0] * len(PLACES) + [6.0] * len(PLACES)
+
+
+def test_a_full_record_keeps_the_newest_measurement_of_a_place() -> None:
+    found = RadioMap(10)
+    places = np.array([[40.0 * number, 0.0] for number in range(30)])
+    for lap in range(4):
+        for place in places:
             found.measure(ALL, place, np.full(10, 3.0 + lap))
-    assert found.count.max() == found.excess.shape[1] < 48
-    assert found.predict(PLACES[:1], ALL)[0][0] == pytest.approx([6.0] * 10, abs=1.5)
+    assert found.count.max() == found.excess.shape[1] < 60
+    assert found.predict(places[:1], ALL)[0][0] == pytest.approx([6.0] * 10, abs=1.5)
+
+
+def test_a_record_of_places_never_measured_twice_drops_the_nearest() -> None:
+    found = RadioMap(1)
+    kept = found.excess.shape[1]
+    for number in range(kept):
+        found.measure(np.array([0]), np.array([100.0 * number, 0.0]), np.array([float(number)]))
+    found.measure(np.array([0]), np.array([330.0, 0.0]), np.array([33.0]))
+    assert found.count[0] == kept
+    assert set(range(kept)) - set(found.excess[0].tolist()) == {3} and 33.0 in found.excess[0]
 
 
 @pytest.mark.parametrize("sensors", [1, 10, 1000, 10_000])
