@@ -13,6 +13,7 @@ from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from shared.ray_connection import RayUnusable
+from shared.validation_messages import suggestion
 from simulator.cli.options import check_between, checked_edge, chosen_site
 from simulator.cli.running import command_main
 from simulator.errors import UsageError
@@ -69,6 +70,8 @@ class Options:
     """The world: paper (default), stress, shadowed and others; `aicvds simulate --help` lists them."""
     world: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """A world of your own instead of a scenario: a folder, as for `aicvds simulate --world`."""
+    scheme: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")] = ()
+    """Fly this scheme alone, by its name in results.json; repeatable. Default: every scheme of the experiment."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes for the flights without an edge."""
     ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None
@@ -94,6 +97,7 @@ def experiment(options: Options, argv: list[str], console: Console) -> int:
     """
     chosen = _chosen(options.name)
     setup = setup_of(options)
+    _check_schemes(chosen, setup)
     from simulator.experiments.runner import Run
 
     run = Run(setup, options.out, _commands(options.name, argv), console, options.workers, options.ray)
@@ -128,7 +132,8 @@ def setup_of(options: Options) -> Setup:
         sites |= {name: chosen_site(name, None, options.steps) for name in named if name not in sites}
     pace: Literal["full", "quick"] = "quick" if options.quick else "full"
     edge = None if options.edge is None else checked_edge(options.edge)
-    return Setup(sites, Llm(options.llm, edge), options.model, seeds, min(llm_seeds, seeds), options.steps, pace)
+    llm, llm_seeds = Llm(options.llm, edge), min(llm_seeds, seeds)
+    return Setup(sites, llm, options.model, seeds, llm_seeds, options.steps, pace, options.scheme)
 
 
 def show(result: Result, console: Console) -> None:
@@ -155,6 +160,13 @@ def _chosen(name: str) -> list[Experiment]:
     if name not in EXPERIMENTS:
         raise UsageError(f"there is no experiment {name[:32]!r}: choose one of {', '.join(EXPERIMENTS)}, or {ALL}")
     return [EXPERIMENTS[name]]
+
+
+def _check_schemes(chosen: list[Experiment], setup: Setup) -> None:
+    known = list(dict.fromkeys(scheme.name for each in chosen for scheme in each.schemes(setup)))
+    for name in setup.only:
+        if name not in known:
+            raise UsageError(f"--scheme: choose one of {', '.join(known)}, not {name[:32]!r}{suggestion(name, known)}")
 
 
 def _commands(name: str, argv: list[str]) -> Callable[[Experiment], str]:

@@ -29,6 +29,7 @@ class Setup:
 
     ``sites`` are the worlds by name; an experiment flies the first one, and those that it names. ``seeds`` and
     ``llm_seeds`` are numbers of seeds, from 0. ``steps`` are those of a mission, or ``None`` for the scenario's.
+    ``only`` names the schemes to fly, or none for all.
     """
 
     sites: dict[str, Site]
@@ -38,6 +39,7 @@ class Setup:
     llm_seeds: int = 10
     steps: int | None = None
     pace: Literal["full", "quick"] = "full"
+    only: tuple[str, ...] = ()
 
     @property
     def quick(self) -> bool:
@@ -81,6 +83,10 @@ class Experiment:
     heuristics: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
+    def chosen(self, setup: Setup) -> list[Scheme]:
+        """Its schemes, or those of them that the setup names."""
+        return [scheme for scheme in self.schemes(setup) if not setup.only or scheme.name in setup.only]
+
 
 @dataclass(frozen=True, eq=False)
 class Planned:
@@ -120,7 +126,7 @@ def plan(experiment: Experiment, setup: Setup) -> Plan:
     flights, left_out = [], []
     first = next(iter(setup.sites))
     sites = {name: site for name, site in setup.sites.items() if name == first or name in experiment.worlds}
-    for scheme in experiment.schemes(setup):
+    for scheme in experiment.chosen(setup):
         without_llm = setup.quick and experiment.when_quick == "no_llm"
         missing = isinstance(scheme.decides, OverEdge) and not setup.llm.flies(scheme.decides.backing)
         if scheme.asks_llm and (without_llm or missing):

@@ -70,7 +70,7 @@ class Run:
         return results
 
     def _plans(self, experiments: Sequence[Experiment]) -> list[Plan]:
-        plans = [plan(experiment, self.setup) for experiment in experiments]
+        plans = [plan(each, self.setup) for each in experiments if each.chosen(self.setup)]
         empty = [p.experiment.name for p in plans if not p.flights]
         if len(empty) == len(plans):
             raise UsageError(f"experiment {', '.join(empty)}: every scheme of it asks an LLM; name one with --llm")

@@ -63,6 +63,7 @@ def test_help_tells_what_every_experiment_is() -> None:
         (["aoi", "--edge", "nowhere"], "--edge"),
         (["aoi", "--scenario", "mars"], "--scenario"),
         (["llm-models", "--model", "/no/such.gguf"], "--model /no/such.gguf"),
+        (["aoi", "--scheme", "eoff"], "not 'eoff'; did you mean eof?"),
         (["top-k", "--llm", "none"], "top-k: every scheme of it asks an LLM"),
     ],
 )

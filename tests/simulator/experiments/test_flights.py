@@ -81,6 +81,13 @@ def test_experiments_share_flights_and_a_second_run_flies_nothing(tmp_path: Path
     assert before.items() <= after.items()
 
 
+def test_a_run_flies_only_the_schemes_that_are_chosen(tmp_path: Path) -> None:
+    run = run_in(tmp_path, only=("random",))
+    (result,) = run.make([declared()])
+    assert list(result.schemes) == ["random"]
+    assert run.flown == 3
+
+
 def test_only_a_broken_flight_is_flown_again(tmp_path: Path) -> None:
     first = run_in(tmp_path).make([declared()])
     before = flights_in(tmp_path)
