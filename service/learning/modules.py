@@ -24,11 +24,13 @@ from shared.schemas import Features
 Array = NDArray[np.float32]
 
 WIDTH = 32
+# From so many sensors on, torch's kernel is faster than numpy; from so many, its time is that of the heads' products.
+_FOR_TORCH, _NARROW = 64, 512
+# The kernel is fastest where a head's dimension is a multiple of this.
+_LANES = 16
 # From so many sensors on, the cores share the queries. From 768 queries on, torch's kernel takes 256 at a time: shares
 # of at least four whole blocks give the same result to the bit as one call for all queries.
 _MANY, _BLOCK, _LEAST_BLOCKS = 2048, 256, 4
-# From so many sensors on, torch's kernel is faster than numpy.
-_FOR_TORCH = 64
 
 
 class Sample(NamedTuple):
@@ -96,27 +98,43 @@ def attend(weights: AttentionWeights, x: Tensor, admissible: Tensor | None = Non
     q = functional.linear(wide, weights.query)
     k = functional.linear(wide, weights.key)
     v = functional.linear(wide, weights.value)
-    if admissible is None and n >= _MANY and torch.is_inference_mode_enabled():
-        z = _attend_on_cores(q, k, v)
-    else:
-        mask = None if admissible is None else admissible.reshape(-1, 1, 1, n)
-        z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-    z = z.reshape(*x.shape[:-1], -1)
+    mask = None if admissible is None else admissible.reshape(-1, 1, 1, n)
+    z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).reshape(*x.shape[:-1], -1)
     return functional.linear(z, weights.score, weights.bias)[..., 0], z
 
 
-def _attend_on_cores(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """The contexts of all queries; each core computes a share of them."""
+@torch.inference_mode()
+def attend_narrow(weights: AttentionWeights, x: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`attend` of many sensors ``(n, d)``, with heads as wide as their features.
+
+    ``q_i k_j = x_i (W_q^T W_k) x_j`` and ``sum_j a_ij v_j = W_v sum_j a_ij x_j``: the kernel's products have the d
+    features, filled up with zeros, in place of d' dimensions.
+    """
+    n, d = x.shape
+    wide = torch.zeros(2, 1, 1, n, -(-d // _LANES) * _LANES)
+    queries, keys = wide
+    keys[..., :d] = x
+    queries[..., :d] = x @ (weights.query.T @ weights.key)
+    attended = _attend_on_cores(queries, keys, len(weights.query) ** -0.5)[0, 0, :, :d]
+    z = functional.linear(attended, weights.value)
+    return functional.linear(z, weights.score, weights.bias)[:, 0], z
+
+
+def _attend_on_cores(queries: Tensor, keys: Tensor, scale: float) -> Tensor:
+    """The means of the keys as all queries weigh them; from many sensors on, each core computes a share of them."""
 
     @torch.inference_mode()
     def share(queries: Tensor) -> Tensor:
-        return functional.scaled_dot_product_attention(queries, k, v)
+        return functional.scaled_dot_product_attention(queries, keys, keys, scale=scale)
 
-    blocks = -(-q.shape[2] // _BLOCK)
+    count = queries.shape[2]
+    if count < _MANY:
+        return share(queries)
+    blocks = -(-count // _BLOCK)
     cores = min(usable_cores(), blocks // _LEAST_BLOCKS)
     rows = [_BLOCK * (blocks // cores + (core < blocks % cores)) for core in range(cores)]
-    rows[-1] -= _BLOCK * blocks - q.shape[2]
-    return torch.cat([*_threads(cores).map(share, torch.split(q, rows, dim=2))], dim=2)
+    rows[-1] -= _BLOCK * blocks - count
+    return torch.cat([*_threads(cores).map(share, torch.split(queries, rows, dim=2))], dim=2)
 
 
 @cache
@@ -173,7 +191,8 @@ class Weights:
         if len(features) >= _FOR_TORCH:
             with torch.inference_mode():
                 attention = AttentionWeights(*map(torch.from_numpy, self.attention.values()))
-                scores, contexts = attend(attention, torch.from_numpy(features))
+                kernel = attend_narrow if len(features) >= _NARROW else attend
+                scores, contexts = kernel(attention, torch.from_numpy(features))
                 return scores.numpy(), contexts.numpy()
         own = self.parameters
         similar = (features @ own.query.T) @ (features @ own.key.T).T
