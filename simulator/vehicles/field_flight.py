@@ -1,7 +1,7 @@
 """The flight of real UAVs: telemetry in, decisions out as speeds along their missions' paths, outcomes back.
 
-All UAVs of a flight are at the same waypoint: every ``step_s`` seconds of the mission each reports, decides, and is
-told its speed for the next ``step_s`` seconds. At their end it collects from the decided sensor.
+All UAVs of a flight are at the same waypoint: every ``step_s`` seconds of the mission each reports, decides, and gets
+the speed that brings it to its next waypoint in time. There it collects from the decided sensor.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class FieldFlight:
             for step in range(self._scenario.steps):
                 if step == 0:
                     await self._listen(0)
-                legs = await self._decide(step)
+                legs = await self._decide(step, began + step * step_s)
                 if self._clock.now() > began + (step + 1) * step_s:
                     self.flown.late += len(legs)
                 await self._clock.until(began + (step + 1) * step_s)
@@ -113,8 +113,8 @@ class FieldFlight:
     async def _look(self, seconds: float) -> None:
         await asyncio.gather(*(uav.look(seconds) for uav in self._uavs))
 
-    async def _decide(self, step: int) -> list[_Leg]:
-        """Decide for the UAVs that fly their missions, and tell them."""
+    async def _decide(self, step: int, since_s: float) -> list[_Leg]:
+        """Decide for the UAVs that fly their missions, and tell them; their waypoint was at ``since_s``."""
         flying = {uav.index: uav for uav in self._uavs if uav.away is None}
         for uav in self._uavs:
             if uav.away is not None:
@@ -124,12 +124,12 @@ class FieldFlight:
             self._away[uav.index] = uav.away
         choices = await self._pilot.decide({index: uav.observation(step) for index, uav in flying.items()})
         legs = [_Leg(flying[index], choice, flying[index].spot(step)) for index, choice in choices.items()]
-        await asyncio.gather(*(self._command(leg) for leg in legs))
+        await asyncio.gather(*(self._command(leg, self._clock.now() - since_s) for leg in legs))
         return legs
 
-    async def _command(self, leg: _Leg) -> None:
+    async def _command(self, leg: _Leg, decided_s: float) -> None:
         try:
-            await leg.uav.command(leg.choice.velocity)
+            await leg.uav.command(leg.choice.velocity, decided_s)
         except VehicleError as error:
             self.flown.disobeyed.append(str(error))
             self._on_event(leg.uav.index, str(error))

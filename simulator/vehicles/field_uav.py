@@ -21,6 +21,8 @@ from simulator.world import Observation
 OFF_PATH_M = 100.0
 # Below this height above its take-off place a UAV has not taken off, or lands.
 AIRBORNE_M = 5.0
+# Below this speed a UAV waits in place instead, m/s.
+LEAST_SPEED_M_S = 0.5
 # The mode comes with the heartbeat, once a second: after a command of its own the flight reads the old one so long.
 MODE_LAG_S = 2.5
 
@@ -50,6 +52,8 @@ class FieldUav:
         # Since the last position that was near its trajectory.
         self._unseen_s = 0.0
         self._mode_changed_s = -math.inf
+        # The last commanded ground speed, m/s; unknown before the first command.
+        self._speed: float | None = None
         self.heard = HeardBeacons(np.array(site.scenario.sites))
 
     async def look(self, seconds: float) -> None:
@@ -76,23 +80,40 @@ class FieldUav:
         longitude, latitude = self._site.frame.degrees([self._here])[0].tolist()
         self._degrees = longitude, latitude
 
-    async def command(self, velocity: int) -> None:
-        """Fly at this velocity along the mission, or wait in place at 0 m/s.
+    async def command(self, velocity: int, decided_s: float = 0.0) -> None:
+        """Be ``velocity x step_s`` metres past the waypoint at the next one, as far as the speed limit allows.
+
+        Args:
+            velocity: decided, m/s.
+            decided_s: seconds since the waypoint. Meanwhile the UAV has flown on at its last commanded speed, and the
+                commanded speed makes up for the difference. A speed below ``LEAST_SPEED_M_S`` is a wait in place.
 
         Raises:
             VehicleError: the vehicle did not do it, or is not to be told: somebody took it over during the decision.
         """
+        speed = self._speed_for(velocity, decided_s)
         why = self._taken(await self.vehicle.state())
         if why is not None:
-            raise VehicleError(f"{self.vehicle.name} was not told to fly at {velocity} m/s: {why}")
-        if velocity == 0:
+            raise VehicleError(f"{self.vehicle.name} was not told to fly at {speed:g} m/s: {why}")
+        if speed < LEAST_SPEED_M_S:
             if not self.waits:
                 await self.vehicle.hold()
                 self.waits, self._mode_changed_s = True, time.monotonic()
             return
         # Some autopilots forget the speed when the mode changes.
         await self.hand_back()
-        await self.vehicle.set_speed(float(velocity))
+        await self.vehicle.set_speed(speed)
+        self._speed = speed
+
+    def _speed_for(self, velocity: int, decided_s: float) -> float:
+        """``(v dt - u s) / (dt - s)`` for the last speed u and s seconds since the waypoint, rounded to cm/s."""
+        world = self._site.scenario
+        left_s = world.step_s - decided_s
+        last = 0.0 if self.waits else self._speed
+        if velocity == 0 or last is None or left_s <= 0:
+            return float(velocity)
+        speed = (velocity * world.step_s - last * decided_s) / left_s
+        return round(min(max(speed, 0.0), float(world.max_velocity)), 2)
 
     async def hand_back(self) -> None:
         """Let it go on with its mission if this flight made it wait; raises :class:`VehicleError`."""

@@ -88,6 +88,59 @@ async def test_the_edge_decides_every_waypoint_and_hears_every_outcome(edge: Edg
             assert trajectories(trial.site.scenario)[uav].locate(decision.position)[1] < 0.1
 
 
+@pytest.mark.parametrize(
+    ("velocity", "commanded", "flown_m"),
+    [
+        # Of 10 s to the next waypoint 2 s are over at the last speed, 10 m/s.
+        (6, 5.0, 60.0),
+        (10, 10.0, 100.0),
+        # As fast as it may, and too late all the same.
+        (14, 14.0, 132.0),
+        # It has flown farther than decided.
+        (1, "hold", 20.0),
+        (0, "hold", 20.0),
+    ],
+)
+async def test_the_speed_makes_up_for_the_time_of_the_decision(
+    velocity: int, commanded: float | str, flown_m: float
+) -> None:
+    trial = Trial()
+    uav, vehicle, clock = trial.uavs[0], trial.vehicles[0], trial.clock
+    await uav.look(10.0)
+    await uav.command(10)
+    await clock.until(10.0)
+    await uav.look(10.0)
+    assert vehicle.flown_m == pytest.approx(100.0)
+    await clock.until(12.0)
+    await uav.command(velocity, decided_s=2.0)
+    await clock.until(20.0)
+    await vehicle.state()
+    assert vehicle.told[-1] == commanded
+    assert vehicle.flown_m == pytest.approx(100.0 + flown_m)
+
+
+async def test_a_uav_that_waited_during_the_decision_flies_faster_after_it() -> None:
+    trial = Trial()
+    uav, vehicle, clock = trial.uavs[0], trial.vehicles[0], trial.clock
+    await uav.look(10.0)
+    await uav.command(0)
+    await clock.until(12.0)
+    await uav.command(8, decided_s=2.0)
+    await clock.until(20.0)
+    await vehicle.state()
+    assert vehicle.told == ["hold", "resume", 10.0]
+    assert vehicle.flown_m == pytest.approx(80.0)
+
+
+async def test_the_first_speed_and_that_of_a_late_decision_are_the_decided_ones() -> None:
+    trial = Trial()
+    uav, vehicle = trial.uavs[0], trial.vehicles[0]
+    await uav.look(10.0)
+    await uav.command(6, decided_s=2.0)
+    await uav.command(9, decided_s=10.0)
+    assert vehicle.told == [6.0, 9.0]
+
+
 class Counting:
     """Sensors 0 and 1 with scripted counters of lost packets, by step; UAV 1 hears sensor 1 alone."""
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from simulator.client import EdgeClient
@@ -20,7 +21,7 @@ from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.plan_folder import export_plans
 from simulator.vehicles.field_run import FieldJob, conduct_field
 from simulator.vehicles.field_uav import FieldUav
-from simulator.vehicles.mavlink_vehicle import mavlink_vehicle
+from simulator.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
 from simulator.vehicles.simulated_radio import SimulatedRadio
 from simulator.vehicles.uploaded_path import check_uploaded
 from tests.conftest import Edge
@@ -78,21 +79,42 @@ def gap_m(decision: Decision, trace: list[tuple[float, float]]) -> float:
     return min(math.hypot((lat - latitude) * north, (lon - longitude) * east) for lat, lon in trace)
 
 
+class Commanded:
+    """The commands that the flight gives to vehicles, as they are on the wire: speeds are of single precision."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.all: list[tuple[int, float]] = []
+        set_speed, hold = MavlinkVehicle.set_speed, MavlinkVehicle.hold
+
+        async def noted_speed(vehicle: MavlinkVehicle, speed_m_s: float) -> None:
+            self.all.append((SPEED, float(np.float32(speed_m_s))))
+            await set_speed(vehicle, speed_m_s)
+
+        async def noted_hold(vehicle: MavlinkVehicle) -> None:
+            self.all.append((SET_MODE, 3.0))
+            await hold(vehicle)
+
+        monkeypatch.setattr(MavlinkVehicle, "set_speed", noted_speed)
+        monkeypatch.setattr(MavlinkVehicle, "hold", noted_hold)
+
+
 def test_a_vehicle_of_mavsdk_flies_as_the_edge_decides(
-    missions: list[list[Item]], port: int, edge: Edge, tmp_path: Path
+    missions: list[list[Item]], port: int, edge: Edge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    commanded = Commanded(monkeypatch)
     url = str(edge(mode="policy").base_url).rstrip("/")
     with mavsdk_peer(missions[0], port, speedup=20.0, start_m=300.0) as peer:
         flown = asyncio.run(conduct_field(patient_job(port, url, tmp_path, steps=8)))
         decisions = read_decisions(tmp_path / "decisions.jsonl")
-        commanded = [(SPEED, float(d.velocity)) if d.velocity else (SET_MODE, 3.0) for d in decisions]
         # MAVSDK hands on a message after it has obeyed it.
-        until(lambda: len(once(peer.commands())) >= len(once(commanded)))
+        until(lambda: len(once(peer.commands())) >= len(once(commanded.all)))
         received = list(peer.received)
     assert [(d.step, d.source) for d in decisions] == [(step, "policy") for step in range(8)]
     assert decisions == flown.decisions and not flown.untold
-    assert once(peer.commands()) == once(commanded)
-    assert len(flown.disobeyed) == commanded.count((SET_MODE, 3.0)), "MAVSDK's action server denies hold"
+    assert once(peer.commands()) == once(commanded.all)
+    assert len(commanded.all) == len(decisions) and commanded.all[0] == (SPEED, decisions[0].velocity)
+    assert {kind for kind, _ in commanded.all} <= {SPEED, SET_MODE} and max(speed for _, speed in commanded.all) <= 14
+    assert len(flown.disobeyed) == commanded.all.count((SET_MODE, 3.0)), "MAVSDK's action server denies hold"
     told = [fields for name, fields in received if name.startswith("COMMAND")]
     assert {fields["command"] for fields in told} <= HARMLESS
     assert {name for name, _ in received} <= {
