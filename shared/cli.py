@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import select
+import signal
 import sys
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
@@ -69,7 +72,31 @@ def usage() -> str:
 
 
 def main() -> int:
-    """Run one subcommand with the rest of the command line; returns the process's exit code."""
+    """Run one subcommand with the rest of the command line; returns the process's exit code.
+
+    If the reader of standard output is gone, as in ``aicvds simulate --help | head``, it is 141, a shell's for SIGPIPE.
+    """
+    try:
+        try:
+            return _run()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        if not _reader_is_gone():
+            raise
+        # The interpreter flushes once more at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+
+
+def _reader_is_gone() -> bool:
+    """Whether standard output is a pipe that nothing reads any more; another broken pipe is an error of the command."""
+    output = select.poll()
+    output.register(sys.stdout, 0)
+    return any(event & select.POLLERR for _, event in output.poll(0))
+
+
+def _run() -> int:
     name, rest = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
     if name in ("--help", "-h"):
         print(usage())
