@@ -28,9 +28,8 @@ WIDTH = 32
 _FOR_TORCH, _NARROW = 64, 512
 # The kernel is fastest where a head's dimension is a multiple of this.
 _LANES = 16
-# From so many sensors on, the cores share the queries. From 768 queries on, torch's kernel takes 256 at a time: shares
-# of at least four whole blocks give the same result to the bit as one call for all queries.
-_MANY, _BLOCK, _LEAST_BLOCKS = 2048, 256, 4
+# Queries that one core computes at a time. The share does not depend on the number of cores, so neither do the results.
+_SHARE = 256
 
 
 class Sample(NamedTuple):
@@ -115,26 +114,18 @@ def attend_narrow(weights: AttentionWeights, x: Tensor) -> tuple[Tensor, Tensor]
     queries, keys = wide
     keys[..., :d] = x
     queries[..., :d] = x @ (weights.query.T @ weights.key)
-    attended = _attend_on_cores(queries, keys, len(weights.query) ** -0.5)[0, 0, :, :d]
-    z = functional.linear(attended, weights.value)
+    shares = [(share, keys, len(weights.query) ** -0.5) for share in torch.split(queries, _SHARE, dim=2)]
+    cores = usable_cores()
+    attended = _threads(cores).map(_means_of, shares) if cores > 1 else map(_means_of, shares)
+    z = functional.linear(torch.cat([*attended], dim=2)[0, 0, :, :d], weights.value)
     return functional.linear(z, weights.score, weights.bias)[:, 0], z
 
 
-def _attend_on_cores(queries: Tensor, keys: Tensor, scale: float) -> Tensor:
-    """The means of the keys as all queries weigh them; from many sensors on, each core computes a share of them."""
-
-    @torch.inference_mode()
-    def share(queries: Tensor) -> Tensor:
-        return functional.scaled_dot_product_attention(queries, keys, keys, scale=scale)
-
-    count = queries.shape[2]
-    if count < _MANY:
-        return share(queries)
-    blocks = -(-count // _BLOCK)
-    cores = min(usable_cores(), blocks // _LEAST_BLOCKS)
-    rows = [_BLOCK * (blocks // cores + (core < blocks % cores)) for core in range(cores)]
-    rows[-1] -= _BLOCK * blocks - count
-    return torch.cat([*_threads(cores).map(share, torch.split(queries, rows, dim=2))], dim=2)
+@torch.inference_mode()
+def _means_of(share: tuple[Tensor, Tensor, float]) -> Tensor:
+    """The means of the keys as some queries weigh them, from the queries, the keys and the products' scale."""
+    queries, keys, scale = share
+    return functional.scaled_dot_product_attention(queries, keys, keys, scale=scale)
 
 
 @cache
