@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,21 @@ _REFRESH = 500
 _SAME_PLACE_M, _MOST_OF_PLACE = 10.0, 2
 
 
+# A measurement's numbers: the UAV's place, the excess loss, the noise and when it was taken (``heard`` then), and its
+# entries of K^-1 r and K^-1 1. One array has them all, because indexing costs more than the sums of a few sensors.
+_PLACE, _EXCESS, _NOISE, _TAKEN, _MEASURED, _ONES, _NUMBERS = slice(0, 2), 2, 3, 4, 5, 6, 7
 # A packed symmetric matrix has its upper triangle column by column, in half the memory, so that a leading block of it
 # comes first. By row and column, the place in it.
 _ROWS, _COLUMNS = np.tril_indices(_MOST_OF_ONE)[::-1]
 _PLACE_IN_PACKED = np.zeros((_MOST_OF_ONE, _MOST_OF_ONE), dtype=np.int64)
 _PLACE_IN_PACKED[_ROWS, _COLUMNS] = _PLACE_IN_PACKED[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
+
+
+@cache
+def _packing(kept: int) -> tuple[IntArray, IntArray]:
+    """Places of a square matrix's entries in the packed one, ``(kept * kept,)``, and of the packed ones in it."""
+    few = kept * (kept + 1) // 2
+    return _PLACE_IN_PACKED[:kept, :kept].ravel(), _ROWS[:few] * kept + _COLUMNS[:few]
 
 
 class RadioMap:
@@ -52,9 +63,6 @@ class RadioMap:
         sensors: J. A map of many sensors keeps fewer measurements of each.
 
     Attributes:
-        places: shape ``(J, N, 2)``, metres, of the UAVs at the measurements.
-        excess: shape ``(J, N)``, dB, measured.
-        noise: shape ``(J, N)``, the factor of the fading's variance of each measurement, at least 1.
         count: shape ``(J,)``, measurements kept.
         heard: measurements so far, of all sensors.
         exact: whether every measurement so far agrees with the formula.
@@ -64,28 +72,38 @@ class RadioMap:
 
     def __init__(self, sensors: int) -> None:
         kept = int(np.clip(_MOST_KEPT // sensors, 1, _MOST_OF_ONE))
-        self.places: FloatArray = np.zeros((sensors, kept, 2))
-        self.excess: FloatArray = np.zeros((sensors, kept))
-        self.noise: FloatArray = np.ones((sensors, kept))
+        self._kept: FloatArray = np.zeros((sensors, kept, _NUMBERS))
+        self.noise[:] = 1.0
         self.count: IntArray = np.zeros(sensors, dtype=np.int64)
-        # When each measurement was taken: ``heard`` then.
-        self._taken: IntArray = np.zeros((sensors, kept), dtype=np.int64)
         self.heard = 0
         self.kind = KINDS[0]
         self._compared = _COMPARE_FIRST
         self.exact = True
         self.offset_db, self.deviation_db = 0.0, PRIOR_DB
-        # By sensor, K^-1 packed, K^-1 r and K^-1 1, with zeros where a sensor has no measurement. None until a gain
-        # differs from the formula.
+        # K^-1 of each sensor, packed, with zeros where it has no measurement. None until a gain differs from the
+        # formula.
         self._inverse: FloatArray | None = None
-        self._measured: FloatArray = np.zeros((sensors, kept))
-        self._ones: FloatArray = np.zeros((sensors, kept))
+
+    @property
+    def places(self) -> FloatArray:
+        """Shape ``(J, N, 2)``, metres, of the UAVs at the measurements; a view, as the two below."""
+        return self._kept[..., _PLACE]
+
+    @property
+    def excess(self) -> FloatArray:
+        """Shape ``(J, N)``, dB, measured."""
+        return np.asarray(self._kept[..., _EXCESS])
+
+    @property
+    def noise(self) -> FloatArray:
+        """Shape ``(J, N)``, the factor of the fading's variance of each measurement, at least 1."""
+        return np.asarray(self._kept[..., _NOISE])
 
     def measured_db(self) -> dict[int, float]:
         """The mean excess loss of each measured sensor, dB, over the measurements kept; empty if all are exact."""
         if self.exact:
             return {}
-        used = np.arange(self.excess.shape[1]) < self.count[:, None]
+        used = np.arange(self._kept.shape[1]) < self.count[:, None]
         means = (self.excess * used).sum(axis=1) / np.maximum(self.count, 1)
         return {int(sensor): float(means[sensor]) for sensor in np.flatnonzero(self.count)}
 
@@ -105,90 +123,104 @@ class RadioMap:
         if not len(ids):
             return excess
         self.heard += len(ids)
-        here = np.asarray(place, dtype=np.float64)
-        noise: FloatArray | float = 1.0
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        slot, dropped = self._slots(ids, here)
-        if not self.exact:
-            noise = self._replace(ids, slot, here, excess)
-        self._taken[ids, slot] = self.heard
-        self.places[ids, slot], self.excess[ids, slot], self.noise[ids, slot] = here, excess, noise
+        count = self.count.take(ids)
+        # One more than a sensor has, for a new one.
+        size = min(int(count.max()) + 1, self._kept.shape[1])
+        kept = self._kept.take(ids, 0)[:, :size]
+        new = np.empty((len(ids), _NUMBERS))
+        new[:, _PLACE], new[:, _EXCESS], new[:, _NOISE], new[:, _TAKEN] = place, excess, 1.0, self.heard
+        east, north = kept[:, :, 0] - new[:, :1], kept[:, :, 1] - new[:, 1:2]
+        apart = east * east + north * north
+        slot, dropped = self._slots(kept, count, apart)
+        inverse = None if self.exact else self._replace(kept, new, slot, dropped, self._inverses(ids, size), apart)
+        kept[np.arange(len(ids)), slot] = new
         self.count[ids] += ~dropped
-        if self.exact:
+        due = not self.exact and (self.heard >= self._compared or self.heard % _REFRESH < len(ids))
+        if inverse is not None and not due:
+            kept[:, :, _MEASURED:] = _solved(inverse, kept)
+        self._kept[ids, :size] = kept
+        self._learn(ids, inverse, due)
+        return excess
+
+    def _learn(self, ids: IntArray, inverse: FloatArray | None, due: bool) -> None:
+        """Estimate what all links have in common, after new measurements of these sensors with this ``K^-1``."""
+        if inverse is None:
             self.deviation_db = 0.0
+        elif not due:
+            self._pack(ids, inverse)
+            self._estimate()
         elif self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
             self._compare()
-        elif self.heard % _REFRESH < len(ids):
-            self._factor(ids)
         else:
-            self._solve(ids)
-        return excess
+            self._factor(ids)
 
-    def _replace(self, ids: IntArray, slot: IntArray, here: FloatArray, excess: FloatArray) -> FloatArray:
-        """Change ``K^-1`` for new measurements at these slots; returns their noise, by the prediction before them."""
-        size = max(int(self.count[ids].max()), int(slot.max()) + 1)
-        rows, inverse = np.arange(len(ids)), self._inverses(ids, size)
-        away = self.places[ids, :size] - here
-        covariance = self._covariance(np.sqrt(np.square(away).sum(axis=2)))
-        left = self._measured[ids, :size] - self.offset_db * self._ones[ids, :size]
+    def _replace(
+        self,
+        kept: FloatArray,
+        new: FloatArray,
+        slot: IntArray,
+        dropped: NDArray[np.bool_],
+        inverse: FloatArray,
+        apart: FloatArray,
+    ) -> FloatArray:
+        """``K^-1`` with new measurements ``(n, 7)`` in these slots, whose noise is set by the prediction before them.
+
+        Args:
+            apart: shape ``(n, size)``, squared distances of the kept measurements from the new ones, square metres.
+        """
+        rows, fading = np.arange(len(kept)), self.kind.fading
+        covariance = self._covariance(np.sqrt(apart))
+        left = kept[:, :, _MEASURED] - self.offset_db * kept[:, :, _ONES]
         known = (covariance[:, None] @ inverse)[:, 0]
-        share = np.maximum(1.0 - (known * covariance).sum(axis=1), self.kind.fading)
+        share = np.maximum(1.0 - (known * covariance).sum(axis=1), fading)
         deviation = np.maximum(self.deviation_db * np.sqrt(share), _HUBER_LEAST_DB)
-        off = np.abs(excess - self.offset_db - (covariance * left).sum(axis=1)) / deviation
-        noise: FloatArray = np.square(np.maximum(off / _HUBER, 1.0))
-        # Without the measurement that leaves the slot, if there is one.
-        own = inverse[rows, slot]
-        weight = own[rows, slot]
-        own /= np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]
-        inverse -= own[:, :, None] * own[:, None, :]
-        inverse[rows, slot], inverse[rows, :, slot] = 0.0, 0.0
-        # With the one that takes it.
-        known = (covariance[:, None] @ inverse)[:, 0]
-        free = 1.0 + self.kind.fading * (noise - 1.0) - (known * covariance).sum(axis=1)
+        off = np.abs(new[:, _EXCESS] - self.offset_db - (covariance * left).sum(axis=1)) / deviation
+        noise = new[:, _NOISE] = np.square(np.maximum(off / _HUBER, 1.0))
+        if dropped.any():
+            # Without the measurements that leave their slots.
+            own = inverse[rows, slot]
+            weight = own[rows, slot]
+            own /= np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]
+            inverse -= own[:, :, None] * own[:, None, :]
+            inverse[rows, slot], inverse[rows, :, slot] = 0.0, 0.0
+            known = (covariance[:, None] @ inverse)[:, 0]
+        # With the new ones: with w = k K^-1 and -1 in the slot, whose row and column are zeros, w w^T is added.
+        free = 1.0 + fading * (noise - 1.0) - (known * covariance).sum(axis=1)
+        known[rows, slot] = -1.0
         inverse += known[:, :, None] * (known / free[:, None])[:, None, :]
-        beside = known / -free[:, None]
-        inverse[rows, slot], inverse[rows, :, slot] = beside, beside
-        inverse[rows, slot, slot] = 1.0 / free
-        assert self._inverse is not None
-        few = size * (size + 1) // 2
-        self._inverse[ids, :few] = inverse[:, _ROWS[:few], _COLUMNS[:few]]
-        return noise
+        return inverse
 
-    def _slots(self, ids: IntArray, here: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
-        """The slot of each sensor that takes a measurement here, and whether it drops another for it.
+    def _slots(self, kept: FloatArray, count: IntArray, apart: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
+        """The slot of each sensor that takes a new measurement, and whether it drops another for it.
 
         Two measurements of the same place are kept. A third drops the oldest, so that no wrong one stays. A full record
         without any of the place drops the nearest one, which tells the most of what the new one tells.
         """
-        slot, kept = self.count[ids], self.excess.shape[1]
-        used = int(slot.max())
-        if not used:
-            return slot, np.zeros(len(ids), dtype=np.bool_)
-        east, north = (self.places[ids, :used, axis] - here[axis] for axis in (0, 1))
-        apart = np.where(np.arange(used) < slot[:, None], east * east + north * north, np.inf)
+        apart = np.where(np.arange(kept.shape[1]) < count[:, None], apart, np.inf)
         same = apart <= _SAME_PLACE_M**2
-        full = slot == kept
+        full = count == self._kept.shape[1]
         repeated = same.sum(axis=1) >= np.where(full, 1, _MOST_OF_PLACE)
-        oldest = np.where(same, self._taken[ids, :used], self.heard).argmin(axis=1)
-        slot = np.where(repeated, oldest, np.where(full, apart.argmin(axis=1), slot))
-        return slot, repeated | full
+        oldest = np.where(same, kept[:, :, _TAKEN], self.heard).argmin(axis=1)
+        return np.where(repeated, oldest, np.where(full, apart.argmin(axis=1), count)), repeated | full
 
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
         shape = (len(places), len(which))
         if self._inverse is None:
             return np.zeros(shape), np.full(shape, self.deviation_db)
-        kept = int(self.count[which].max(initial=0))
+        kept = int(self.count.take(which).max(initial=0))
         offset, deviation = self.offset_db, self.deviation_db
         if not kept:
             return np.full(shape, offset), np.full(shape, deviation)
-        east, north = (places[None, :, None, axis] - self.places[which, None, :kept, axis] for axis in (0, 1))
+        known_at = self._kept.take(which, 0)[:, :kept]
+        east, north = (places[None, :, None, axis] - known_at[:, None, :, axis] for axis in (0, 1))
         # (n, P, kept)
         covariance = self._covariance(np.sqrt(east * east + north * north))
-        left = self._measured[which, :kept] - offset * self._ones[which, :kept]
+        left = known_at[:, :, _MEASURED] - offset * known_at[:, :, _ONES]
         mean = offset + np.matmul(covariance, left[..., None])[..., 0]
         known = (covariance @ self._inverses(which, kept) * covariance).sum(axis=2)
         # The fading is part of a link's variance, since it differs in the next step.
@@ -198,32 +230,31 @@ class RadioMap:
     def _inverses(self, ids: IntArray, kept: int) -> FloatArray:
         """``K^-1`` of these sensors, ``(n, kept, kept)``, with zeros where a sensor has no measurement."""
         assert self._inverse is not None
-        return np.asarray(self._inverse[ids][:, _PLACE_IN_PACKED[:kept, :kept]])
+        return self._inverse.take(ids, 0).take(_packing(kept)[0], 1).reshape(len(ids), kept, kept)
+
+    def _pack(self, ids: IntArray, inverse: FloatArray) -> None:
+        """Keep ``K^-1`` of these sensors, ``(n, kept, kept)``."""
+        assert self._inverse is not None
+        places = _packing(inverse.shape[1])[1]
+        self._inverse[ids, : len(places)] = inverse.reshape(len(ids), -1).take(places, 1)
 
     def _factor(self, ids: IntArray) -> None:
         """Invert the covariances of these sensors' measurements, and estimate what all links have in common."""
         if self._inverse is None:
-            most = self.excess.shape[1]
-            self._inverse = np.zeros((len(self.excess), most * (most + 1) // 2))
-        kept = int(self.count[ids].max(initial=0))
-        if kept:
-            used = np.arange(kept) < self.count[ids, None]
-            inverse: FloatArray = np.linalg.inv(self._covariances(ids, kept)).astype(np.float64, copy=False)
-            few = kept * (kept + 1) // 2
-            both_used = used[:, :, None] & used[:, None, :]
-            self._inverse[ids, :few] = (inverse * both_used)[:, _ROWS[:few], _COLUMNS[:few]]
-        self._solve(ids)
+            most = self._kept.shape[1]
+            self._inverse = np.zeros((len(self._kept), most * (most + 1) // 2))
+        if size := int(self.count[ids].max(initial=0)):
+            used = np.arange(size) < self.count[ids, None]
+            inverse: FloatArray = np.linalg.inv(self._covariances(ids, size)).astype(np.float64, copy=False)
+            self._pack(ids, inverse * (used[:, :, None] & used[:, None, :]))
+            self._kept[ids, :size, _MEASURED:] = _solved(self._inverses(ids, size), self._kept[ids, :size])
+        self._estimate()
 
-    def _solve(self, ids: IntArray) -> None:
-        """``K^-1 r`` and ``K^-1 1`` of these sensors, and with them the offset and the deviation of all links."""
-        kept = int(self.count[ids].max(initial=0))
-        if kept:
-            both = np.ones((len(ids), kept, 2))
-            both[..., 0] = self.excess[ids, :kept]
-            solved = self._inverses(ids, kept) @ both
-            self._measured[ids, :kept], self._ones[ids, :kept] = solved[..., 0], solved[..., 1]
-        offset = self.offset_db = float(self._measured.sum() / (self._ones.sum() + OFFSET_WEIGHT))
-        squares = (self.excess - offset) * (self._measured - offset * self._ones)
+    def _estimate(self) -> None:
+        """The offset and the deviation of all links."""
+        excess, measured, ones = (self._kept[..., number] for number in (_EXCESS, _MEASURED, _ONES))
+        offset = self.offset_db = float(measured.sum() / (ones.sum() + OFFSET_WEIGHT))
+        squares = (excess - offset) * (measured - offset * ones)
         weight = PRIOR_WEIGHT + int(self.count.sum())
         self.deviation_db = float(np.sqrt((PRIOR_WEIGHT * PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
@@ -242,7 +273,7 @@ class RadioMap:
 
     def _apart(self, ids: IntArray, kept: int) -> FloatArray:
         """Distances between the places of each sensor's measurements, ``(n, kept, kept)``, metres."""
-        at = self.places[ids, :kept]
+        at = self._kept[ids, :kept, _PLACE]
         east, north = (at[:, :, None, axis] - at[:, None, :, axis] for axis in (0, 1))
         return np.asarray(np.sqrt(east * east + north * north))
 
@@ -258,28 +289,42 @@ class RadioMap:
     def state_dict(self) -> dict[str, Any]:
         """The measurements and what was solved of them, as copies."""
         arrays = {name: getattr(self, name).copy() for name in ("places", "excess", "noise", "count")}
-        solved = None if self._inverse is None else [self._inverse.copy(), self._measured.copy(), self._ones.copy()]
+        measured, ones = self._kept[..., _MEASURED].copy(), self._kept[..., _ONES].copy()
         return {
             **arrays,
-            "taken": self._taken.copy(),
+            "taken": self._kept[..., _TAKEN].astype(np.int64),
             "heard": self.heard,
             "kind": KINDS.index(self.kind),
             "compared": self._compared,
             "exact": self.exact,
-            "solved": solved,
+            "solved": None if self._inverse is None else [self._inverse.copy(), measured, ones],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a map, to the bit. One of an earlier version is without what was solved."""
-        for name in ("places", "excess", "noise", "count"):
-            setattr(self, name, state[name])
-        self._taken = state["taken"]
+        numbers: list[tuple[slice | int, str]] = [
+            (_PLACE, "places"),
+            (_EXCESS, "excess"),
+            (_NOISE, "noise"),
+            (_TAKEN, "taken"),
+        ]
+        self._kept = np.zeros((*state["excess"].shape, _NUMBERS))
+        for number, name in numbers:
+            self._kept[..., number] = state[name]
+        self.count = state["count"]
         self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
         self.exact = state["exact"]
         if state.get("solved") is not None:
-            self._inverse, self._measured, self._ones = state["solved"]
-            self._solve(np.zeros(0, dtype=np.int64))
+            self._inverse, self._kept[..., _MEASURED], self._kept[..., _ONES] = state["solved"]
+            self._estimate()
         elif not self.exact:
             self._factor(np.arange(len(self.count)))
         elif self.heard:
             self.deviation_db = 0.0
+
+
+def _solved(inverse: FloatArray, kept: FloatArray) -> FloatArray:
+    """``K^-1 r`` and ``K^-1 1``, ``(n, size, 2)``, of sensors' measurements ``(n, size, 7)``."""
+    both = np.ones((*kept.shape[:2], 2))
+    both[..., 0] = kept[:, :, _EXCESS]
+    return np.asarray(inverse @ both)
