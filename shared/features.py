@@ -24,6 +24,8 @@ FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
 VELOCITY_BONUS = 0.5
 # The number of the velocity scorer's inputs for each velocity level.
 LEVEL_FEATURES = 4
+# What stands for a beacon's queue, battery, gain and step where there was none.
+_NO_BEACON = np.array([[0.0], [0.0], [0.0], [-1.0]])
 # Terms of the sum in memory at the same time.
 _TERMS = 1_000_000
 
@@ -286,7 +288,7 @@ def beacon_columns(sensors: SensorColumns) -> FloatArray:
     # numpy converts None to NaN, and the wire admits no other NaN.
     columns = (sensors.queue, sensors.battery, sensors.channel_gain, sensors.last_seen)
     values = np.array(columns, dtype=np.float64)
-    return np.where(np.isnan(values), [[0.0], [0.0], [0.0], [-1.0]], values)
+    return np.where(np.isnan(values), _NO_BEACON, values)
 
 
 def places_ahead(

@@ -140,33 +140,38 @@ class LearnedChannel:
         near = (distance <= world.radio_radius_m).any(axis=0)
         which = np.flatnonzero(near) if ids is None else np.asarray(ids)[near]
         packets, margin = np.zeros(distance.shape, dtype=np.int64), np.full(distance.shape, -np.inf)
-        mean, deviation = self.radio_map.predict(places, which)
-        metres = distance[:, near]
-        loss = path_loss_db(metres, world) + mean
-        with np.errstate(divide="ignore", invalid="ignore"):
-            spare = (world.path_loss_limit_db - loss) / deviation
-        spare = np.where(np.isnan(spare), -np.inf, spare)
-        margin[:, near] = np.where(metres <= world.radio_radius_m, spare, -np.inf)
-        # If a link holds that is expected to fail, its loss is just below the threshold.
-        held = Links(metres, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
-        moved = np.floor(held.packets * self.share + 1e-9).astype(np.int64)
-        packets[:, near] = np.where(margin[:, near] > -3.0, moved, 0)
-        # Phi(margin) within 0.01, by the logistic function: the standard library has no vectorised erf.
-        hold = 1.0 / (1.0 + np.exp(np.clip(-1.702 * margin, -50.0, 50.0)))
+        packets[:, near], margin[:, near] = self._transfers(places, distance[:, near], which)
+        hold = _probability(margin)
         if not self.failures.none:
             hold *= self.failures.alive(slice(None) if ids is None else ids)
         return ExpectedLinks(distance, packets, hold, margin)
+
+    def _transfers(self, places: FloatArray, metres: FloatArray, which: IntArray) -> tuple[IntArray, FloatArray]:
+        """Packets and margins of links, as :class:`ExpectedLinks` has them, ``(P, n)`` each, to sensors ``(n,)``."""
+        world = self._scenario
+        mean, deviation = self.radio_map.predict(places, which)
+        loss = path_loss_db(metres, world) + mean
+        with np.errstate(divide="ignore", invalid="ignore"):
+            spare = (world.path_loss_limit_db - loss) / deviation
+        margin = np.where((metres <= world.radio_radius_m) & ~np.isnan(spare), spare, -np.inf)
+        # If a link holds that is expected to fail, its loss is just below the threshold.
+        held = Links(metres, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
+        moved = np.floor(held.packets * self.share + 1e-9).astype(np.int64)
+        return np.where(margin > -3.0, moved, 0), margin
 
     def packets(self, position: Point, place: FloatArray, sensor: int, *, held: bool) -> int:
         """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.
 
         0 too for a sensor of unknown position.
         """
-        metres = np.hypot(*(position - place))
+        metres = math.hypot(position[0] - place[0], position[1] - place[1])
         # Most sensors are out of radio range, and computing one transfer takes as long as computing many.
         if not metres <= self._scenario.radio_radius_m:
             return 0
-        links = self.links(np.array([position]), np.array([[metres]]), np.array([sensor]))
+        distance, which = np.array([[metres]]), np.array([sensor])
+        if held and not self.by_formula:
+            return int(self._transfers(np.array([position]), distance, which)[0][0, 0])
+        links = self.links(np.array([position]), distance, which)
         return int(links.packets[0, 0]) if held or links.hold[0, 0] >= LIKELY else 0
 
     def gain_db(self, place: FloatArray, distance: FloatArray, ids: IntArray) -> FloatArray:
@@ -214,3 +219,8 @@ class LearnedChannel:
         self.radio_map.load_state_dict(state["map"])
         self.failures.load_state_dict(state["failures"])
         self._see(list(state["shares"]))
+
+
+def _probability(margin: FloatArray) -> FloatArray:
+    """``Phi(margin)`` within 0.01, by the logistic function: the standard library has no vectorised erf."""
+    return np.asarray(1.0 / (1.0 + np.exp(np.minimum(np.maximum(-1.702 * margin, -50.0), 50.0))))

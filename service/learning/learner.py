@@ -152,15 +152,16 @@ def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters
     into.score[0], into.bias[0] = ds * z, ds
     into.out[row], into.out_bias[row] = du * h, du
     dh = np.where(h > 0, du * weights.out[row], np.float32(0))
-    np.outer(dh, velocity_input, out=into.hidden)
+    # np.outer takes several times as long for a few numbers.
+    np.multiply(dh[:, None], velocity_input, out=into.hidden)
     into.hidden_bias[:] = dh
     dz = ds * weights.score[0] + (dh @ weights.hidden)[: len(z)]
-    np.outer(dz, attended, out=into.value)
+    np.multiply(dz[:, None], attended, out=into.value)
     dp = x @ (dz @ weights.value)
     da = p * (dp - p @ dp)
     mixed = scale * (da @ x)
-    np.outer(weights.key @ mixed, own, out=into.query)
-    np.outer(q, mixed, out=into.key)
+    np.multiply((weights.key @ mixed)[:, None], own, out=into.query)
+    np.multiply(q[:, None], mixed, out=into.key)
     return float(off_score * off_score + off_value * off_value)
 
 
