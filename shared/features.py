@@ -14,7 +14,8 @@ from shared.drift import Drift
 from shared.fleetplan import FleetBelief
 from shared.learned_channel import LIKELY, ExpectedLinks, LearnedChannel
 from shared.scenario import Point, Scenario
-from shared.schemas import Features, SensorColumns, UavState
+from shared.schemas import Features, UavState
+from shared.sensor_arrays import arrays_of
 from shared.trajectory import progress_of, trajectories
 
 # The number of features of a sensor in each preset.
@@ -24,8 +25,6 @@ FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
 VELOCITY_BONUS = 0.5
 # The number of the velocity scorer's inputs for each velocity level.
 LEVEL_FEATURES = 4
-# What stands for a beacon's queue, battery, gain and step where there was none.
-_NO_BEACON = np.array([[0.0], [0.0], [0.0], [-1.0]])
 # Terms of the sum in memory at the same time.
 _TERMS = 1_000_000
 
@@ -235,12 +234,10 @@ def augment(
         preset: ``reach`` also looks ahead along the UAV's trajectory.
         belief: the fleet's; without it the state has this UAV's own last beacons.
     """
-    sensors = uav.sensors
-    ids = np.asarray(sensors.id, dtype=np.int64)
-    queue, battery, gain, beacon = beacon_columns(sensors)
-    heard = beacon >= 0
+    reported = arrays_of(uav.sensors)
+    ids, places, queue, battery, gain = reported.ids, reported.places, reported.queue, reported.battery, reported.gain
+    heard = reported.beacon >= 0
     position = (uav.position[0], uav.position[1])
-    places = np.array((sensors.x, sensors.y), dtype=np.float64).T
     distance = np.sqrt(np.square(places - position).sum(axis=1))
     if belief is None:
         assert rates is not None
@@ -249,8 +246,9 @@ def augment(
         heard = np.ones_like(heard)
         coming = belief.arrivals.coming(step, scenario.overflow_horizon_steps)
         queue, battery, rate = belief.queue(step)[ids], belief.battery[ids], coming[ids]
-    stale = beacon != step
+    stale = reported.beacon != step
     if stale.any():
+        gain = gain.copy()
         far, here = distance[stale], np.asarray(position)
         known = None if belief is None else belief.channel
         gain[stale] = channel_gain_db(far, scenario) if known is None else known.gain_db(here, far, ids[stale])
@@ -281,14 +279,6 @@ def augment(
         drift=None if belief is None else belief.drift,
     )
     return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
-
-
-def beacon_columns(sensors: SensorColumns) -> FloatArray:
-    """What a report has of the beacons, ``(4, J)``: queue, battery, gain, step; for nulls 0, and -1 for the step."""
-    # numpy converts None to NaN, and the wire admits no other NaN.
-    columns = (sensors.queue, sensors.battery, sensors.channel_gain, sensors.last_seen)
-    values = np.array(columns, dtype=np.float64)
-    return np.where(np.isnan(values), _NO_BEACON, values)
 
 
 def places_ahead(

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray
-from shared.features import beacon_columns
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.gain_measurements import Measured
 from shared.scenario import Scenario
 from shared.schemas import UavState
+from shared.sensor_arrays import arrays_of
 
 # The weight, in steps, of the scenario's mean arrival rate against the observations.
 _PRIOR_STEPS = 2.0
@@ -131,14 +131,11 @@ def take_readings(
 
 def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
     """Add a UAV's full report to the sensors' records and to the belief; returns what its gains show."""
-    ids = np.asarray(uav.sensors.id)
-    queue, battery, gain, beacon = beacon_columns(uav.sensors)
-    seen = beacon.astype(np.int64)
+    reported = arrays_of(uav.sensors)
     belief.advance(step)
     belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
-    places = np.array((uav.sensors.x, uav.sensors.y), dtype=np.float64).T
-    belief.hear(ids, places, seen, queue, battery)
-    fresh = seen == step
-    measured = belief.measure(uav.uav_id, ids[fresh], gain[fresh])
-    records.hear(ids, seen, queue)
+    belief.hear(reported.ids, reported.places, reported.beacon, reported.queue, reported.battery)
+    fresh = reported.beacon == step
+    measured = belief.measure(uav.uav_id, reported.ids[fresh], reported.gain[fresh])
+    records.hear(reported.ids, reported.beacon, reported.queue)
     return measured

@@ -26,6 +26,7 @@ def uav(
     uav_id: int = 0,
     position: tuple[float, float] = (500.0, 500.0),
     x: list[float] | None = None,
+    y: list[float] | None = None,
     queue: list[float | None] | None = None,
     last_seen: list[int | None] | None = None,
 ) -> UavState:
@@ -36,7 +37,7 @@ def uav(
     sensors = SensorColumns(
         id=list(range(n)),
         x=x if x is not None else [500.0 + 100.0 * i for i in range(n)],
-        y=[500.0] * n,
+        y=y or [500.0] * n,
         queue=queue,
         battery=[None if q is None else 50.0 for q in queue],
         channel_gain=[None if q is None else -90.0 for q in queue],

@@ -20,8 +20,7 @@ def state(**kwargs: object) -> State:
 def test_the_sensor_is_in_reach_after_the_move() -> None:
     """Far ahead on the lap: out of reach at full speed's opposite, in reach where the policy flies."""
     ahead = PATH.at(480.0)
-    view = attended(mission(), uav(position=ON_LAP, x=[float(ahead[0])], queue=[60.0]))
-    view.state.places[0] = ahead
+    view = attended(mission(), uav(position=ON_LAP, x=[float(ahead[0])], y=[float(ahead[1])], queue=[60.0]))
     sensor, velocity = look_ahead(view.state, view.reach, frozenset())
     arrived = PATH.at(velocity * PAPER.step_s)
     assert sensor == 0
@@ -32,8 +31,7 @@ def test_the_sensor_is_in_reach_after_the_move() -> None:
 
 def test_it_slows_down_for_a_full_queue_that_it_would_leave_behind() -> None:
     behind = PATH.at(-300.0)
-    s = state(position=ON_LAP, x=[float(behind[0])], queue=[60.0])
-    s.places[0] = behind
+    s = state(position=ON_LAP, x=[float(behind[0])], y=[float(behind[1])], queue=[60.0])
     _, velocity = look_ahead(s, s.reach_ahead(0, PAPER), frozenset())
     arrived = PATH.at(velocity * PAPER.step_s)
     assert velocity < PAPER.max_velocity
