@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shared.channel import FloatArray, IntArray, link_holds, packets_per_step, rate_bps
 from shared.fleetplan.afterwards import Afterwards
+from shared.fleetplan.queue_chains import QueueChains
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory
 
@@ -46,6 +47,8 @@ class FleetProblem:
             ``chance`` of its packets, the expected ones, and cancels that share of the risk. ``None``: 1.
         afterwards: the risk after the horizon by the UAVs' last places, in place of ``risk[:, H]``; it needs a
             ``risk``. ``None``: wherever the UAVs are, the risk is that.
+        chains: the queues' distributions, for a search of plans over uncertain links; the last sensor is then one
+            nowhere. ``None``: a plan is priced by its expected queues and the risk.
 
     Raises:
         ValueError: a shape or a value is wrong; the message names the field.
@@ -67,6 +70,7 @@ class FleetProblem:
     links: Sequence[IntArray] | None = None
     chances: Sequence[FloatArray] | None = None
     afterwards: Afterwards | None = None
+    chains: QueueChains | None = None
 
     def __post_init__(self) -> None:
         count = len(self.places)

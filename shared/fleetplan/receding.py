@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Collection
 from copy import copy
 from dataclasses import dataclass
@@ -15,11 +16,13 @@ from shared.channel import FloatArray, IntArray
 from shared.fleetplan.afterwards import Afterwards, steps_to
 from shared.fleetplan.arrivals import Arrivals
 from shared.fleetplan.belief import FAR_M, FleetBelief
+from shared.fleetplan.expected_loss import ExpectedLoss
 from shared.fleetplan.greedy import look_ahead
 from shared.fleetplan.problem import FleetProblem, price
-from shared.fleetplan.refinement import refined
+from shared.fleetplan.queue_chains import Arriving, QueueChains, queue_chains
 from shared.fleetplan.risk import neglect
-from shared.fleetplan.solver import Budget, Plan, plan
+from shared.fleetplan.solver import Budget, Plan, plan, with_fixed
+from shared.fleetplan.uav_by_uav import searched
 from shared.guidance import NO_GUIDANCE, Guidance
 from shared.scenario import Scenario
 
@@ -73,18 +76,26 @@ class Draft:
         Raises:
             ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
         """
+        if self.problem.chains is not None:
+            return self._search_uncertain(seconds)
         start = self.before
         if not self.saved:
             greedy = look_ahead(self.problem)
             start = min(start, greedy, key=lambda actions: price(self.problem, actions)[1])
-        found = plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
-        if self.problem.chances is None:
-            return found
-        return refined(self.problem, found, seconds - found.seconds)
+        return plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
+
+    def _search_uncertain(self, seconds: float) -> Plan:
+        """The plan over uncertain links, from the better of the last plan and the greedy one."""
+        begun = time.perf_counter()
+        loss = ExpectedLoss(self.problem)
+        starts = [with_fixed(self.problem, actions) for actions in (self.before, look_ahead(self.problem))]
+        actions = searched(self.problem, min(starts, key=loss.of), seconds)
+        lost, _ = price(self.problem, actions)
+        return Plan(actions, lost, loss.of(actions), 0.0, "FEASIBLE", time.perf_counter() - begun, 0.0)
 
 
 class RecedingHorizon:
-    """Plan eight steps ahead for the fleet with CP-SAT, fly the first, and plan again.
+    """Plan eight steps ahead for the fleet, fly the first, and plan again: with CP-SAT, or UAV by UAV.
 
     The objective is the expected number of packets lost in those steps and, without further visits, in at least four
     more: as many as the nearest UAV then needs to the sensor, at full speed; see :func:`shared.fleetplan.risk.neglect`
@@ -92,8 +103,11 @@ class RecedingHorizon:
     made in this step are fixed. Fleets of more than four UAVs plan UAV by UAV, four steps ahead, and for them the four
     steps count alone.
 
-    The solver's deterministic time limits the search, so that a mission repeats to the bit. Steps that are solved early
-    save time for others. Without saved time a short search starts from the better of the last plan and
+    Where links are uncertain, :func:`shared.fleetplan.uav_by_uav.searched` finds the plan, and the objective is the
+    exact expectation of :class:`shared.fleetplan.expected_loss.ExpectedLoss`.
+
+    The solver's deterministic time limits CP-SAT's search, so that a mission repeats to the bit. Steps that are solved
+    early save time for others. Without saved time a short search starts from the better of the last plan and
     :func:`shared.fleetplan.look_ahead`, and never ends with a worse plan.
 
     Attributes:
@@ -153,6 +167,7 @@ class RecedingHorizon:
         def renamed(actions: IntArray) -> IntArray:
             return np.array([(index.get(sensor, nowhere), v) for sensor, v in actions.tolist()], dtype=np.int64)
 
+        links = self._links(present, kept, horizon)
         problem = FleetProblem(
             scenario=world,
             trajectories=[belief.trajectory(u) for u in present],
@@ -160,7 +175,8 @@ class RecedingHorizon:
             places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
-            **self._links(present, kept, horizon),
+            chains=self._chains(present, kept, horizon) if links else None,
+            **links,
             **self._outlook(present, kept, horizon),
             **self._guided(kept, horizon),
         )
@@ -261,9 +277,7 @@ class RecedingHorizon:
             return None
         fastest = self._scenario.max_velocity
         sums = horizon * fastest + 1
-        metres = np.arange(0, sums + _BEYOND[-1] * fastest, _STRIDE) * self._scenario.step_s
-        links = [self._belief.links(uav, metres) for uav in present]
-        chances = [(link.hold * (link.packets > 0))[:, kept] for link in links]
+        chances = self._chances_ahead(present, kept, horizon)
         best = np.max(chances, axis=(0, 1))
         stages = []
         for chance in chances:
@@ -272,6 +286,38 @@ class RecedingHorizon:
         # A UAV that comes saves packets by the chance of its link.
         risk = risk[0] + best * (risk - risk[0])
         return Afterwards(stages, np.pad(risk, ((0, 0), (0, 0), (0, 1))))
+
+    def _chances_ahead(self, present: list[int], kept: IntArray, horizon: int) -> list[FloatArray]:
+        """By UAV the chances of its links to the kept sensors, ``(P, n)``, at every stride of the way that counts."""
+        sums = horizon * self._scenario.max_velocity + 1
+        metres = np.arange(0, sums + _BEYOND[-1] * self._scenario.max_velocity, _STRIDE) * self._scenario.step_s
+        links = [self._belief.links(uav, metres) for uav in present]
+        return [(link.hold * (link.packets > 0))[:, kept] for link in links]
+
+    def _chains(self, present: list[int], kept: IntArray, horizon: int) -> QueueChains:
+        """The queues' chains of the kept sensors, and of one nowhere without packets."""
+        world, belief, step = self._scenario, self._belief, self.step
+        arrivals = belief.arrivals
+        rate, dispersion, base = arrivals.rate[kept], arrivals.dispersion, belief.base[kept]
+        rate_variance = rate / arrivals.watched[kept]
+        age = np.maximum(step - belief.since[kept], 0)
+        came = np.maximum(belief.queue(step)[kept] - base, 0.0) * (age > 0)
+        soon = np.diff(Arrivals.burst_over(np.arange(horizon + 2)), axis=0)
+        soon[-1] = 0.0
+        coming = rate + arrivals.burst(step)[kept] * soon[:, None]
+        best = np.max(self._chances_ahead(present, kept, horizon), axis=(0, 1)) if self._joint else np.ones(len(kept))
+        # The error of the rate is the same in all steps: of n steps it adds n times a step's variance to each.
+        spread = coming * dispersion + rate_variance * horizon / 2
+        return queue_chains(
+            base=np.append(base, 0.0),
+            base_variance=np.append(belief.base_variance[kept], 0.0),
+            came=Arriving(np.append(came, 0.0), np.append(came * dispersion + age**2 * rate_variance, 0.0)),
+            coming=Arriving(np.pad(coming, ((0, 0), (0, 1))), np.pad(spread, ((0, 0), (0, 1)))),
+            capacity=world.queue_capacity,
+            beyond=self._beyond(horizon),
+            best_chance=np.append(best, 1.0),
+            weights=np.append(self.guidance.weights(world.sensors)[kept], 1.0),
+        )
 
     def _beyond(self, horizon: int) -> tuple[int, ...]:
         """By stage, the number of steps after the plan that count."""

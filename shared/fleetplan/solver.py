@@ -127,7 +127,7 @@ def plan(
     from shared.fleetplan.formulation import Formulation
 
     begun = time.perf_counter()
-    best = _priced(problem, _with_fixed(problem, hint))
+    best = _priced(problem, with_fixed(problem, hint))
     found = _Search(None, 0.0, "UNKNOWN", 0.0)
     strategies = _strategies(problem, budget)
     for strategy, share in strategies:
@@ -167,7 +167,7 @@ def least_loss(
         Interrupted: Ctrl-C came.
     """
     begun = time.perf_counter()
-    start = best = _unproven(_priced(problem, _with_fixed(problem, look_ahead(problem))))
+    start = best = _unproven(_priced(problem, with_fixed(problem, look_ahead(problem))))
     try:
         for best in _improved(problem, start, seconds, workers, on_news):
             if best.optimal:
@@ -338,7 +338,7 @@ def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any
             return search.result(), True
 
 
-def _with_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
+def with_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
     """The actions, or full speed and sensor 0 for all UAVs, with the problem's fixed ones at the beginning.
 
     The nearest allowed velocity replaces a forbidden one.

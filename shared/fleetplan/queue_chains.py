@@ -1,0 +1,134 @@
+"""The sensors' queues as Markov chains: the losses that a plan expects where links and arrivals are uncertain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import FloatArray, IntArray
+
+Floats = NDArray[np.float32]
+
+# A queue has at most this many levels beside the empty one; of a larger capacity a level is several packets. With 60
+# levels, one a packet, missions in six development worlds of `shadowed` and `faulty` lost the same packets.
+_MOST_LEVELS = 30
+# A negative binomial of so many successes is a Poisson.
+_POISSON = 1e9
+# The places of a uniform distribution's quantiles, for a queue that no beacon told.
+_QUANTILES = np.linspace(-1.0, 1.0, 9)
+
+
+@dataclass(frozen=True, eq=False)
+class QueueChains:
+    """The Markov chains of J sensors' queues over a horizon of H steps, on G + 1 levels from 0 packets to W.
+
+    Attributes:
+        level: packets of a level.
+        start: shape ``(J, G + 1)``, the probability of each level before the first step.
+        arrive: shape ``(H, J, G + 1, G + 1)``, the probabilities of a step's arrivals, from level to level.
+        lost: shape ``(H, J, G + 1)``, the packets that a step is expected to lose, by the level before its arrivals.
+        after: shape ``(K, J, G + 1)``, those that are expected to be lost after the horizon, by the level then and by
+            the stage of :class:`~shared.fleetplan.afterwards.Afterwards`.
+    """
+
+    level: float
+    start: Floats
+    arrive: Floats
+    lost: Floats
+    after: Floats
+
+    def served(self, odds: Floats, levels: IntArray, chance: Floats) -> Floats:
+        """The odds ``(n, G + 1)`` of each level after transfers of ``levels`` ``(n,)`` over links of ``chance``."""
+        count = odds.shape[1] - 1
+        left = np.arange(count + 1) + levels[:, None]
+        moved = np.where(left <= count, np.take_along_axis(odds, np.minimum(left, count), axis=1), np.float32(0.0))
+        moved[:, 0] = np.take_along_axis(np.cumsum(odds, axis=1), levels[:, None], axis=1)[:, 0]
+        return np.asarray(odds + chance[:, None] * (moved - odds))
+
+
+@dataclass(frozen=True)
+class Arriving:
+    """Packets that come to J sensors: their mean and variance, shape ``(..., J)``."""
+
+    mean: FloatArray
+    variance: FloatArray
+
+
+def queue_chains(
+    base: FloatArray,
+    base_variance: FloatArray,
+    came: Arriving,
+    coming: Arriving,
+    capacity: int,
+    beyond: Sequence[int],
+    best_chance: FloatArray,
+    weights: FloatArray,
+) -> QueueChains:
+    """The chains of queues whose arrivals are negative binomial (a Poisson's of an uncertain rate).
+
+    Args:
+        base: the last known packets, ``(J,)``.
+        base_variance: their variance, ``(J,)``, of a uniform distribution.
+        came: since then, ``(J,)``.
+        coming: in each step of the horizon and in each later one, ``(H + 1, J)``.
+        capacity: W, packets.
+        beyond: by stage (K), rising: steps after the plan whose losses count too, at least 0.
+        best_chance: the share, ``(J,)``, of the losses beyond the first stage's that count.
+        weights: the factor of each sensor's lost packets, ``(J,)``.
+    """
+    count = min(capacity, _MOST_LEVELS)
+    level = capacity / count
+    move, over = _transitions(came, capacity, count)
+    start = _uniform(base / level, np.sqrt(3.0 * base_variance) / level, count)
+    start = (start[:, None] @ move)[:, 0]
+    move, over = _transitions(coming, capacity, count)
+    lost = over * weights[:, None]
+    value, values = np.zeros_like(start), []
+    for _ in range(max(beyond) + 1):
+        values.append(value)
+        value = lost[-1] + (move[-1] @ value[..., None])[..., 0]
+    first = values[beyond[0]]
+    after = np.array([first + best_chance[:, None] * (values[steps] - first) for steps in beyond])
+    whole = (start, move[:-1], lost[:-1], after)
+    return QueueChains(level, *(array.astype(np.float32) for array in whole))
+
+
+def _transitions(arriving: Arriving, capacity: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """The probabilities from level to level ``(..., J, G + 1, G + 1)``, and the packets lost ``(..., J, G + 1)``."""
+    level = capacity / count
+    odds = _negative_binomial(arriving.mean, arriving.variance, capacity)
+    if level != 1.0:
+        # A number of packets between two levels counts as the nearer one the more, so that the mean stays.
+        away = np.abs(np.arange(capacity + 1)[:, None] / level - np.arange(count + 1))
+        odds = odds @ np.maximum(0.0, 1.0 - away)
+    q = np.arange(count + 1)
+    more = q - q[:, None]
+    move = np.where(more >= 0, odds[..., np.maximum(more, 0)], 0.0)
+    move[..., -1] = np.maximum(1.0 - move[..., :-1].sum(axis=-1), 0.0)
+    # E[(a - room)+] = E[a] - sum_{k < room} P(a > k)
+    exceed = np.maximum(1.0 - np.cumsum(odds, axis=-1), 0.0)
+    held = np.concatenate((np.zeros((*odds.shape[:-1], 1)), np.cumsum(exceed, axis=-1)[..., :-1]), axis=-1)
+    lost = np.maximum(arriving.mean[..., None] - level * held[..., ::-1], 0.0)
+    return move, lost
+
+
+def _negative_binomial(mean: FloatArray, variance: FloatArray, most: int) -> FloatArray:
+    """The probabilities of 0..most, ``(..., most + 1)``; of a variance not above the mean a Poisson's."""
+    size = np.square(mean) / np.maximum(variance - mean, 1e-12)
+    size = np.clip(size, 1e-9, _POISSON)[..., None]
+    mean = mean[..., None]
+    k = np.arange(most)
+    with np.errstate(divide="ignore"):
+        ratio = np.log((k + size) / (k + 1) * (mean / (size + mean)))
+    none = -size * np.log1p(mean / size)
+    return np.asarray(np.exp(none + np.concatenate((np.zeros_like(none), np.cumsum(ratio, axis=-1)), axis=-1)))
+
+
+def _uniform(middle: FloatArray, half: FloatArray, count: int) -> FloatArray:
+    """The odds of each level, ``(J, G + 1)``, of a queue uniform around a middle ``(J,)``, in levels."""
+    points = np.clip(middle[:, None] + half[:, None] * _QUANTILES, 0.0, count)
+    away = np.abs(points[..., None] - np.arange(count + 1))
+    return np.asarray(np.maximum(0.0, 1.0 - away).mean(axis=1))
