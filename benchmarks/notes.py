@@ -1,9 +1,12 @@
-"""An LLM's understanding of operators' notes: 30 held-out notes, compiled as the edge compiles them.
+"""An LLM's understanding of operators' notes: held-out notes, compiled as the edge compiles them.
 
     python benchmarks/notes.py
+    python benchmarks/notes.py --notes benchmarks/held_out_notes.json
 
-It prints the guidance from each note, the number of exactly right structures, and by field the orders that were found
-and the orders that are wrong; it writes the same as JSON. A control works without any LLM: the most similar worked
+It prints the guidance from each note, the number of right readings and of those that are wrong and without a doubt, and
+by field the orders that were found and the orders that are wrong; it writes the same as JSON. Two structures are the
+same if they order the same. A note whose `guidance` is null has no order that can be given: it is right to refuse it.
+A control works without any LLM: the most similar worked
 example's orders, with this note's numbers in place of the example's, in their order. An LLM no better than the control
 has understood nothing. The LLM is the edge's: set AICVDS_LLM_URL for another.
 """
@@ -17,6 +20,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -49,8 +53,9 @@ class Understood:
     """One note: its meaning, the guidance compiled from it, and the failure if there is none."""
 
     note: str
-    meant: Guidance
+    meant: Guidance | None
     llm: Guidance | None
+    doubts: tuple[str, ...]
     why: str
     control: Guidance | None
     seconds: float
@@ -67,15 +72,18 @@ async def understood(notes: list[dict[str, object]]) -> tuple[str | None, list[U
         for row in notes:
             note, begun, why = str(row["note"]), time.monotonic(), ""
             llm: Guidance | None = None
+            doubts: tuple[str, ...] = ()
             try:
-                llm = await compile_note(note, SCENARIOS["paper"], upstream)
+                reading = await compile_note(note, SCENARIOS["paper"], upstream)
+                llm, doubts = reading.guidance, reading.doubts
             except (BadOrders, Impossible, NoDecision, TimeoutError) as error:
                 why = str(error) or "late"
             took = time.monotonic() - begun
-            found.append(Understood(note, Guidance.model_validate(row["guidance"]), llm, why, control(note), took))
+            meant = None if row["guidance"] is None else Guidance.model_validate(row["guidance"])
+            found.append(Understood(note, meant, llm, doubts, why, control(note), took))
     finally:
         await upstream.close()
-    return upstream.active.model, found
+    return upstream.notes_model, found
 
 
 def control(note: str) -> Guidance | None:
@@ -97,6 +105,21 @@ def numbers(text: str) -> list[int]:
     return [number for number in named if number is not None]
 
 
+def same(given: Guidance | None, meant: Guidance | None) -> bool:
+    """Whether both order the same; a note without an order that can be given is refused, or nothing is ordered."""
+    if given is None or meant is None:
+        return meant is None and not given
+    levels, most = (
+        SCENARIOS["paper"].max_velocity + 1,
+        1 + max((w.sensor_id for w in given.sensors + meant.sensors), default=0),
+    )
+    return (
+        np.array_equal(given.allowed(levels), meant.allowed(levels))
+        and np.array_equal(given.weights(most), meant.weights(most))
+        and np.array_equal(given.every(most), meant.every(most))
+    )
+
+
 def facts(guidance: Guidance | None) -> set[tuple[str, int, float]]:
     """A structure's orders: field, sensor (-1: none), value."""
     if guidance is None:
@@ -114,22 +137,27 @@ def main(asked: Notes) -> None:
     model, rows = asyncio.run(understood(json.loads(asked.notes.read_text())))
     told = Table("", "note", "understood", title=str(model))
     for row in rows:
-        right = facts(row.llm) == facts(row.meant) and row.llm is not None
-        told.add_row("right" if right else "", row.note, row.llm.in_words() if row.llm is not None else f"({row.why})")
+        said = f"({row.why})" if row.llm is None else " ".join((row.llm.in_words(), *row.doubts))
+        told.add_row("right" if same(row.llm, row.meant) else "", row.note, said)
     console.print(told)
     result: dict[str, object] = {"model": model, "notes": len(rows)}
     for who in ("llm", "control"):
-        answers = [(facts(row.meant), getattr(row, who)) for row in rows]
-        exact = sum(given is not None and facts(given) == meant for meant, given in answers)
-        silent = sum(given is None for _, given in answers)
+        given = [getattr(row, who) for row in rows]
+        exact = sum(same(one, row.meant) for one, row in zip(given, rows, strict=True))
+        silent = sum(one is None and row.meant is not None for one, row in zip(given, rows, strict=True))
         result[who] = {"exact": exact, "nothing": silent, "wrong": len(rows) - exact - silent}
         console.print(f"{who}: {exact} of {len(rows)} right, {silent} refused, {len(rows) - exact - silent} wrong")
+        answers = [(facts(row.meant), one) for one, row in zip(given, rows, strict=True)]
         for name in FIELDS:
             pairs = [({f for f in m if f[0] == name}, {f for f in facts(g) if f[0] == name}) for m, g in answers]
-            wanted, given = (sum(len(pair[i]) for pair in pairs) for i in (0, 1))
+            wanted, told_of = (sum(len(pair[i]) for pair in pairs) for i in (0, 1))
             both = sum(len(meant & said) for meant, said in pairs)
-            result[f"{who}_{name}"] = {"asked": wanted, "found": both, "said": given}
-            console.print(f"  {name}: {both} of {wanted} found, {given - both} of {given} wrong")
+            result[f"{who}_{name}"] = {"asked": wanted, "found": both, "said": told_of}
+            console.print(f"  {name}: {both} of {wanted} found, {told_of - both} of {told_of} wrong")
+    certain = [row for row in rows if row.llm and not row.doubts]
+    wrong = sum(not same(row.llm, row.meant) for row in certain)
+    result |= {"certain": len(certain), "wrong_and_certain": wrong}
+    console.print(f"{len(certain)} with orders and without a doubt, of which {wrong} wrong")
     result["seconds_mean"] = round(sum(row.seconds for row in rows) / len(rows), 2)
     asked.out.parent.mkdir(parents=True, exist_ok=True)
     asked.out.write_text(json.dumps(result, indent=1) + "\n")

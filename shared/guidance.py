@@ -233,6 +233,7 @@ class GuidanceStatus(Wire):
     origin: Literal["llm", "operator"] | None = Field(None, description="the author of the structure")
     model: str | None = Field(None, description="the LLM that compiled the note")
     failure: str | None = Field(None, description="why the note could not be compiled")
+    doubts: list[str] = Field([], description="what may be wrong with the LLM's reading; empty where it is certain")
 
 
 class GuidanceAnswer(Received):

@@ -67,7 +67,7 @@ DECISION = {
     "latency_ms": {"plan": 160.7, "augment": 0.8, "attend": 0.5, "prompt": 0.4, "llm": 410.5, "total": 574.2},
     "stored": True,
 }
-GUIDANCE = {
+GUIDANCE: dict[str, Any] = {
     "mission_id": "patrol",
     "status": "confirmed",
     "note": NOTE,
@@ -77,6 +77,7 @@ GUIDANCE = {
     "origin": "operator",
     "model": None,
     "failure": None,
+    "doubts": [],
 }
 MISSION = {
     "mission_id": "patrol",

@@ -7,38 +7,48 @@ import sys
 import tyro
 from rich.console import Console
 
-from service.distilling.options import Distill
+from service.distilling.options import Distill, DistillOrders, Training
 from service.llm.model_file import ModelMissing
 
 
 def main(argv: list[str]) -> int:
     """Train and write; returns the exit code."""
-    args = tyro.cli(Distill, prog="aicvds distill", args=argv)
+    return trained(Distill, "distill", argv)
+
+
+def trained(options: type[Training], name: str, argv: list[str]) -> int:
+    """Train by a command's options and write; returns the exit code."""
+    args = tyro.cli(options, prog=f"aicvds {name}", args=argv)
     console = Console()
     try:
         _check(args)
-        # This import loads torch and transformers, which takes seconds; `--help` and usage errors answer without it.
-        from service.distilling.distill import distill
+        # These imports load torch and transformers, which takes seconds; `--help` and usage errors answer without them.
+        if isinstance(args, Distill):
+            from service.distilling.distill import distill
 
-        distill(args, console)
+            distill(args, console)
+        elif isinstance(args, DistillOrders):
+            from service.distilling.distill_orders import distill_orders
+
+            distill_orders(args, console)
     except (ValueError, OSError, ModelMissing) as error:
-        print(f"aicvds distill: {error}", file=sys.stderr)
+        print(f"aicvds {name}: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as missing:
-        print(f"aicvds distill: {missing.name} is not installed: pip install 'aic-vds[distill]'", file=sys.stderr)
+        print(f"aicvds {name}: {missing.name} is not installed: pip install 'aic-vds[distill]'", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("aicvds distill: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        print(f"aicvds {name}: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         return 130
     console.print(f"Wrote {args.out / 'adapter.gguf'}", soft_wrap=True)
     return 0
 
 
-def _check(args: Distill) -> None:
-    if not args.rollouts:
+def _check(args: Training) -> None:
+    if isinstance(args, Distill) and not args.rollouts:
         raise ValueError("name at least one file of `aicvds explore`")
     for name in ("steps", "batch", "workers"):
-        if getattr(args, name) < 1:
+        if getattr(args, name, 1) < 1:
             raise ValueError(f"--{name} {getattr(args, name)} is not at least 1")
     if not 1 <= args.rank <= 64:
         raise ValueError(f"--rank {args.rank} is not between 1 and 64")

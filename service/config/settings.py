@@ -16,6 +16,8 @@ from shared.validation_messages import suggestion
 
 # The adapter that this package ships, if it ships one.
 SHIPPED_ADAPTER = Path(__file__).parents[1] / "checkpoints" / "adapter.gguf"
+# The orders' adapter, likewise.
+SHIPPED_ORDERS = SHIPPED_ADAPTER.with_name("orders.gguf")
 
 
 def _default_cache() -> Path:
@@ -70,6 +72,9 @@ class Settings(BaseSettings):
     # LoRA adapter of the embedded LLM, a GGUF file of `aicvds distill`. Unset: the package's own, if it has one. `off`:
     # none. `served`: the server of AICVDS_LLM_URL applies it. Missions then have the prompt that it was trained on.
     llm_adapter: str | None = None
+    # LoRA adapter with which the embedded LLM reads operators' notes, a GGUF file of `aicvds distill-orders`. Unset:
+    # the package's own, if it has one. `off`: none.
+    llm_orders: str | None = None
     # Threads of the embedded llama.cpp. 0: cores - 1. With as many threads as cores, llama.cpp's spinning workers need
     # a hundred times as long for a token when anything else runs.
     llm_threads: int = Field(0, ge=0, le=256)
@@ -189,12 +194,18 @@ class Settings(BaseSettings):
     @property
     def embedded_adapter(self) -> Path | None:
         """The adapter file of the embedded LLM; None where that has none, and where the LLM is a server's."""
-        if self.llm_url is not None or self.llm_adapter in ("off", "served"):
+        return self._embedded(None if self.llm_adapter == "served" else self.llm_adapter or SHIPPED_ADAPTER)
+
+    @property
+    def embedded_orders(self) -> Path | None:
+        """The same for operators' notes."""
+        return self._embedded(self.llm_orders or SHIPPED_ORDERS)
+
+    def _embedded(self, named: str | Path | None) -> Path | None:
+        if self.llm_url is not None or named is None or named == "off":
             return None
-        if self.llm_adapter is not None:
-            return Path(self.llm_adapter)
-        # The package's adapter belongs to the package's model.
-        return SHIPPED_ADAPTER if self.llm_gguf is None and SHIPPED_ADAPTER.is_file() else None
+        # The package's adapters belong to the package's model.
+        return Path(named) if isinstance(named, str) else named if self.llm_gguf is None and named.is_file() else None
 
     @property
     def adapted(self) -> bool:

@@ -7,25 +7,21 @@ import random
 from dataclasses import asdict
 from pathlib import Path
 
-import torch
 from rich.console import Console
-from rich.progress import Progress
 
-from service.config.cores import usable_cores
 from service.config.settings import Settings
-from service.distilling.adapter_training import Agreement, Student, agreement, train
+from service.distilling.adapter_training import prepared, train_showing
+from service.distilling.decision_student import Agreement, DecisionStudent, agreement
 from service.distilling.examples import PromptExample
 from service.distilling.examples_file import examples_of
 from service.distilling.options import Distill
-from service.llm.adapter_version import PROMPT_VERSION
+from service.llm.adapter_version import DECISIONS, PROMPT_VERSION
 from service.llm.model_file import embedded_model, sha256
 from service.prompting.compact_prompt import STATIC
 from shared.executors import ordered_map
 
 # Held-out decisions of each scenario that are evaluated.
 _EVALUATED = 300
-# Steps whose mean loss is shown; a log has a line as often.
-_RECENT = 50
 
 
 def distill(args: Distill, console: Console) -> None:
@@ -36,9 +32,7 @@ def distill(args: Distill, console: Console) -> None:
         RayUnusable: there is no such Ray.
         ModelMissing: the embedded model's file does not exist.
     """
-    device = args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-    torch.set_num_threads(args.threads or usable_cores())
-    torch.manual_seed(args.seed)
+    device = prepared(args)
     gguf = embedded_model(Settings())
     training: list[PromptExample] = []
     held_out: dict[str, list[PromptExample]] = {}
@@ -49,26 +43,11 @@ def distill(args: Distill, console: Console) -> None:
             training += found.training
             for name, some in found.held_out.items():
                 held_out.setdefault(name, []).extend(some)
-    student = Student(gguf, STATIC, args.rank, device, args.begin)
-    _train(student, training, args, console)
+    student = DecisionStudent(gguf, STATIC, args.rank, device, args.begin)
+    train_showing(student, training, args, console)
     agreed = {name: agreement(student, _some(some)) for name, some in held_out.items() if some}
     _report(agreed, console)
     _write(student, agreed, gguf, len(training), args)
-
-
-def _train(student: Student, training: list[PromptExample], args: Distill, console: Console) -> None:
-    with Progress(console=console) as progress:
-        task = progress.add_task("Training", total=args.steps)
-        recent: list[float] = []
-        left = args.steps
-        for loss in train(student, training, args, args.out / "checkpoint.pt"):
-            recent = [*recent[1 - _RECENT :], loss]
-            said = f"Training, loss {sum(recent) / len(recent):.3f}"
-            progress.update(task, advance=1, description=said)
-            left -= 1
-            if left % _RECENT == 0 and not console.is_terminal:
-                console.print(f"{args.steps - left} steps: {said}", highlight=False)
-        progress.update(task, advance=left)
 
 
 def _some(held: list[PromptExample]) -> list[PromptExample]:
@@ -84,10 +63,10 @@ def _report(found: dict[str, Agreement], console: Console) -> None:
         )
 
 
-def _write(student: Student, found: dict[str, Agreement], gguf: Path, examples: int, args: Distill) -> None:
+def _write(student: DecisionStudent, found: dict[str, Agreement], gguf: Path, examples: int, args: Distill) -> None:
     student.write_peft(args.out / "peft")
     target = args.out / "adapter.gguf"
-    student.write_gguf(target)
+    student.write_gguf(target, DECISIONS)
     card = {
         "prompt_version": PROMPT_VERSION,
         "base": gguf.name,

@@ -9,7 +9,7 @@ import gguf
 import numpy as np
 from numpy.typing import NDArray
 
-from service.llm.adapter_version import PROMPT_VERSION, VERSION_KEY
+from service.llm.adapter_version import Version
 
 # The model's matrices: transformers' names, and llama.cpp's.
 _NAMES = {
@@ -25,7 +25,7 @@ _HALVES = {"lora_A": "lora_a", "lora_B": "lora_b"}
 
 
 def write_gguf_adapter(
-    path: Path, weights: Mapping[str, NDArray[np.float32]], *, alpha: float, heads: int, kv_heads: int
+    path: Path, weights: Mapping[str, NDArray[np.float32]], version: Version, *, alpha: float, heads: int, kv_heads: int
 ) -> None:
     """Write a LoRA adapter for a model of llama.cpp's architecture ``llama``.
 
@@ -36,6 +36,7 @@ def write_gguf_adapter(
     Args:
         weights: by peft's name, such as ``base_model.model.model.layers.0.mlp.up_proj.lora_A.weight``: A ``(r, in)``
             and B ``(out, r)``.
+        version: of the prompt that it was trained on.
         alpha: the adapter adds ``alpha / r B A`` to each matrix.
         heads, kv_heads: the model's attention heads.
 
@@ -46,7 +47,7 @@ def write_gguf_adapter(
     writer.add_string("general.type", "adapter")
     writer.add_string("adapter.type", "lora")
     writer.add_float32("adapter.lora.alpha", alpha)
-    writer.add_uint32(VERSION_KEY, PROMPT_VERSION)
+    writer.add_uint32(version.key, version.number)
     for name, values in weights.items():
         target, half = _target(name)
         if half == "lora_b" and target.endswith(("attn_q.weight", "attn_k.weight")):

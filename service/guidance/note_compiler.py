@@ -3,7 +3,8 @@
 The prompt is a conversation with worked examples that resemble the note. Where the server can constrain its answer, it
 is constrained to the orders that the note's numbers allow. The answer is parsed strictly in any case; an answer that
 does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
-LLM no note is compiled.
+LLM no note is compiled. An embedded LLM with the orders' adapter reads the note otherwise: see
+:mod:`service.guidance.note_readings`.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
 time and serves decisions first.
@@ -14,10 +15,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from service.guidance.lettered_orders import Reading
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
+from service.guidance.note_readings import read_note
 from service.guidance.operator_guidance import OperatorGuidance
 from service.guidance.order_grammar import constrain_orders
 from service.llm.answers import NoDecision
@@ -35,6 +38,7 @@ _TEMPERATURE = 0.7
 _ANSWER_S = 60.0
 _TIMEOUT_S = 300.0
 _POLL_S = 0.2
+_NOT_JUDGED = "How well this LLM reads notes is not known: compare each order with the note."
 
 
 class NoteOwner(Protocol):
@@ -44,7 +48,7 @@ class NoteOwner(Protocol):
     scenario: Scenario
     guidance: OperatorGuidance
 
-    def propose_guidance(self, guidance: Guidance, model: str | None) -> None:
+    def propose_guidance(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
         """Propose the guidance that an LLM made of the note."""
         ...
 
@@ -96,7 +100,7 @@ class NoteCompiler:
                     return
                 compiled = await compile_note(note, mission.scenario, self._llm)
             if _waits_for(mission, note):
-                mission.propose_guidance(compiled, self._llm.bare_model)
+                mission.propose_guidance(compiled.guidance, self._llm.notes_model, compiled.doubts)
                 self._on_change(mission.mission_id)
             return
         except (BadOrders, Impossible, NoDecision) as error:
@@ -107,7 +111,7 @@ class NoteCompiler:
             log.exception("mission %s: the note was not compiled", mission.mission_id)
             reason = f"{type(error).__name__}: see the log"
         if _waits_for(mission, note):
-            mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.bare_model)
+            mission.fail_guidance(f"{reason}; give `guidance` of your own", self._llm.notes_model)
             self._on_change(mission.mission_id)
 
     async def _wait_for_llm(self) -> None:
@@ -123,23 +127,33 @@ def _waits_for(mission: NoteOwner, note: str) -> bool:
     return mission.guidance.status == "compiling" and mission.guidance.note == note
 
 
-async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Guidance:
-    """The guidance of the first answer that passes every check.
+async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Reading:
+    """The note's reading: with the orders' adapter, or else the first answer that passes every check.
 
     Raises:
         BadOrders: no answer passes, and the first one does not match the note; or the note contains no order.
         Impossible: no answer passes, and the first one orders something that the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
+    begun = time.monotonic()
+    if llm.reads_letters:
+        async with asyncio.timeout(_ANSWER_S):
+            reading = await read_note(note, scenario, llm)
+    else:
+        reading = await _rewrite_note(note, scenario, llm)
+    log.info("note compiled in %.1f s", time.monotonic() - begun)
+    return reading
+
+
+async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> Reading:
     rewriting = Rewriting(
         INSTRUCTION, similar_examples(note), note, lambda constraint: constrain_orders(constraint, note)
     )
     faults: list[BadOrders | Impossible] = []
-    begun = time.monotonic()
     for attempt in range(_ATTEMPTS):
         temperature = _TEMPERATURE if attempt else 0.0
         async with asyncio.timeout(_ANSWER_S):
-            text = await llm.rewrite(rewriting, temperature=temperature, seed=attempt)
+            text = (await llm.rewrite(rewriting, temperature=temperature, seed=attempt)).text
         try:
             guidance = parse_orders(text, note)
             guidance.check(scenario)
@@ -147,6 +161,5 @@ async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Guidan
             log.debug("note, attempt %d: %r: %s", attempt, text[:80], error)
             faults.append(error)
             continue
-        log.info("note compiled in %.1f s, attempt %d", time.monotonic() - begun, attempt)
-        return guidance
+        return Reading(guidance, (_NOT_JUDGED,))
     raise faults[0]

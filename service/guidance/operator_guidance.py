@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from service.errors import Conflict, Refused
@@ -30,11 +31,13 @@ class OperatorGuidance:
         self._origin: Literal["llm", "operator"] | None = None
         self._model: str | None = None
         self._failure: str | None = None
+        self._doubts: list[str] = []
 
-    def propose(self, guidance: Guidance, model: str | None) -> None:
+    def propose(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
         """Propose the guidance that an LLM made of the note; it has no effect until the operator confirms it."""
         if self.status == "compiling":
             self.status, self._proposed, self._origin, self._model = "proposed", guidance, "llm", model
+            self._doubts = list(doubts)
 
     def fail(self, reason: str, model: str | None) -> None:
         """Note that the note was not compiled."""
@@ -51,6 +54,7 @@ class OperatorGuidance:
         if answer.note is not None:
             self.note, self.status = answer.note, "compiling"
             self._proposed = self._origin = self._model = self._failure = None
+            self._doubts = []
             return
         if answer.guidance is not None:
             try:
@@ -58,6 +62,7 @@ class OperatorGuidance:
             except Impossible as error:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
             self._proposed, self._origin, self._failure = answer.guidance, "operator", None
+            self._doubts = []
         elif self._proposed is None:
             raise Conflict(
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
@@ -86,6 +91,7 @@ class OperatorGuidance:
             origin=self._origin,
             model=self._model,
             failure=self._failure,
+            doubts=self._doubts,
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -98,6 +104,7 @@ class OperatorGuidance:
             "origin": self._origin,
             "model": self._model,
             "failure": self._failure,
+            "doubts": self._doubts,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -109,3 +116,4 @@ class OperatorGuidance:
         proposed = state["understood"]
         self._proposed = None if proposed is None else Guidance.model_validate(proposed)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]
+        self._doubts = state.get("doubts", [])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import xllamacpp
 
 from service.config.settings import Settings
-from service.llm.adapter_version import check_adapter
+from service.llm.adapter_version import DECISIONS, ORDERS, check_adapter
 from service.llm.model_file import embedded_model
 
 # By default llama.cpp uses up to 8 GB of host memory for old prompts.
@@ -33,18 +33,30 @@ class EmbeddedServer:
     Args:
         adapter: a LoRA adapter that is applied to every request without :attr:`without_adapter`. The model's name then
             ends in ``+`` and the adapter's.
+        orders: a LoRA adapter that is applied to notes' requests alone.
         context: tokens, which the slots share evenly.
         slots: requests served at once, each with its own prefix cache. With one slot, the static block and the
             experiences are one prefix for the whole fleet.
 
     Attributes:
         without_adapter: the fields that a request needs to be answered by the bare model.
+        with_orders: the fields that a request needs to be answered with the orders' adapter; empty without one.
+        bare_model, model, notes_model: names of the model alone, with the decisions' adapter, and with that of orders.
 
     Raises:
         LoadFailed: llama.cpp could not load the file.
     """
 
-    def __init__(self, gguf: Path, *, threads: int, context: int, slots: int = 1, adapter: Path | None = None) -> None:
+    def __init__(
+        self,
+        gguf: Path,
+        *,
+        threads: int,
+        context: int,
+        slots: int = 1,
+        adapter: Path | None = None,
+        orders: Path | None = None,
+    ) -> None:
         params = xllamacpp.CommonParams()
         params.model.path = str(gguf)
         params.cpuparams.n_threads = threads
@@ -54,12 +66,15 @@ class EmbeddedServer:
         # llama.cpp notices a cancelled call between batches: the next decision would wait seconds for a large one.
         params.n_batch = params.n_ubatch = _BATCH
         # llama.cpp's cache of old prompts ignores adapters: what was read with one would serve a request without it.
-        params.cache_ram_mib = _PROMPT_CACHE_MIB if adapter is None else 0
+        params.cache_ram_mib = _PROMPT_CACHE_MIB if adapter is None and orders is None else 0
         params.verbosity = _ONLY_ERRORS
         params.ui = False
-        if adapter is not None:
-            params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(adapter), 1.0)]
-        self.without_adapter: dict[str, Any] = {} if adapter is None else {"lora": [{"id": 0, "scale": 0.0}]}
+        # The scales of requests that name none.
+        loaded = {path: scale for path, scale in ((adapter, 1.0), (orders, 0.0)) if path is not None}
+        params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(path), scale) for path, scale in loaded.items()]
+        self.without_adapter = _scales(loaded, None)
+        # What the slot has read with another adapter is not reused.
+        self.with_orders = {} if orders is None else {**_scales(loaded, orders), "cache_prompt": False}
         # Requests without the adapter, and how many of them had begun when the adapter last read a whole prompt.
         self._bare_requests = self._read_again_after = 0
         self.api_key = secrets.token_urlsafe(24)
@@ -67,11 +82,13 @@ class EmbeddedServer:
         try:
             self._server: xllamacpp.Server | None = xllamacpp.Server(params)
         except RuntimeError as error:
-            files = gguf.name if adapter is None else f"{gguf.name} with {adapter.name}"
+            files = " with ".join([gguf.name, *(path.name for path in loaded)])
             raise LoadFailed(f"llama.cpp cannot load {files}: {error}") from error
         self.base_url = f"{self._server.listening_address}/v1"
         self.bare_model = gguf.stem
-        self.model = gguf.stem if adapter is None else f"{gguf.stem}+{adapter.stem}"
+        self.model, self.notes_model = (
+            gguf.stem if one is None else f"{gguf.stem}+{one.stem}" for one in (adapter, orders)
+        )
 
     @property
     def gone(self) -> bool:
@@ -93,6 +110,13 @@ class EmbeddedServer:
         yield {} if bare == self._read_again_after else {"cache_prompt": False}
         self._read_again_after = bare
 
+    @contextmanager
+    def note_request(self) -> Iterator[dict[str, Any]]:
+        """While a note's request runs, its fields: the orders' adapter alone, or the bare model without one."""
+        # For the prompts of decisions it is one that the bare model reads.
+        with self.request("", "not a decision's") as bare:
+            yield self.with_orders or bare
+
     def close(self) -> None:
         """Stop the server and free the model; blocks until its threads have ended."""
         self._server = None
@@ -104,10 +128,18 @@ def embed(settings: Settings) -> EmbeddedServer:
     Raises:
         ModelMissing, AdapterUnusable, LoadFailed: there is none, or it cannot be used.
     """
-    gguf, adapter = embedded_model(settings), settings.embedded_adapter
-    if adapter is not None:
-        check_adapter(adapter)
-    return EmbeddedServer(gguf, threads=settings.embedded_threads, context=settings.llm_context, adapter=adapter)
+    gguf, adapter, orders = embedded_model(settings), settings.embedded_adapter, settings.embedded_orders
+    for path, version in ((adapter, DECISIONS), (orders, ORDERS)):
+        if path is not None:
+            check_adapter(path, version)
+    threads, context = settings.embedded_threads, settings.llm_context
+    return EmbeddedServer(gguf, threads=threads, context=context, adapter=adapter, orders=orders)
+
+
+def _scales(loaded: Collection[Path], applied: Path | None) -> dict[str, Any]:
+    """The field with the scale of each loaded adapter. llama.cpp takes an empty list for a missing one."""
+    scales = [{"id": number, "scale": float(path == applied)} for number, path in enumerate(loaded)]
+    return {"lora": scales} if scales else {}
 
 
 async def embedded(settings: Settings) -> EmbeddedServer:

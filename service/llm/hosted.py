@@ -19,6 +19,8 @@ from service.llm.embedded import EmbeddedServer, LoadFailed, embed
 from service.llm.model_file import ModelMissing
 
 _UNUSABLE = 2
+# What one process says to the others.
+_SAID = ("base_url", "api_key", "model", "bare_model", "notes_model", "without_adapter", "with_orders")
 _CELL = 8
 # Seconds between two looks whether it is loaded.
 _LOADING_S = 0.1
@@ -38,8 +40,7 @@ def host(settings: Settings, folder: Path) -> int:
     except (ModelMissing, AdapterUnusable, LoadFailed) as error:
         _write(file, {"error": str(error)})
         return _UNUSABLE
-    names = ("base_url", "api_key", "model", "bare_model", "without_adapter")
-    _write(file, {name: getattr(server, name) for name in names})
+    _write(file, {name: getattr(server, name) for name in _SAID})
     signal.pause()
     return 0
 
@@ -60,11 +61,8 @@ class HostedServer(EmbeddedServer):
         said = json.loads(file)
         if "error" in said:
             raise LoadFailed(said["error"])
-        self.base_url: str = said["base_url"]
-        self.api_key: str = said["api_key"]
-        self.model: str = said["model"]
-        self.bare_model: str = said["bare_model"]
-        self.without_adapter: dict[str, Any] = said["without_adapter"]
+        for name in _SAID:
+            setattr(self, name, said[name])
         # Each process counts its own requests without the adapter, before and after, so that no count is lost.
         self._counts = _counts(member)
         self._all_read_after = bytes(_CELL * member.slots)

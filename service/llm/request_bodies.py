@@ -22,7 +22,7 @@ class Rewriting:
 
     Attributes:
         examples: pairs of a text and its rewritten form.
-        constrain: returns the request fields for the answer's form under a server's constraint.
+        constrain: returns the request fields for the answer's form under a server's constraint, and others.
     """
 
     instruction: str

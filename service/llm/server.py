@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import time
 from collections.abc import Callable, Sequence
 from contextvars import Context
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
@@ -16,6 +16,7 @@ from service.llm.adapter_version import AdapterUnusable
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
+from service.llm.giving_way import GivingWay
 from service.llm.model_file import ModelMissing
 from service.llm.probing import probe, probe_body
 from service.llm.request_bodies import (
@@ -40,11 +41,6 @@ _RETRY_S = 5.0
 # Message to a call that is cancelled because an earlier call was answered: that is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
 _PROBE_TIMEOUT_S = 60.0
-# A rewriting gives way to decisions so often, and waits so long at most for so much time without any: each spoils the
-# other's prefix cache. In a mission, decisions come seconds apart.
-_STEPS_BACK = 3
-_SILENCE_S = 0.5
-_PATIENCE_S = 10.0
 
 
 @dataclass(slots=True)
@@ -72,6 +68,8 @@ class LlmServer:
         status: replaced as a whole when the state changes.
         url: the server's address; empty for the embedded LLM.
         model, bare_model: name of the model, once it is known, with its adapter and without.
+        notes_model: name of the model that reads notes.
+        reads_letters: whether that has the orders' adapter, which reads notes whose numbers are letters.
         constraint: the kind of constraint that the server obeys.
         logprobs: whether the server gives the probabilities of tokens.
         max_uavs_per_call: number of UAVs that one call may decide for.
@@ -94,16 +92,14 @@ class LlmServer:
         self._embedded: EmbeddedServer | None = None
         # Brings the server up, or waits for its recovery.
         self._task: asyncio.Task[None] | None = None
-        self.model = self.bare_model = settings.llm_model
+        self.model = self.bare_model = self.notes_model = settings.llm_model
+        self.reads_letters = False
         self.constraint: Constraint = "none"
         self.logprobs = False
         self.max_uavs_per_call = 1
         self._breaker = CircuitBreaker()
         self._silence = SilenceCounter(settings.deadline_ms / 2e3)
-        # Decisions under way, the end of the last one, and the rewriting that gives way to the next one.
-        self._decisions = 0
-        self._decided_at = -math.inf
-        self._rewriting: asyncio.Task[Completion] | None = None
+        self._giving_way = GivingWay()
 
     @property
     def recovering(self) -> bool:
@@ -160,7 +156,7 @@ class LlmServer:
         positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
         return replace(answer, positions=positions)
 
-    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
+    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> Completion:
         """Call for a rewritten text.
 
         The embedded model has one slot: a few times, the call is given up for a decision and begins again.
@@ -170,33 +166,15 @@ class LlmServer:
             NoDecision: no answer, with the reason.
         """
         body = rewriting_body(self.model, wanted, wanted.constrain(self.constraint), temperature, seed)
-        for _ in range(_STEPS_BACK if self._embedded is not None else 0):
-            await self._await_silence()
-            self._rewriting = asyncio.create_task(self._ask(body), name="llm-rewriting")
-            try:
-                await asyncio.wait({self._rewriting})
-            finally:
-                self._rewriting.cancel()
-            if not self._rewriting.cancelled():
-                return self._rewriting.result().text
-        return (await self._ask(body)).text
-
-    async def _await_silence(self) -> None:
-        """Wait until no decision has been asked for a while, but not longer than ``_PATIENCE_S``."""
-        begun = time.monotonic()
-        while (now := time.monotonic()) < begun + _PATIENCE_S:
-            if not self._decisions and now - max(begun, self._decided_at) >= _SILENCE_S:
-                return
-            await asyncio.sleep(min(0.1, _SILENCE_S))
+        ask = partial(self._ask_about_note, body)
+        return await ask() if self._embedded is None else await self._giving_way.answer(ask)
 
     async def _decide(self, mission_id: str, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
         """Call for a decision, and count its result; ``silence`` counts the wait of a cancelled call."""
-        self._decisions += 1
-        if self._rewriting is not None:
-            self._rewriting.cancel()
         begun = time.monotonic()
         try:
-            answer = await self._ask(body, mission_id)
+            with self._giving_way.decision():
+                answer = await self._ask(body, mission_id)
         except NotUnderstood:
             # The fault is the request's, not the server's.
             raise
@@ -209,25 +187,30 @@ class LlmServer:
             if silence.cancelled(begun, time.monotonic()):
                 self._failed("llm_timeout")
             raise
-        else:
-            if self._breaker.troubled:
-                self._breaker.answered()
-            self._silence.answered_at = time.monotonic()
-            return answer
-        finally:
-            self._decisions -= 1
-            self._decided_at = time.monotonic()
+        if self._breaker.troubled:
+            self._breaker.answered()
+        self._silence.answered_at = time.monotonic()
+        return answer
 
     async def _ask(self, body: dict[str, Any], mission_id: str | None = None) -> Completion:
+        embedded, system = self._embedded, body["messages"][0]["content"]
+        if embedded is None:
+            return replace(await self._complete(body, mission_id), model=self.model)
+        with embedded.request(system, self._warm_up.static) as fields:
+            answer = await self._complete(body | fields)
+        return replace(answer, model=self.bare_model if "lora" in fields else self.model)
+
+    async def _ask_about_note(self, body: dict[str, Any]) -> Completion:
+        if self._embedded is None:
+            return replace(await self._complete(body), model=self.model)
+        with self._embedded.note_request() as fields:
+            return replace(await self._complete(body | fields), model=self.notes_model)
+
+    async def _complete(self, body: dict[str, Any], mission_id: str | None = None) -> Completion:
         if self._client is None or self.status.llm != "ready":
             raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
         try:
-            embedded, system = self._embedded, body["messages"][0]["content"]
-            if embedded is None:
-                return replace(await self._client.complete(body, mission_id), model=self.model)
-            with embedded.request(system, self._warm_up.static) as fields:
-                answer = await self._client.complete(body | fields)
-            return replace(answer, model=self.bare_model if "lora" in fields else self.model)
+            return await self._client.complete(body, mission_id)
         except Unreachable as gone:
             if self.status.llm == "ready":
                 self.status = ServerStatus("unavailable", str(gone))
@@ -294,9 +277,11 @@ class LlmServer:
             self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
             self.model = self.model or self._embedded.model
             self.bare_model = self.bare_model or self._embedded.bare_model
+            self.notes_model = self.notes_model or self._embedded.notes_model
+            self.reads_letters = bool(self._embedded.with_orders)
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
             if self.model is None:
-                self.model = self.bare_model = next(iter(await self._client.models()), None)
+                self.model = self.bare_model = self.notes_model = next(iter(await self._client.models()), None)
             found = await probe(self._client, self.model)
             self.constraint, self.logprobs = found.constraint, found.logprobs
             self.max_uavs_per_call = found.max_uavs_per_call

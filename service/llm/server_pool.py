@@ -65,9 +65,14 @@ class ServerPool:
         return self.active.status.llm
 
     @property
-    def bare_model(self) -> str | None:
-        """The active server's model, without an adapter."""
-        return self.active.bare_model
+    def notes_model(self) -> str | None:
+        """The model with which the active server reads notes."""
+        return self.active.notes_model
+
+    @property
+    def reads_letters(self) -> bool:
+        """As of the active :class:`LlmServer`."""
+        return self.active.reads_letters
 
     @property
     def recovering(self) -> bool:
@@ -109,7 +114,7 @@ class ServerPool:
         """As :meth:`LlmServer.ask_labels`."""
         return self._first(mission_id, lambda server: server.ask_labels(mission_id, system, user, lists), len(lists))
 
-    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> str:
+    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> Completion:
         """As :meth:`LlmServer.rewrite`, by the active server."""
         return await self.active.rewrite(wanted, temperature=temperature, seed=seed)
 

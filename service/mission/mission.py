@@ -112,9 +112,9 @@ class Mission:
         self.guidance.answer(answer)
         self._guidance_changed()
 
-    def propose_guidance(self, guidance: Guidance, model: str | None) -> None:
+    def propose_guidance(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
         """Propose the guidance that an LLM made of the operator's note."""
-        self.guidance.propose(guidance, model)
+        self.guidance.propose(guidance, model, doubts)
         self._guidance_changed()
 
     def fail_guidance(self, reason: str, model: str | None) -> None:

@@ -64,6 +64,7 @@ PARSED = {
     "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
     "aicvds explore": "minutes; tests/e2e/test_pretrain.py runs it small",
     "aicvds distill": "an hour; tests/service/distilling/test_distill.py runs it small",
+    "aicvds distill-orders": "an hour; tests/service/distilling/test_distill_orders.py runs it small",
     "aicvds pretrain": "minutes; tests/e2e/test_pretrain.py runs it small",
     "aicvds demonstrate": "minutes; tests/e2e/test_pretrain.py runs it small",
     "python benchmarks/": "minutes to hours, and they measure",

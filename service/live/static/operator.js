@@ -38,6 +38,8 @@ export class Operator {
     const orders = waits ? guidance.in_words : guidance.status === "failed" ? guidance.failure : "";
     say(at("note-words"), orders ?? "");
     at("note-words").hidden = !orders;
+    say(at("note-doubts"), waits ? (guidance.doubts ?? []).join(" ") : "");
+    at("note-doubts").hidden = !at("note-doubts").textContent;
     at("answer").hidden = !mayCommand || !(waits || (guidance.status === "confirmed" && guidance.obeyed_in_words));
     at("confirm").hidden = !waits;
     say(at("reject"), waits ? "Reject" : "Withdraw the orders");

@@ -19,8 +19,9 @@ from rich.console import Console
 
 from service.commands.distill import main
 from service.config.settings import Settings
-from service.distilling.adapter_training import Student, train
+from service.distilling.adapter_training import train
 from service.distilling.batches import Batches
+from service.distilling.decision_student import DecisionStudent
 from service.distilling.distill import distill
 from service.distilling.examples import (
     EXPERIENCED,
@@ -34,7 +35,7 @@ from service.distilling.examples import (
 from service.distilling.examples_file import examples_of
 from service.distilling.loss import Outputs, Targets, answer_loss, loss_of
 from service.distilling.options import Distill
-from service.llm.adapter_version import PROMPT_VERSION, check_adapter
+from service.llm.adapter_version import DECISIONS, PROMPT_VERSION, check_adapter
 from service.llm.answers import Completion
 from service.llm.calibration import probabilities
 from service.llm.client import LLMClient
@@ -227,7 +228,7 @@ def test_the_loss_is_least_for_the_teachers_probabilities() -> None:
 
 @pytest.mark.long
 def test_it_writes_an_adapter_for_llama_cpp_one_for_vllm_and_a_card(distilled: Path) -> None:
-    check_adapter(distilled / "adapter.gguf")
+    check_adapter(distilled / "adapter.gguf", DECISIONS)
     assert (distilled / "peft" / "adapter_model.safetensors").is_file()
     card = json.loads((distilled / "card.json").read_text(encoding="utf-8"))
     assert (card["prompt_version"], card["steps"]) == (PROMPT_VERSION, 3)
@@ -236,9 +237,9 @@ def test_it_writes_an_adapter_for_llama_cpp_one_for_vllm_and_a_card(distilled: P
 
 
 @pytest.fixture(scope="module")
-def changed(distilled: Path) -> tuple[Student, Path]:
+def changed(distilled: Path) -> tuple[DecisionStudent, Path]:
     """A student whose adapter changes every answer, and its GGUF file."""
-    student = Student(embedded_model(Settings()), STATIC, 2, "cpu", distilled / "peft")
+    student = DecisionStudent(embedded_model(Settings()), STATIC, 2, "cpu", distilled / "peft")
     large = 0
     torch.manual_seed(0)
     with torch.no_grad():
@@ -249,16 +250,16 @@ def changed(distilled: Path) -> tuple[Student, Path]:
                 large += 1
     assert large == 30 * 7
     adapter = distilled.parent / "large.gguf"
-    student.write_gguf(adapter)
+    student.write_gguf(adapter, DECISIONS)
     return student, adapter
 
 
 @pytest.mark.long
-def test_llama_cpp_gives_the_trained_probabilities(changed: tuple[Student, Path], rollouts: Path) -> None:
+def test_llama_cpp_gives_the_trained_probabilities(changed: tuple[DecisionStudent, Path], rollouts: Path) -> None:
     student, adapter = changed
     example = examples_in(LEARNED, rollouts)[0][7]
     with torch.no_grad():
-        trained = torch.softmax(student.read([example.text]).answer, dim=1)[0].numpy()
+        trained = torch.softmax(student.outputs([example.text]).answer, dim=1)[0].numpy()
     gguf = embedded_model(Settings())
     # llama.cpp's first draw decides whether its probabilities are among the labels or among all tokens.
     base, adapted = answered(gguf, None, example.text, 1), answered(gguf, adapter, example.text, 8)
@@ -268,7 +269,7 @@ def test_llama_cpp_gives_the_trained_probabilities(changed: tuple[Student, Path]
 
 
 @pytest.mark.long
-def test_a_request_without_the_adapter_is_answered_by_the_bare_model(changed: tuple[Student, Path]) -> None:
+def test_a_request_without_the_adapter_is_answered_by_the_bare_model(changed: tuple[DecisionStudent, Path]) -> None:
     said: dict[str, list[str]] = {}
     for name, adapter in (("bare", None), ("adapted", changed[1])):
         server = EmbeddedServer(embedded_model(Settings()), threads=1, context=512, adapter=adapter)
@@ -321,9 +322,9 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
     [found] = examples_of([rollouts], tmp_path)
     examples = found.training
 
-    def student() -> Student:
+    def student() -> DecisionStudent:
         torch.manual_seed(0)
-        return Student(embedded_model(Settings()), STATIC, args.rank, "cpu")
+        return DecisionStudent(embedded_model(Settings()), STATIC, args.rank, "cpu")
 
     whole = list(train(student(), examples, args, tmp_path / "whole.pt"))
     assert len(whole) == 4

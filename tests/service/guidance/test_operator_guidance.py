@@ -2,8 +2,10 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import httpx
 import numpy as np
@@ -19,6 +21,7 @@ from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
 from service.llm.answers import Completion
+from service.llm.embedded import EmbeddedServer
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import LlmServer
 from service.mission.mission import Mission
@@ -38,6 +41,8 @@ Edge = Callable[..., httpx.Client]
 
 NOTE = "Suspected leak at sensor 3: visit it every third step."
 ORDERS = "visit sensor 3 every 3 steps"
+# The embedded LLM, without its llama.cpp and without adapters.
+EMBEDDED = SimpleNamespace(request=lambda *_: nullcontext({}), note_request=lambda: nullcontext({}))
 REWRITING = Rewriting(INSTRUCTION, [], NOTE, lambda constraint: constrain_orders(constraint, NOTE))
 # Numbers of its own: 3 occurs twice in the note that it is given with.
 OWN = {"sensors": [{"sensor_id": 1, "weight": 4.0, "visit_every": 2}], "max_velocity": 5, "forbidden_velocities": [0]}
@@ -94,6 +99,7 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
             "origin": "llm",
             "model": "stub-1",
             "failure": None,
+            "doubts": ["How well this LLM reads notes is not known: compare each order with the note."],
         }
         # At step 2 sensor 3 is due, and its queue is the shortest.
         assert client.post("/decide", json=report(step=2)).json()["sensor_id"] != 3
@@ -327,7 +333,7 @@ def test_an_overdue_sensor_out_of_reach_is_not_waited_for() -> None:
 
 
 async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    monkeypatch.setattr("service.llm.giving_way._SILENCE_S", 0.0)
     upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     running: list[str] = []
     finished: list[str] = []
@@ -340,18 +346,18 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
         finished.append(name)
         return Completion(ORDERS, None, None, None)
 
-    upstream._ask = ask  # type: ignore[method-assign]
-    upstream._embedded = object()  # type: ignore[assignment]
+    upstream._complete = ask  # type: ignore[method-assign]
+    upstream._embedded = cast(EmbeddedServer, EMBEDDED)
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     await soon(lambda: running)
     await upstream.ask("mission", "static", "user", [0], 15)
     assert finished == ["decision"]
-    assert await note == ORDERS
+    assert (await note).text == ORDERS
     assert (running, finished) == (["note", "decision", "note"], ["decision", "note"])
 
 
 async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    monkeypatch.setattr("service.llm.giving_way._SILENCE_S", 0.0)
     upstream = LlmServer(Settings(mode="llm"), WarmUp("", "", None))
     given_up = asked = decided = 0
 
@@ -372,11 +378,11 @@ async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.Mon
     def asked_times(times: int) -> bool:
         return asked == times
 
-    upstream._ask = ask  # type: ignore[method-assign]
-    upstream._embedded = object()  # type: ignore[assignment]
+    upstream._complete = ask  # type: ignore[method-assign]
+    upstream._embedded = cast(EmbeddedServer, EMBEDDED)
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     for turn in range(1, 5):
         await soon(partial(asked_times, turn))
         await upstream.ask("mission", "static", "user", [0], 15)
     await note
-    assert (note.result(), given_up) == (ORDERS, 3)
+    assert (note.result().text, given_up) == (ORDERS, 3)

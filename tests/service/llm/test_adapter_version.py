@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 from service.config.settings import SHIPPED_ADAPTER, Settings
-from service.llm.adapter_version import PROMPT_VERSION, VERSION_KEY, AdapterUnusable, check_adapter
+from service.llm.adapter_version import DECISIONS, ORDERS, PROMPT_VERSION, AdapterUnusable, Version, check_adapter
 from service.llm.answers import Completion
 from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
@@ -25,14 +25,22 @@ from shared.scenario import SCENARIOS
 from tests.waiting import soon
 
 
-def metadata(version: int, kind: int = 4) -> bytes:
-    return b"GGUF" + bytes(20) + VERSION_KEY.encode() + struct.pack("<II", kind, version) + bytes(64)
+def metadata(version: int, kind: int = 4, key: str = DECISIONS.key) -> bytes:
+    return b"GGUF" + bytes(20) + key.encode() + struct.pack("<II", kind, version) + bytes(64)
 
 
-def test_an_adapter_of_this_version_passes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", [DECISIONS, ORDERS])
+def test_an_adapter_of_this_version_passes(version: Version, tmp_path: Path) -> None:
+    file = tmp_path / "adapter.gguf"
+    file.write_bytes(metadata(version.number, key=version.key))
+    check_adapter(file, version)
+
+
+def test_an_adapter_of_the_other_task_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "adapter.gguf"
     file.write_bytes(metadata(PROMPT_VERSION))
-    check_adapter(file)
+    with pytest.raises(AdapterUnusable, match="no adapter of aicvds distill-orders: set AICVDS_LLM_ORDERS=off"):
+        check_adapter(file, ORDERS)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +48,7 @@ def test_an_adapter_of_this_version_passes(tmp_path: Path) -> None:
     [
         (metadata(PROMPT_VERSION + 1), f"version {PROMPT_VERSION + 1} of the prompt, and this edge writes"),
         (metadata(PROMPT_VERSION, kind=5), "of the prompt"),
-        (metadata(PROMPT_VERSION)[:60][: 24 + len(VERSION_KEY) + 3], "no adapter of aicvds distill"),
+        (metadata(PROMPT_VERSION)[:60][: 24 + len(DECISIONS.key) + 3], "no adapter of aicvds distill"),
         (b"GGUF" + bytes(100), "no adapter of aicvds distill"),
         (metadata(PROMPT_VERSION)[1:], "no adapter of aicvds distill"),
         (b"", "no adapter of aicvds distill"),
@@ -50,13 +58,13 @@ def test_any_other_file_is_refused_with_the_remedy(tmp_path: Path, content: byte
     file = tmp_path / "adapter.gguf"
     file.write_bytes(content)
     with pytest.raises(AdapterUnusable, match=said) as refused:
-        check_adapter(file)
+        check_adapter(file, DECISIONS)
     assert "AICVDS_LLM_ADAPTER=off" in str(refused.value)
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(AdapterUnusable, match="cannot be read"):
-        check_adapter(tmp_path / "adapter.gguf")
+        check_adapter(tmp_path / "adapter.gguf", DECISIONS)
 
 
 OFF = {"lora": [{"id": 0, "scale": 0.0}]}
@@ -67,7 +75,18 @@ def embedded_server() -> EmbeddedServer:
     """An embedded server with an adapter, without its llama.cpp."""
     server = EmbeddedServer.__new__(EmbeddedServer)
     server.without_adapter, server._bare_requests, server._read_again_after = OFF, 0, 0
+    server.with_orders, server.notes_model = {}, "bare"
     return server
+
+
+def test_a_note_is_read_with_the_orders_adapter_alone_and_decisions_are_read_again_after_it() -> None:
+    server = embedded_server()
+    server.with_orders = {"lora": [{"id": 0, "scale": 0.0}, {"id": 1, "scale": 1.0}], "cache_prompt": False}
+    with server.note_request() as sent:
+        assert sent == server.with_orders
+    for expected in (READ_AGAIN, {}):
+        with server.request("trained", "trained") as sent:
+            assert sent == expected
 
 
 @pytest.mark.parametrize("note", [None, "visit sensor 2 every third step"])
@@ -104,7 +123,7 @@ def test_a_prompt_is_read_again_until_one_is_answered_that_was_sent_after_the_ba
 async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.llm.server._SILENCE_S", 0.0)
+    monkeypatch.setattr("service.llm.giving_way._SILENCE_S", 0.0)
     settings = Settings(mode="llm", llm_adapter=str(tmp_path / "adapter.gguf"))
     warm = warm_up(settings)
     sent: list[dict[str, Any]] = []
@@ -130,7 +149,7 @@ async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
 
 
 def test_the_adapter_that_ships_is_the_one_of_its_card() -> None:
-    check_adapter(SHIPPED_ADAPTER)
+    check_adapter(SHIPPED_ADAPTER, DECISIONS)
     assert SHIPPED_ADAPTER.stat().st_size <= 12_000_000
     card = json.loads(SHIPPED_ADAPTER.with_suffix(".json").read_text(encoding="utf-8"))
     assert (card["adapter_sha256"], card["prompt_version"]) == (sha256(SHIPPED_ADAPTER), PROMPT_VERSION)

@@ -16,7 +16,16 @@ from service.llm.hosted import host, hosted
 
 OFF = {"lora": [{"id": 0, "scale": 0.0}]}
 READ_AGAIN = {"cache_prompt": False}
-SAID = {"base_url": "http://127.0.0.1:1/v1", "api_key": "k", "model": "m+a", "bare_model": "m", "without_adapter": OFF}
+ORDERS = {"lora": [{"id": 0, "scale": 0.0}, {"id": 1, "scale": 1.0}], "cache_prompt": False}
+SAID = {
+    "base_url": "http://127.0.0.1:1/v1",
+    "api_key": "k",
+    "model": "m+a",
+    "bare_model": "m",
+    "notes_model": "m+o",
+    "without_adapter": OFF,
+    "with_orders": ORDERS,
+}
 
 
 async def _each(folder: Path, said: dict[str, Any]) -> list[EmbeddedServer]:
@@ -38,6 +47,11 @@ async def test_a_prompt_is_read_again_after_any_processs_bare_request(tmp_path: 
     assert [_fields(two, "trained") for _ in range(2)] == [READ_AGAIN, {}]
     # While a bare request is under way, the adapter's may be served before it.
     with one.request("another", "trained"):
+        assert _fields(two, "trained") == READ_AGAIN
+    assert [_fields(two, "trained") for _ in range(2)] == [READ_AGAIN, {}]
+    # So it is after a note's.
+    with one.note_request() as sent:
+        assert sent == ORDERS
         assert _fields(two, "trained") == READ_AGAIN
     assert [_fields(two, "trained") for _ in range(2)] == [READ_AGAIN, {}]
     assert (one.base_url, one.api_key, one.model, one.bare_model) == ("http://127.0.0.1:1/v1", "k", "m+a", "m")

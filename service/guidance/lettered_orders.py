@@ -1,0 +1,198 @@
+"""The language in which the orders' adapter answers, and its meaning.
+
+The adapter reads a note whose numbers are letters (:mod:`service.guidance.note_numbers`) and writes orders of the same
+letters, such as ``visit A B every C; max D``. Code reads the letters' values and units here, and checks them.
+A change of a word here, or of the letters' text, is another version: :data:`service.llm.adapter_version.ORDERS`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from service.guidance.note_numbers import LetteredNote, Number
+from service.guidance.note_orders import BadOrders
+from shared.guidance import Guidance, SensorWish
+from shared.scenario import Scenario
+
+STATIC = "Orders of a note."
+SEPARATOR = "; "
+NOTHING, UNCLEAR, MOVE, ALL, OTHERS = "nothing", "unclear", "move", "all", "others"
+_MOST_ORDERS = 8
+_METRES_A_SECOND = {None: 1.0, "m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "kn": 0.514444}
+_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
+# A converted velocity this near to a whole number is that number.
+_ROUNDING = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a note was read as.
+
+    Attributes:
+        doubts: sentences about what may be wrong; empty where nothing is known to be.
+    """
+
+    guidance: Guidance
+    doubts: tuple[str, ...] = ()
+
+
+def grammar(note: LetteredNote) -> str:
+    """GBNF of the answers that a note's letters allow."""
+    if not note.numbers:
+        return f'root ::= "{NOTHING}" | "{UNCLEAR}" | "{MOVE}"'
+    letter = " | ".join(f'"{one}"' for one in note.numbers)
+    return "\n".join(
+        (
+            f'root ::= "{NOTHING}" | "{UNCLEAR}" | '
+            f'order ("{SEPARATOR}" order){{0,{_MOST_ORDERS - 1}}} ("{SEPARATOR}{UNCLEAR}")?',
+            f'order ::= "visit " who (" every " n | " always") | "weigh " who " " n | "ignore " (who | "{OTHERS}") | '
+            f'"max " n | "min " n | "avoid " n (" " n)* | "{MOVE}" | "until " n | "for " n',
+            f'who ::= "{ALL}" | n ("-" n | (" " n)*)',
+            f"n ::= {letter}",
+        )
+    )
+
+
+def meaning(answer: str, note: LetteredNote, scenario: Scenario) -> Reading:
+    """The reading of an answer.
+
+    Raises:
+        BadOrders: the answer is none, is unclear, or a number cannot be what it is ordered to be.
+    """
+    words = answer.strip()
+    if words == UNCLEAR:
+        raise BadOrders("the note is unclear: say which sensor, how often, or how fast")
+    orders = _Orders(note.numbers, scenario)
+    if words != NOTHING:
+        for order in words.split(SEPARATOR):
+            orders.add(order)
+    return Reading(orders.guidance(), tuple(orders.doubts))
+
+
+class _Orders:
+    """The orders of one answer."""
+
+    def __init__(self, numbers: Mapping[str, Number], scenario: Scenario) -> None:
+        self._numbers = numbers
+        self._scenario = scenario
+        self._wishes: dict[int, dict[str, float]] = {}
+        self._limits: dict[str, int] = {}
+        self._forbidden: list[int] = []
+        self._others = False
+        self.doubts: list[str] = []
+
+    def add(self, order: str) -> None:
+        """Add one order; raises :class:`BadOrders`."""
+        kind, *words = order.split(" ")
+        writers: dict[str, Callable[[list[str]], object]] = {
+            "visit": self._visit,
+            "weigh": lambda words: self._wish(words[:-1], "weight", self._plain(words[-1], "weight")),
+            "ignore": self._ignore,
+            "max": lambda words: self._limit("max_velocity", self._velocity(words, math.floor)),
+            "min": lambda words: self._limit("min_velocity", self._velocity(words, math.ceil)),
+            "avoid": lambda words: self._forbidden.extend(self._velocity([word], _whole) for word in words),
+            MOVE: lambda _: self._forbidden.append(0),
+            "until": self._end,
+            "for": self._end,
+            UNCLEAR: lambda _: self.doubts.append("A part of the note is unclear, and is in no order."),
+        }
+        write = writers.get(kind)
+        if write is None or (not words and kind not in (MOVE, UNCLEAR)):
+            raise BadOrders(f"{order[:80]!r} is no order")
+        write(words)
+
+    def guidance(self) -> Guidance:
+        """The orders together; raises :class:`BadOrders`."""
+        if self._others:
+            for sensor in range(self._scenario.sensors):
+                self._wishes.setdefault(sensor, {"weight": 0.0})
+        try:
+            sensors = [SensorWish.model_validate({"sensor_id": own, **wish}) for own, wish in self._wishes.items()]
+            fields = {"sensors": sensors, **self._limits, "forbidden_velocities": sorted(set(self._forbidden))}
+            return Guidance.model_validate(fields)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise BadOrders(f"{first['loc'][-1] if first['loc'] else 'orders'}: {first['msg']}") from None
+
+    def _visit(self, words: list[str]) -> None:
+        if words[-1] == "always":
+            return self._wish(words[:-1], "visit_every", 1)
+        if len(words) < 3 or words[-2] != "every":
+            raise BadOrders("a visit has no period")
+        self._wish(words[:-2], "visit_every", self._period(words[-1]))
+
+    def _ignore(self, words: list[str]) -> None:
+        if words == [OTHERS]:
+            self._others = True
+        else:
+            self._wish(words, "weight", 0.0)
+
+    def _end(self, _: list[str]) -> None:
+        self.doubts.append("The note says when the orders end. The edge does not end them by itself.")
+
+    def _wish(self, sensors: list[str], name: str, value: float) -> None:
+        for sensor in self._sensors(sensors):
+            wish = self._wishes.setdefault(sensor, {})
+            if wish.setdefault(name, value) != value:
+                raise BadOrders(f"{name} of sensor {sensor} is ordered twice")
+
+    def _limit(self, name: str, value: int) -> None:
+        if self._limits.setdefault(name, value) != value:
+            raise BadOrders(f"{name} is ordered twice")
+
+    def _sensors(self, words: list[str]) -> list[int]:
+        if not words:
+            raise BadOrders("an order names no sensor")
+        if words == [ALL]:
+            return list(range(self._scenario.sensors))
+        if len(words) == 1 and "-" in words[0]:
+            first, last = (self._sensor(letter) for letter in words[0].split("-", 1))
+            if not first < last < first + self._scenario.sensors:
+                raise BadOrders(f"sensors {first} to {last} are no range")
+            return list(range(first, last + 1))
+        return [self._sensor(letter) for letter in words]
+
+    def _sensor(self, letter: str) -> int:
+        value = self._plain(letter, "sensor")
+        if not value.is_integer():
+            raise BadOrders(f"there is no sensor {value:g}")
+        return int(value)
+
+    def _number(self, letter: str) -> Number:
+        if letter not in self._numbers:
+            raise BadOrders(f"{letter[:20]!r} is no number of the note")
+        return self._numbers[letter]
+
+    def _plain(self, letter: str, what: str) -> float:
+        number = self._number(letter)
+        if number.unit is not None:
+            raise BadOrders(f"a {what} of {number.value:g} {number.unit}")
+        return number.value
+
+    def _period(self, letter: str) -> int:
+        """Steps; a time is rounded down to whole steps."""
+        number = self._number(letter)
+        if number.unit in _SECONDS:
+            steps = number.value * _SECONDS[number.unit] / self._scenario.step_s
+        elif number.unit in (None, "steps") and number.value.is_integer():
+            steps = number.value
+        else:
+            raise BadOrders(f"{number.value:g} {number.unit or 'steps'} are no period")
+        if steps < 1:
+            raise BadOrders(f"{number.value:g} {number.unit} are shorter than a step of {self._scenario.step_s:g} s")
+        return int(steps)
+
+    def _velocity(self, words: list[str], rounded: Callable[[float], int]) -> int:
+        number = self._number(words[0]) if len(words) == 1 else None
+        if number is None or number.unit not in _METRES_A_SECOND:
+            raise BadOrders("a velocity has no number in m/s, km/h, mph or knots")
+        value = number.value * _METRES_A_SECOND[number.unit]
+        return round(value) if abs(value - round(value)) <= _ROUNDING else rounded(value)
+
+
+def _whole(value: float) -> int:
+    raise BadOrders(f"{value:.1f} m/s is none of the velocities")
