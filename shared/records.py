@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray
+from shared.features import arrays_of
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.gain_measurements import Measured
 from shared.scenario import Scenario
 from shared.schemas import UavState
-from shared.sensor_arrays import arrays_of
 
 # The weight, in steps, of the scenario's mean arrival rate against the observations.
 _PRIOR_STEPS = 2.0

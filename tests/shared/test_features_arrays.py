@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from shared.features import arrays_of
 from shared.schemas import SensorColumns
-from shared.sensor_arrays import arrays_of
 
 
 def columns() -> SensorColumns:
