@@ -26,6 +26,7 @@ _SUMMARIES = {
     "train": "train the learned baselines, MADQN and MAPPO",
     "explore": "record exploring UAVs on training worlds, for pretrain",
     "distill": "train the embedded LLM's adapter on what explore recorded",
+    "distill-orders": "train the adapter that reads operators' notes",
     "pretrain": "train the attention and velocity modules' start on what explore recorded",
     "demonstrate": "choose worked examples for the prompt from what explore recorded",
     "replay": "decide a logged mission again with another model, prompt, k or mode",
@@ -68,7 +69,7 @@ aicvds --version prints the version."""
 
 def usage() -> str:
     """The text of ``aicvds --help``."""
-    return _USAGE.format(commands="\n".join(f"  {name:<11} {text}" for name, text in _SUMMARIES.items()))
+    return _USAGE.format(commands="\n".join(f"  {name:<14} {text}" for name, text in _SUMMARIES.items()))
 
 
 def main() -> int:
