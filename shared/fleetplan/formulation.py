@@ -15,9 +15,6 @@ quick, one for every sensor and every run of steps s..e in which more than W pac
 
 That is, without a visit in these steps the sensor loses the excess.
 
-Over an uncertain link a transfer moves the expected packets, and cancels the risk by the link's chance. ``x`` then
-confines ``c_it`` to the values from which the link holds with a chance of the best tier that the UAV can reach.
-
 After the last step a sensor's price depends on the stage of the nearest UAV (:mod:`shared.fleetplan.afterwards`). A UAV
 that ends below stage k (:mod:`shared.fleetplan.endings`) cancels the prices of that stage as a visit does.
 
@@ -36,43 +33,33 @@ import numpy as np
 from numpy.typing import NDArray
 from ortools.sat.python import cp_model
 
-from shared.channel import FloatArray, IntArray, rate_bps
+from shared.channel import IntArray, rate_bps
 from shared.fleetplan.endings import Endings
-from shared.fleetplan.problem import Course, FleetProblem, expected_packets, fly
+from shared.fleetplan.problem import Course, FleetProblem, fly
 
-# The Booleans that serve a sensor in a step, the packets that each moves, and the chance of its link in percent.
-Visits = list[tuple[Any, int, int]]
+# The Booleans that serve a sensor in a step, and the packets that each moves.
+Visits = list[tuple[Any, int]]
 Links = Literal["exact", "cautious", "hopeful"]
 
-# The lowest chances of the tiers of uncertain links, percent. The lowest tier is for sensors whose links are all weak:
-# without it no plan visits them, and 60 worlds of scenario `shadowed` lost 67 packets each instead of 57.
-_TIERS = (8, 35, 80)
 # The cost of a lost packet. CP-SAT's objective has integer coefficients, and an expected loss may be a fraction.
 SCALE = 100
 
 
 class Serve(NamedTuple):
-    """A UAV collects from a sensor in a step: over a link of at least ``needed`` packets, and so moves ``packets``.
-
-    The link holds with at least the chance ``likely``, and counts as one of the ``chance``, both in percent.
-    """
+    """A UAV collects from a sensor in a step: over a link of at least ``needed`` packets, and so moves ``packets``."""
 
     uav: int
     sensor: int
     step: int
     packets: int
     needed: int
-    likely: int = 100
-    chance: int = 100
 
 
 class Level(NamedTuple):
-    """A tier of a sensor's links; as the fields of :class:`Serve`, with the sums of velocities ``within`` it."""
+    """A level of a sensor's links; as the fields of :class:`Serve`, with the sums of velocities ``within`` it."""
 
     packets: int
     needed: int
-    likely: int
-    chance: int
     within: NDArray[np.bool_]
 
 
@@ -139,10 +126,7 @@ class Formulation:
         for step, (sensor, _) in enumerate(fixed.tolist()):
             packets = min(int(links[step][row[step], sensor]), int(self._most[step, sensor]))
             if packets and not any((s.sensor, s.step) == (sensor, step) for s in self.serves):
-                likely = float(problem.chance(uav, np.array(row[step]), step)[sensor])
-                moved, percent = expected_packets(packets, likely), round(100 * likely)
-                serve = Serve(uav, sensor, step, moved, packets, percent, percent)
-                self.serves[serve] = model.new_constant(1)
+                self.serves[Serve(uav, sensor, step, packets, packets)] = model.new_constant(1)
         for step in range(len(row), problem.horizon):
             reached = links[step][start : start + (step + 1 - len(fixed)) * fastest + 1]
             now = model.new_int_var(start, start + len(reached) - 1, f"c_{uav}_{step}")
@@ -162,16 +146,10 @@ class Formulation:
         if self.problem.usable is not None:
             servable &= self.problem.usable[step]
         summed = start + np.arange(len(packets))
-        chances = None if self.problem.chances is None else self.problem.chance(uav, summed, step)
         for sensor in np.flatnonzero(servable).tolist():
-            found = (
-                _levels(packets[:, sensor], self._links)
-                if chances is None
-                else _best_tier(packets[:, sensor], chances[:, sensor])
-            )
-            for level in found:
-                serve = Serve(uav, sensor, step, level.packets, level.needed, level.likely, level.chance)
-                literal = self.model.new_bool_var(f"x_{uav}_{sensor}_{step}_{level.needed}_{level.likely}")
+            for level in _levels(packets[:, sensor], self._links):
+                serve = Serve(uav, sensor, step, level.packets, level.needed)
+                literal = self.model.new_bool_var(f"x_{uav}_{sensor}_{step}_{level.needed}")
                 within = cp_model.Domain.from_values(summed[level.within].tolist())
                 self.model.add_linear_expression_in_domain(now, within).only_enforce_if(literal)
                 self.serves[serve] = literal
@@ -191,7 +169,7 @@ class Formulation:
         problem = self.problem
         visits: list[list[Visits]] = [[[] for _ in range(problem.horizon)] for _ in range(problem.sensors)]
         for serve, literal in self.serves.items():
-            visits[serve.sensor][serve.step].append((literal, serve.packets, serve.chance))
+            visits[serve.sensor][serve.step].append((literal, serve.packets))
         return visits
 
     def _store(self, sensor: int, affordable: int, visits: list[Visits]) -> None:
@@ -204,7 +182,7 @@ class Formulation:
             filled = int(self._most[step, sensor]) + arrived
             after = model.new_int_var(min(arrived, capacity), min(filled, capacity), "")
             over = model.new_int_var(max(0, arrived - capacity), int(self._overflow[step, sensor]), "")
-            drained = _total(packets * literal for literal, packets, _ in visits[step])
+            drained = _total(packets * literal for literal, packets in visits[step])
             model.add(after + over >= queue[-1] + arrived - drained)
             if arrived > capacity:
                 model.add(after + over >= arrived)
@@ -230,7 +208,7 @@ class Formulation:
                 if excess > room:
                     break
                 if excess > 0:
-                    within = _total(literal for step in visits[start:end] for literal, _, _ in step)
+                    within = _total(literal for step in visits[start:end] for literal, _ in step)
                     self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
 
     def _expect(self, sensor: int, lost: list[Any], visits: list[Visits]) -> None:
@@ -292,8 +270,7 @@ class Formulation:
         best: dict[tuple[int, int], Serve] = {}
         for serve in self.serves:
             made = (serve.step, serve.uav)
-            likely = course.chance[made] * 100 >= serve.likely - 0.5
-            if actions[made][0] == serve.sensor and course.link[made] >= serve.needed and likely:
+            if actions[made][0] == serve.sensor and course.link[made] >= serve.needed:
                 best[made] = max(serve, best.get(made, serve))
         return set(best.values())
 
@@ -334,7 +311,7 @@ def _levels(packets: IntArray, links: Links) -> list[Level]:
             pairs = [(levels[0], levels[0])]
         case "hopeful":
             pairs = [(levels[-1], levels[0])]
-    return [Level(moved, needed, 100, 100, packets >= needed) for moved, needed in pairs]
+    return [Level(moved, needed, packets >= needed) for moved, needed in pairs]
 
 
 def _affordable(problem: FleetProblem) -> IntArray:
@@ -345,33 +322,10 @@ def _affordable(problem: FleetProblem) -> IntArray:
     return np.asarray(np.floor(np.minimum(problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
 
 
-def _best_tier(packets: IntArray, chances: FloatArray) -> list[Level]:
-    """The level of uncertain links, shape ``(C,)`` each, with the highest chances; empty where no tier has any.
-
-    Lower tiers would double the Booleans. On 8 worlds of scenario ``shadowed`` the plans with the best tier alone lost
-    63 packets, with all tiers 86, found in the same work.
-    """
-    beyond = 101
-    for lowest in reversed(_TIERS):
-        usable = (packets > 0) & (chances * 100 >= lowest)
-        tier = usable & (chances * 100 < beyond)
-        if tier.any():
-            likely = float(chances[tier].mean())
-            moved = max(1, expected_packets(int(packets[tier].min()), likely))
-            return [Level(moved, int(packets[usable].min()), lowest, round(100 * likely), usable)]
-        beyond = lowest
-    return []
-
-
 def _charge(model: cp_model.CpModel, cost: Any, expected: int, visits: list[Visits], near: list[Any]) -> None:
-    """Let a cost be at least the expected one, less the share that visits, or a UAV that ends near, cancel."""
-    made = [visit for now in visits for visit in now]
-    if all(chance == 100 for _, _, chance in made):
-        within = _total([*(literal for literal, _, _ in made), *near])
-        model.add(cost + expected * within >= expected)
-    else:
-        within = _total([*(chance * literal for literal, _, chance in made), *(100 * literal for literal in near)])
-        model.add(100 * cost + expected * within >= 100 * expected)
+    """Let a cost be at least the expected one, unless a visit, or a UAV that ends near, cancels it."""
+    made = [literal for now in visits for literal, _ in now]
+    model.add(cost + expected * _total([*made, *near]) >= expected)
 
 
 def _total(terms: Iterable[Any]) -> Any:

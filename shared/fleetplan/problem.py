@@ -44,7 +44,7 @@ class FleetProblem:
             can move over the link after steps whose velocities sum to c, 0 where the link fails, with C at least
             ``H max_velocity + 1``. ``None``: by the formula.
         chances: of the same shapes as ``links``: the probability that each link holds. A transfer then moves the share
-            ``chance`` of its packets, the expected ones, and cancels that share of the risk. ``None``: 1.
+            ``chance`` of its packets, the expected ones. ``None``: 1.
         afterwards: the risk after the horizon by the UAVs' last places, in place of ``risk[:, H]``; it needs a
             ``risk``. ``None``: wherever the UAVs are, the risk is that.
         chains: the queues' distributions, for a search of plans over uncertain links; the last sensor is then one
@@ -205,26 +205,18 @@ class FleetProblem:
         table = self.chances[uav]
         return np.asarray(table[step if len(table) > 1 else 0, np.asarray(velocity)])
 
-    def tables_until(self, step: int) -> dict[str, Any]:
-        """The links and chances of the steps before this one."""
-        return {
-            name: None if tables is None else [table[:step] for table in tables]
-            for name, tables in (("links", self.links), ("chances", self.chances))
-        }
+    def links_until(self, step: int) -> list[IntArray] | None:
+        """The links of the steps before this one."""
+        return None if self.links is None else [table[:step] for table in self.links]
 
-    def tables_after(self, actions: IntArray) -> dict[str, Any]:
-        """The links and chances after these actions ``(n, I, 2)``."""
+    def links_after(self, actions: IntArray) -> list[IntArray] | None:
+        """The links after these actions ``(n, I, 2)``."""
+        if self.links is None:
+            return None
         flown = actions[:, :, 1].sum(axis=0).tolist()
-
-        def after(table: NDArray[Any], summed: int) -> NDArray[Any]:
-            return table[min(len(actions), len(table) - 1) :, summed:]
-
-        return {
-            name: None
-            if tables is None
-            else [after(table, summed) for table, summed in zip(tables, flown, strict=True)]
-            for name, tables in (("links", self.links), ("chances", self.chances))
-        }
+        return [
+            table[min(len(actions), len(table) - 1) :, summed:] for table, summed in zip(self.links, flown, strict=True)
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,13 +227,11 @@ class Course:
         queue: shape ``(H + 1, J)``, packets before each step and after the last.
         lost: shape ``(H, J)``, packets.
         link: shape ``(H, I)``, packets that the link could move if it holds; 0 for a failed transmission.
-        chance: shape ``(H, I)``, the probability that it holds.
     """
 
     queue: IntArray
     lost: IntArray
     link: IntArray
-    chance: FloatArray
 
 
 def fly(problem: FleetProblem, actions: IntArray) -> Course:
@@ -253,7 +243,7 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
     capacity = problem.scenario.queue_capacity
     queue, lost = [problem.queue], []
     battery = problem.battery.copy()
-    link, chance = np.zeros(actions.shape[:2], dtype=np.int64), np.zeros(actions.shape[:2])
+    link = np.zeros(actions.shape[:2], dtype=np.int64)
     for step, transfers in enumerate(_transfers(problem, actions)):
         left, served = queue[-1].copy(), set[int]()
         for uav, (sensor, budget, joules, likely) in enumerate(transfers):
@@ -261,17 +251,17 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
             if budget is None or sensor in served or affordable < 1:
                 continue
             served.add(sensor)
-            link[step, uav], chance[step, uav] = budget, likely
-            moved = min(int(left[sensor]), expected_packets(budget, likely), affordable)
+            link[step, uav] = budget
+            moved = min(int(left[sensor]), _expected(budget, likely), affordable)
             left[sensor] -= moved
             battery[sensor] = max(0.0, float(battery[sensor]) - moved * joules)
         filled = left + problem.arrivals[step]
         queue.append(np.minimum(filled, capacity))
         lost.append(filled - queue[-1])
-    return Course(np.array(queue), np.array(lost), link, chance)
+    return Course(np.array(queue), np.array(lost), link)
 
 
-def expected_packets(packets: int, chance: float) -> int:
+def _expected(packets: int, chance: float) -> int:
     """The expected packets of a transfer, rounded down."""
     return packets if chance >= 1.0 else int(packets * chance + 1e-9)
 
@@ -279,9 +269,8 @@ def expected_packets(packets: int, chance: float) -> int:
 def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
     """The lost packets of actions, and the objective of a plan: weighted losses and expected losses above them.
 
-    The expected loss in a step is the largest ``risk[s, e] (1 - P)`` of all s, with P the sum of the chances of the
-    sensor's visits from step s on. With certain links that is the risk since the last visit. After the horizon the
-    risk is that of each sensor's stage in ``afterwards``.
+    The expected loss in a step is the risk since the sensor's last visit. After the horizon the risk is that of each
+    sensor's stage in ``afterwards``. Links are certain: an uncertain one counts as one that holds.
     """
     course = fly(problem, actions)
     lost = int(course.lost.sum())
@@ -293,15 +282,15 @@ def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
     if problem.afterwards is not None:
         stage = problem.afterwards.stage(actions[:, :, 1].sum(axis=0))
     at_end = np.take_along_axis(after, stage[None, None, :], axis=0)[0]
-    visits = np.zeros((problem.horizon + 1, problem.sensors))
+    visits = np.zeros((problem.horizon + 1, problem.sensors), dtype=np.bool_)
     steps = np.repeat(np.arange(problem.horizon), problem.uavs)
-    np.add.at(visits, (steps, actions[:, :, 0].ravel()), course.chance.ravel())
+    visits[steps[served := course.link.ravel() > 0], actions[:, :, 0].ravel()[served]] = True
     cost = 0.0
     for step in range(problem.horizon + 1):
-        # visited[s]: the chances of the visits in the steps s..e.
-        visited = np.cumsum(visits[step::-1], axis=0)[::-1]
+        # visited[s]: whether a visit is in the steps s..e.
+        visited = np.logical_or.accumulate(visits[step::-1], axis=0)[::-1]
         since = at_end if step == problem.horizon else neglect[: step + 1, step]
-        expected = (since * np.maximum(1.0 - visited, 0.0)).max(axis=0)
+        expected = np.where(visited, 0.0, since).max(axis=0)
         cost += float((expected if step == problem.horizon else np.maximum(expected, paid[step])).sum())
     return lost, cost
 

@@ -168,6 +168,7 @@ class RecedingHorizon:
             return np.array([(index.get(sensor, nowhere), v) for sensor, v in actions.tolist()], dtype=np.int64)
 
         links = self._links(present, kept, horizon)
+        ahead = self._chances_ahead(present, kept, horizon) if self._joint else None
         problem = FleetProblem(
             scenario=world,
             trajectories=[belief.trajectory(u) for u in present],
@@ -175,9 +176,9 @@ class RecedingHorizon:
             places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
-            chains=self._chains(present, kept, horizon) if links else None,
+            chains=self._chains(kept, horizon, ahead) if links else None,
             **links,
-            **self._outlook(present, kept, horizon),
+            **self._outlook(kept, horizon, ahead),
             **self._guided(kept, horizon),
         )
         before = np.empty((horizon, len(present), 2), dtype=np.int64)
@@ -246,12 +247,12 @@ class RecedingHorizon:
         usable[0, :-1] = ~np.isin(kept, list(taken))
         return usable
 
-    def _outlook(self, present: list[int], kept: IntArray, horizon: int) -> dict[str, Any]:
+    def _outlook(self, kept: IntArray, horizon: int, ahead: list[FloatArray] | None) -> dict[str, Any]:
         """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         queue, rate, burst = belief.queue(step)[kept], belief.arrivals.rate[kept], belief.arrivals.burst(step)[kept]
-        ahead = np.arange(horizon + 1)[:, None]
-        expected = np.rint(queue + ahead * rate + burst * Arrivals.burst_over(ahead)).astype(np.int64)
+        steps = np.arange(horizon + 1)[:, None]
+        expected = np.rint(queue + steps * rate + burst * Arrivals.burst_over(steps)).astype(np.int64)
         risk, after = neglect(
             base=belief.base[kept] + burst,
             base_variance=belief.base_variance[kept],
@@ -268,16 +269,13 @@ class RecedingHorizon:
             "battery": np.append(belief.battery[kept], 0.0),
             "arrivals": np.pad(np.diff(expected, axis=0), ((0, 0), (0, 1))),
             "risk": np.pad(risk, ((0, 0), (0, 0), (0, 1))),
-            "afterwards": self._afterwards(present, kept, horizon, after),
+            "afterwards": None if ahead is None else self._afterwards(ahead, horizon, after),
         }
 
-    def _afterwards(self, present: list[int], kept: IntArray, horizon: int, risk: FloatArray) -> Afterwards | None:
-        """The risk after the horizon by the UAVs' ways to the kept sensors; a large fleet's does not depend on them."""
-        if not self._joint:
-            return None
+    def _afterwards(self, chances: list[FloatArray], horizon: int, risk: FloatArray) -> Afterwards:
+        """The risk after the horizon by the UAVs' ways to the kept sensors, over links of these chances."""
         fastest = self._scenario.max_velocity
         sums = horizon * fastest + 1
-        chances = self._chances_ahead(present, kept, horizon)
         best = np.max(chances, axis=(0, 1))
         stages = []
         for chance in chances:
@@ -294,7 +292,7 @@ class RecedingHorizon:
         links = [self._belief.links(uav, metres) for uav in present]
         return [(link.hold * (link.packets > 0))[:, kept] for link in links]
 
-    def _chains(self, present: list[int], kept: IntArray, horizon: int) -> QueueChains:
+    def _chains(self, kept: IntArray, horizon: int, ahead: list[FloatArray] | None) -> QueueChains:
         """The queues' chains of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         arrivals = belief.arrivals
@@ -305,7 +303,7 @@ class RecedingHorizon:
         soon = np.diff(Arrivals.burst_over(np.arange(horizon + 2)), axis=0)
         soon[-1] = 0.0
         coming = rate + arrivals.burst(step)[kept] * soon[:, None]
-        best = np.max(self._chances_ahead(present, kept, horizon), axis=(0, 1)) if self._joint else np.ones(len(kept))
+        best = np.ones(len(kept)) if ahead is None else np.max(ahead, axis=(0, 1))
         # The error of the rate is the same in all steps: of n steps it adds n times a step's variance to each.
         spread = coming * dispersion + rate_variance * horizon / 2
         return queue_chains(

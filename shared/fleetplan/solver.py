@@ -121,11 +121,14 @@ def plan(
         The best plan found; otherwise the hint; without one, all UAVs at full speed.
 
     Raises:
+        ValueError: links are uncertain; :func:`shared.fleetplan.uav_by_uav.searched` plans over such.
         ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
         Interrupted: Ctrl-C came, and the budget limits seconds.
     """
     from shared.fleetplan.formulation import Formulation
 
+    if problem.chances is not None:
+        raise ValueError("chances: CP-SAT plans over certain links")
     begun = time.perf_counter()
     best = _priced(problem, with_fixed(problem, hint))
     found = _Search(None, 0.0, "UNKNOWN", 0.0)
@@ -225,7 +228,7 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
             usable=None,
             risk=None,
             afterwards=None,
-            **now.tables_until(_NEAR),
+            links=now.links_until(_NEAR),
         )
         left = seconds - (time.perf_counter() - begun)
         actions = look_ahead(near)
@@ -240,7 +243,7 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
             progress_m=now.progress_m + kept[:, :, 1].sum(axis=0) * problem.scenario.step_s,
             queue=fly(near, actions).queue[len(kept)],
             arrivals=now.arrivals[len(kept) :],
-            **now.tables_after(kept),
+            links=now.links_after(kept),
         )
 
 

@@ -50,9 +50,8 @@ def every(horizon: int) -> Any:
 
 
 @pytest.mark.parametrize("weights", [None, np.array([1.0, 3.0])])
-@pytest.mark.parametrize("chance", [1.0, 0.6])
-def test_the_search_prices_what_comes_after_as_trying_everything_does(chance: float, weights: Any) -> None:
-    made = problem(chances=[np.full((1, SUMS, SENSORS), chance)] * UAVS, weights=weights)
+def test_the_search_prices_what_comes_after_as_trying_everything_does(weights: Any) -> None:
+    made = problem(weights=weights)
     found = plan(made, ENOUGH, "cautious")
     assert found.status == "OPTIMAL"
     assert price(made, found.actions) == (found.lost_packets, found.objective)
