@@ -153,6 +153,7 @@ def _decided(decision: Decision) -> DecisionRecord:
         tokens=None if decision.tokens is None else TokenCounts.model_validate(decision.tokens.model_dump()),
         rtt_ms=None if decision.rtt_ms is None else round(decision.rtt_ms, 2),
         latency_ms={stage: round(took, 2) for stage, took in decision.latency_ms.items()},
+        trust={adviser: round(weight, 4) for adviser, weight in decision.trust.items()},
     )
 
 

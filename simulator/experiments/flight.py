@@ -35,7 +35,11 @@ class TokenCounts(Record):
 
 
 class DecisionRecord(Record):
-    """One decision and its outcome; the last four fields are ``None`` or empty for a decision without an edge."""
+    """One decision and its outcome; the last five fields are ``None`` or empty for a decision without an edge.
+
+    ``trust`` is the weight of each adviser before a decision of mode ``guided``, and empty in flights that were stored
+    before it was.
+    """
 
     step: int
     uav: int
@@ -48,6 +52,7 @@ class DecisionRecord(Record):
     tokens: TokenCounts | None = None
     rtt_ms: float | None = None
     latency_ms: dict[str, float] = {}
+    trust: dict[str, float] = {}
 
 
 class BoundFound(Record):

@@ -42,7 +42,7 @@ EXPERIMENT = Experiment(
     title="Decisions worth flying, whatever the LLM",
     summary="mode guided with the LLM at hand, with one that draws or names the worst, and without the planner",
     schemes=_schemes,
-    measures=(*LOSSES, "failures", "overflows", "velocity", "prompt_tokens"),
+    measures=(*LOSSES, "failures", "overflows", "velocity", "prompt_tokens", "llm_trust"),
     figures=(
         FigureSpec("guided", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), per step and cumulative."),
         FigureSpec("guided_totals", "bars", LOSSES, "Lost packets and loss events (Eq. 5) of a mission."),

@@ -140,6 +140,16 @@ def _trips_per_step(flight: FlightRecord) -> list[float] | None:
     return present if len(present) == flight.steps else None
 
 
+def _last_trust(adviser: str) -> Callable[[FlightRecord], float | None]:
+    """An adviser's mean weight before the last decisions in which it had one, up to one a UAV."""
+
+    def last(flight: FlightRecord) -> float | None:
+        weights = [d.trust[adviser] for d in flight.decisions if adviser in d.trust]
+        return _mean(weights[-flight.uavs :])
+
+    return last
+
+
 def _counted(steps: list[int]) -> list[float] | None:
     return [float(value) for value in steps] or None
 
@@ -177,6 +187,7 @@ MEASURES: dict[str, Measure] = {
     "llm_decided_pct": Measure(
         "decided by the LLM, %", lambda f: 100 * sum(d.source == "llm" for d in f.decisions) / len(f.decisions)
     ),
+    "llm_trust": Measure("the LLM's weight among the advisers at the end", _last_trust("llm")),
 }
 
 STEP_MEASURES: dict[str, StepMeasure] = {

@@ -55,6 +55,14 @@ def test_round_trips_and_their_shares() -> None:
     assert MEASURES["rtt_p50"].of(flown([decided(0, 0)])) is None
 
 
+def test_the_llms_trust_is_that_of_the_last_decisions_with_one() -> None:
+    weights: list[dict[str, float]] = [{"llm": 0.2}, {"llm": 0.4}, {"llm": 0.6}, {}, {"planner": 1.0}]
+    flight = flown([decided(step, 0, trust=weight) for step, weight in enumerate(weights)])
+    last = [weight["llm"] for weight in weights[:3]][-flight.uavs :]
+    assert MEASURES["llm_trust"].of(flight) == pytest.approx(sum(last) / len(last))
+    assert MEASURES["llm_trust"].of(flown([decided(0, 0)])) is None
+
+
 def test_substituted_decisions_exclude_those_without_a_candidate() -> None:
     reasons = ["llm_timeout", "answer_sensor", "no_candidate", "edge_unreachable", None]
     flight = flown([decided(0, 0, reason=reason) for reason in reasons])
