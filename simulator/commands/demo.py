@@ -25,8 +25,8 @@ class Demo:
     """Start an edge on this machine, fly a mission against it, and compare with EOF and WQCS.
 
     The edge loads its LLM (the embedded one, or that of the AICVDS_LLM_* variables), decides for three UAVs at thirty
-    waypoints each, and stops. Written to --out: report.html (open it in a browser), summary.json, decisions.jsonl and
-    edge.log. The results of an earlier demo there are overwritten.
+    waypoints each, then in the same world without the LLM, and stops. Written to --out: report.html (open it in a
+    browser), summary.json, decisions.jsonl and edge.log. The results of an earlier demo there are overwritten.
 
     Try it:  aicvds demo --out runs/demo
 
@@ -80,6 +80,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         edge=f"http://{HOST}:{port}",
         wait_s=options.wait_s,
         bound_s=BOUND_S if options.bound else 0.0,
+        reference="policy",
     )
     log = options.out / EDGE_LOG
     # A store of its own, apart from that of another edge on this machine.

@@ -9,12 +9,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import httpx
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 
 from shared.guidance import GuidanceAnswer
 from shared.missions import MissionStatus
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from simulator.flying.pilots import Choice, Pilot
 
 API_KEY = "AICVDS_API_KEY"
+_LLM_MODES = ("llm", "guided")
 # Without a requested deadline the edge's default applies, which may be as long as the paper's step.
 DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
@@ -59,7 +60,8 @@ class Job:
     ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. A ``named`` mission may exist at the
     edge before the flight. ``note`` is the operator's. Before take-off the mission waits,
     at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses
-    is searched for ``bound_s`` seconds at most; 0 searches none.
+    is searched for ``bound_s`` seconds at most; 0 searches none. ``reference`` is a mode
+    without an LLM in which the same edge flies the same world once more, after a mission whose mode has one.
     """
 
     site: Site
@@ -78,6 +80,7 @@ class Job:
     wait_out: tuple[str, ...] = ("loading",)
     reconnect_s: float = 0.0
     bound_s: float = BOUND_S
+    reference: Mode | None = None
 
 
 def conduct(
@@ -97,7 +100,7 @@ def conduct(
     if job.edge is None:
         fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
-        return _conclude(job, flight, None, None, None, console)
+        return _conclude(job, flight, None, None, {}, console)
     lossy = _radio_link(job.site.scenario, job.seed)
     with _client(job, job.edge) as ground, _client(job, job.edge, lossy) as radio, _probe(job.edge) as probe:
         model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
@@ -119,7 +122,9 @@ def conduct(
             pilot.on_request = requests.append
             flight = _fly(job, pilot, console, progress)
         operator = _operator(probe, job.mission_id, flight)
-    code = _conclude(job, flight, created.mode, model, operator, console)
+        again = _reference(job, ground, console) if created.mode in _LLM_MODES and not flight.interrupted else None
+    extra = {"operator": operator, "without_llm": again}
+    code = _conclude(job, flight, created.mode, model, extra, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
         print(
@@ -247,12 +252,8 @@ class _ProgressText:
         self._update(f"{self._lost} lost; {sources_text(BySource(**self._sources))}")
 
 
-def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Flight:
-    from simulator.flying.flight import fly
-
-    with naming_out(job.out):
-        log = DecisionLog(job.out / DECISIONS)
-    columns = (
+def _columns() -> tuple[ProgressColumn, ...]:
+    return (
         TextColumn("{task.description}"),
         BarColumn(bar_width=12),
         MofNCompleteColumn(),
@@ -260,7 +261,14 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
         TextColumn("{task.fields[text]}"),
         TimeElapsedColumn(),
     )
-    with log, Progress(*columns, console=console) as progress:
+
+
+def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Flight:
+    from simulator.flying.flight import fly
+
+    with naming_out(job.out):
+        log = DecisionLog(job.out / DECISIONS)
+    with log, Progress(*_columns(), console=console) as progress:
         task = progress.add_task("Flying", total=job.site.scenario.steps, text="")
         text.show_with(lambda shown: progress.update(task, text=shown))
 
@@ -272,6 +280,31 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
     if flight.interrupted:
         console.print(f"interrupted after {flight.steps_flown} steps; writing their results", highlight=False)
     return flight
+
+
+def _reference(job: Job, edge: EdgeClient, console: Console) -> int | None:
+    """The packets that the same edge loses in the same world in the job's reference mode; ``None`` if it fails."""
+    from simulator.flying.flight import fly
+    from simulator.flying.pilots import EdgePilot
+
+    if job.reference is None:
+        return None
+    mission_id = f"{job.mission_id}-{job.reference}"
+    pilot = EdgePilot(edge, mission_id, job.site.scenario, job.seed, mode=job.reference, deadline_ms=job.deadline_ms)
+    with Progress(*_columns(), console=console) as progress:
+        task = progress.add_task(f"Flying again, mode {job.reference}", total=job.site.scenario.steps, text="")
+
+        def stepped(flight: Flight) -> None:
+            progress.advance(task)
+
+        try:
+            edge.put_mission(mission_id, pilot.spec)
+        except EdgeError:
+            return None
+        flight = fly(job.site, pilot, job.seed, on_step=stepped)
+    if flight.interrupted or pilot.answered < len(flight.decisions):
+        return None
+    return sum(tally.lost_packets for tally in flight.tally)
 
 
 def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> Operator | None:
@@ -300,8 +333,9 @@ def _bounded(job: Job, flight: Flight, summary: Summary, console: Console) -> Su
 
 
 def _conclude(
-    job: Job, flight: Flight, mode: str | None, model: str | None, operator: Operator | None, console: Console
+    job: Job, flight: Flight, mode: str | None, model: str | None, extra: Mapping[str, Any], console: Console
 ) -> int:
+    """Summarise, with these further fields of the summary, write and print; returns the exit code."""
     from simulator.flying.rollout import baselines
 
     flown_by = "aic_vds" if job.policy == "edge" else job.policy
@@ -317,7 +351,7 @@ def _conclude(
         deadline_ms=job.deadline_ms,
         command=job.command,
     )
-    flown = summarise(facts, flight.decisions, tallies).model_copy(update={"operator": operator})
+    flown = summarise(facts, flight.decisions, tallies).model_copy(update=extra)
     summary = _bounded(job, flight, flown, console)
     write_results(job.out, summary, flight, tallies, console)
     return INTERRUPTED if flight.interrupted else 0

@@ -48,7 +48,7 @@ def llm_notice(summary: Summary) -> str | None:
         return None
     return (
         f"The LLM took {by.llm} of {summary.decisions} decisions; {_others(summary)}, "
-        "so this is not a result of the LLM."
+        f"so this is not a result of the LLM.{_without_llm(summary)}"
     )
 
 
@@ -59,7 +59,15 @@ def _guided_notice(summary: Summary) -> str:
     weights = ", ".join(f"{ADVISERS.get(name, name)} {percent(weight)}" for name, weight in summary.trust.items())
     weighed = f" Mean weight of each adviser: {weights}." if weights else ""
     rest = "" if by.guided == summary.decisions else f" The others: {_others(summary)}."
-    return f"The LLM was one of several advisers in {by.guided} of {summary.decisions} decisions.{weighed}{rest}"
+    part = f"The LLM was one of several advisers in {by.guided} of {summary.decisions} decisions."
+    return f"{part}{weighed}{rest}{_without_llm(summary)}"
+
+
+def _without_llm(summary: Summary) -> str:
+    """What the mission loses without its LLM."""
+    if summary.without_llm is None:
+        return ""
+    return f" Without the LLM (mode policy) the same edge lost {_packets(summary.without_llm)} in this world."
 
 
 def _others(summary: Summary) -> str:

@@ -160,7 +160,7 @@ class EdgeStub:
         return MissionStatus(
             mission_id=mission_id,
             scenario=world,
-            mode="llm",
+            mode=spec.mode or "llm",
             top_k=5,
             init=spec.init,
             seed=spec.seed,

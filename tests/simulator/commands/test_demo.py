@@ -12,9 +12,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from shared.scenario import Scenario
+from shared.schemas import Mode
 from simulator.commands import demo
+from simulator.flying.run import Job, conduct
 from simulator.records.summary import Summary
+from simulator.sites.site import Site
 from tests.simulator.edge_stub import EdgeStub, stub_edge
 from tests.waiting import PATIENCE_S, until
 
@@ -47,6 +52,30 @@ def test_the_demo_serves_flies_and_stops(
     port = int(summary.edge.rsplit(":", 1)[1])
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def flown_beside(stub: EdgeStub, out: Path, mode: Mode) -> Summary:
+    """A mission in this mode at the stub, with the reference mode of the demo."""
+    site = Site(Scenario(steps=3))
+    job = Job(site, 1, "paper-1-x", out, "aicvds demo", edge=stub.url, mode=mode, bound_s=0.0, reference="policy")
+    assert conduct(job, Console()) == 0
+    return summary_in(out)
+
+
+def test_the_same_world_is_flown_without_the_llm_too(stub: EdgeStub, tmp_path: Path) -> None:
+    summary = flown_beside(stub, tmp_path, "guided")
+    assert {name: spec.mode for name, spec in stub.missions.items()} == {
+        "paper-1-x": "guided",
+        "paper-1-x-policy": "policy",
+    }
+    # The stub decides alike in every mode.
+    assert summary.without_llm == summary.lost_packets["aic_vds"]
+    assert summary.decisions == 9 and len(stub.decides) == 18
+
+
+def test_a_mission_without_an_llm_is_flown_once(stub: EdgeStub, tmp_path: Path) -> None:
+    assert flown_beside(stub, tmp_path, "value").without_llm is None
+    assert list(stub.missions) == ["paper-1-x"]
 
 
 def test_an_edge_that_dies_at_start(

@@ -121,6 +121,12 @@ def test_in_mode_guided_the_planner_has_its_own_share() -> None:
     assert "planner 97%, learned values 3%, LLM <1%" in said and "llm_timeout 1" in said
 
 
+def test_the_report_says_what_the_mission_loses_without_the_llm() -> None:
+    said = llm_notice(guided(without_llm=1))
+    assert said is not None
+    assert said.endswith("Without the LLM (mode policy) the same edge lost 1 packet in this world.")
+
+
 def test_a_mission_without_the_llm_says_so(flight: Flight) -> None:
     none = BySource(policy=15)
     said = llm_notice(guided(by_source=none, trust={}))
