@@ -12,7 +12,7 @@ from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
 from service.deciding.llm_timeout import QueryLimits
 from service.deciding.stopwatch import Deadline
 from service.llm.answers import Completion, NoDecision
-from service.llm.calibration import LabelReader
+from service.llm.calibration import LabelReader, sharpened
 from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -71,12 +71,14 @@ class LlmQueries:
         if not mission.prompt_fits:
             model = self._llm.serving(mission.mission_id).model
             return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=model)
+        template = template_of(mission)
         answer = await self._query(mission, prompt.static, prompt.user, [list(candidates.labels)], deadline)
         if answer.to_calibrate:
-            template = template_of(mission)
             ask = partial(self._llm.ask_labels, mission.mission_id)
             self._labels.calibrate(ask, answer.model, prompt.static, template.content_free(), [template.labels])
-        probabilities = None if answer.by_label is None else candidates.by_action(answer.by_label[0])
+        probabilities = None
+        if answer.by_label is not None:
+            probabilities = candidates.by_action(sharpened(answer.by_label[0], template.sharpness))
         return LlmAdvice(prompt, probabilities, answer.reason, answer.completion, answer.calibrated, answer.model)
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:

@@ -59,6 +59,9 @@ class GuidedTemplate(Template):
         note: the operator's note.
     """
 
+    # The exponent of the LLM's probabilities of the labels.
+    sharpness = 1.0
+
     def __init__(
         self, scenario: Scenario, *, rows: int, experiences: int, ranked: bool, note: str | None = None
     ) -> None:

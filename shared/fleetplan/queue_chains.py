@@ -42,11 +42,18 @@ class QueueChains:
 
     def served(self, odds: Floats, levels: IntArray, chance: Floats) -> Floats:
         """The odds ``(n, G + 1)`` of each level after transfers of ``levels`` ``(n,)`` over links of ``chance``."""
-        count = odds.shape[1] - 1
+        count, rows = odds.shape[1] - 1, np.arange(len(odds))
         left = np.arange(count + 1) + levels[:, None]
-        moved = np.where(left <= count, np.take_along_axis(odds, np.minimum(left, count), axis=1), np.float32(0.0))
-        moved[:, 0] = np.take_along_axis(np.cumsum(odds, axis=1), levels[:, None], axis=1)[:, 0]
+        moved = np.where(left <= count, odds[rows[:, None], np.minimum(left, count)], np.float32(0.0))
+        moved[:, 0] = np.cumsum(odds, axis=1)[rows, levels]
         return np.asarray(odds + chance[:, None] * (moved - odds))
+
+    def served_alike(self, odds: Floats, levels: int, chance: float) -> Floats:
+        """As :meth:`served`, by the same transfer over the same link."""
+        moved = np.zeros_like(odds)
+        moved[:, 1 : odds.shape[1] - levels] = odds[:, levels + 1 :]
+        moved[:, 0] = np.cumsum(odds[:, : levels + 1], axis=1)[:, -1]
+        return np.asarray(odds + np.float32(chance) * (moved - odds))
 
 
 @dataclass(frozen=True)

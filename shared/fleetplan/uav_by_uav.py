@@ -154,19 +154,24 @@ class _Ways:
 
     def _gains(self, step: int, levels: IntArray, free: NDArray[np.bool_], left: IntArray) -> tuple[Floats, IntArray]:
         """What the best visit saves after each way and velocity, packets, and its sensor, ``(C, V)``."""
-        sums = self.low + np.arange(len(self.scores))[:, None] + levels
-        moves, chance = self._loss.links(self._uav, step)
-        some = np.flatnonzero(chance[sums.min() : sums.max() + 1].any(axis=0) & free)
+        rows = np.arange(len(self.scores))
+        ahead = rows[:, None] + levels
+        reached = slice(self.low, self.low + len(rows) + int(levels[-1]))
+        moves, chance = (table[reached] for table in self._loss.links(self._uav, step))
+        some = np.flatnonzero(chance.any(axis=0) & free)
         if not len(some):
-            return np.zeros(sums.shape, dtype=np.float32), np.full(sums.shape, -1)
+            return np.zeros(ahead.shape, dtype=np.float32), np.full(ahead.shape, -1)
+        moves, chance = moves[:, some], chance[:, some]
+        # The numbers of levels that a visit may move, beginning with none, and the place of each among them.
+        used = np.bincount(moves.ravel(), minlength=len(left))
+        used[0] = 1
+        place = np.cumsum(used > 0) - 1
         # By sensor, way and the levels moved: the expected losses of that sensor.
-        after = self.odds[some] @ self._values[step + 1][some][:, left]
-        moved = moves[sums[..., None], some]
-        rows = np.arange(len(sums))[:, None, None]
-        saved = after[:, :, 0].T[:, None] - after[np.arange(len(some)), rows, moved]
+        after = self.odds[some] @ self._values[step + 1][some][:, left[:, used > 0]]
+        saved = (after[:, :, :1] - after)[np.arange(len(some)), rows[:, None, None], place[moves][ahead]]
         if self._loss.late_until is not None:
             saved = saved + self._lateness(step, some)[:, None]
-        gains = chance[sums[..., None], some] * saved
+        gains = chance[ahead] * saved
         best = gains.argmax(axis=2)
         return np.take_along_axis(gains, best[..., None], axis=2)[..., 0], some[best]
 
@@ -185,13 +190,12 @@ class _Ways:
         chains = self._loss.chains
         moves, chance = self._loss.links(self._uav, step)
         odds, since = self.odds[:, source], self.since[:, source]
-        for j in np.unique(sensor[sensor >= 0]).tolist():
-            mine = np.flatnonzero(sensor == j)
-            at = targets[mine]
-            odds[j, mine] = chains.served(odds[j, mine], moves[at, j], chance[at, j])
-            since[j, mine] = step + 1
+        ways = np.flatnonzero(sensor >= 0)
+        mine, at = sensor[ways], targets[ways]
+        odds[mine, ways] = chains.served(odds[mine, ways], moves[at, mine], chance[at, mine])
+        since[mine, ways] = step + 1
         for j, (moved, likely) in self._visits[step].items():
-            odds[j] = chains.served(odds[j], np.array([moved]), np.array([likely], dtype=np.float32))
+            odds[j] = chains.served_alike(odds[j], moved, likely)
             since[j] = step + 1
         self.odds, self.since = odds @ chains.arrive[step], since
 
