@@ -20,7 +20,7 @@ from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluat
 from service.deciding.stopwatch import Deadline
 from service.learning.trust import LLM
 from service.llm.answers import Completion, NoDecision, TokenPosition
-from service.llm.calibration import calibrated, probabilities
+from service.llm.calibration import calibrated, probabilities, sharpened
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet, velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
@@ -102,6 +102,13 @@ def test_calibration_takes_a_favourite_label_away() -> None:
     assert sum(corrected.values()) == pytest.approx(1.0)
     # What says no more than the bias says nothing.
     assert calibrated(bias, bias) == pytest.approx(dict.fromkeys("ABC", 1 / 3))
+
+
+def test_sharpened_probabilities_are_nearer_to_a_choice() -> None:
+    told = {"A": 0.5, "B": 0.25, "C": 0.25}
+    assert sharpened(told, 1.0) == pytest.approx(told)
+    assert sharpened(told, 4.0) == pytest.approx({"A": 16 / 18, "B": 1 / 18, "C": 1 / 18})
+    assert sharpened({"A": 1e-12, "B": 1e-300}, 4.0) == pytest.approx({"A": 1.0, "B": 0.0})
 
 
 def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> None:
@@ -344,6 +351,20 @@ def test_decides_and_says_how(edge: Edge, report: Report, tells: bool) -> None:
     asked = [body for body in model.bodies if body["messages"][-1]["content"] != "Say hello."][1:]
     assert all(body["max_tokens"] == 1 for body in asked)
     assert len({body["messages"][0]["content"] for body in asked}) == 1
+
+
+def test_an_adapters_advice_is_sharpened(edge: Edge, report: Report) -> None:
+    """The stub gives label A ten times the probability of B, and the others half of B's each."""
+    highest = {}
+    for form in ("csv", "compact"):
+        with serving(Chooser("A", tells=True).app) as url:
+            client = edge(mode="guided", llm_url=f"{url}/v1", llm_adapter="served")
+            wait_for(client, "ready")
+            made = client.put("/missions/own", json={"prompt": {"format": form}})
+            assert made.is_success, made.text
+            answer = client.post("/decide", json={**report(), "mission_id": "own"}).json()
+        highest[form] = max(candidate["llm"] or 0.0 for candidate in answer["guided"]["candidates"])
+    assert highest["csv"] < 0.7 and highest["compact"] > 0.95
 
 
 @pytest.mark.parametrize("fault", ["silent", "resetting", "500", "no text"])
