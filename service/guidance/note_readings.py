@@ -20,8 +20,9 @@ from shared.guidance import Impossible
 from shared.scenario import Scenario
 
 _READINGS = 3
-# An answer is sure where its tokens together are as likely as this.
-_SURE = 0.8
+# An answer is sure where its tokens together are as likely as this. Of 160 made-up notes of held-out phrasings the
+# adapter that ships read 20 with this certainty, all correctly; at 0.98 it read 25, 2 of them wrongly, at 0.8 64 and 8.
+_SURE = 0.99
 _MOST_TOKENS = 96
 _LIKELIEST = 5
 _DIFFER = "The note can be read in more than one way."
