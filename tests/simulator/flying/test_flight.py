@@ -86,7 +86,7 @@ def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient, monkeypa
     fields = summary.model_dump()
     assert set(fields) == {
         *("scenario", "seed", "steps", "uavs", "sensors", "decisions", "by_source", "lost_packets", "loss_events"),
-        *("tokens", "rtt_ms", "uplink_bytes_mean", "uplink", "attention_bytes_mean", "jain"),
+        *("tokens", "rtt_ms", "uplink_bytes_mean", "uplink", "attention_bytes_mean", "jain", "without_llm"),
         *("by_reason", "late", "failures", "model", "edge", "mission_id", "mode", "interrupted", "steps_flown"),
         *("started_at", "duration_s", "version", "policy", "deadline_ms", "command", "llm_asked"),
         *("trust", "bound", "bound_missing", "operator"),
