@@ -41,6 +41,8 @@ Note = Annotated[str, Field(max_length=MAX_NOTE), AfterValidator(_one_paragraph)
 DeadlineMs = Annotated[int, Field(ge=10, le=60_000, description="answer within this many milliseconds")]
 
 Mode = Literal["llm", "guided", "value", "policy"]
+# The modes that ask an LLM.
+LLM_MODES: tuple[Mode, ...] = ("llm", "guided")
 Init = Literal["pretrained", "random"]
 Features = Literal["paper", "reach"]
 Belief = Literal["fleet", "reported"]

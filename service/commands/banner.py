@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.config.settings import Settings
-
-_LLM_MODES = ("guided", "llm")
+from shared.schemas import LLM_MODES
 
 
 def banner(settings: Settings, url: str, missions: int) -> str:
@@ -31,7 +30,7 @@ def banner(settings: Settings, url: str, missions: int) -> str:
 
 def decides(settings: Settings) -> str:
     """The mode, and the LLM or why there is none."""
-    if settings.mode not in _LLM_MODES:
+    if settings.mode not in LLM_MODES:
         return f"mode {settings.mode}, without an LLM"
     if settings.llm_url is not None:
         return f"mode {settings.mode}, LLM {settings.llm_model or 'as listed'} at {settings.llm_url}"

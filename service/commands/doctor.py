@@ -18,11 +18,11 @@ import tyro
 from pydantic import ValidationError
 
 from service.config.settings import Settings, unknown_variables
+from shared.schemas import LLM_MODES
 from shared.validation_messages import problem_of
 
 _ASKED_S = 3.0
 _SUPPORTED = ((3, 11), (3, 13))
-_LLM_MODES = ("guided", "llm")
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def findings(host: str, port: int) -> Iterator[Finding]:
         return
     yield Finding("settings", f"mode {settings.mode}, deadline {settings.deadline_ms} ms, top-k {settings.top_k}")
     yield store_of(settings)
-    if settings.mode in _LLM_MODES:
+    if settings.mode in LLM_MODES:
         yield from (llm_servers(settings) if settings.llm_url else embedded(settings))
     yield planner(settings)
 

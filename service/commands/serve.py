@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from pydantic import ValidationError
 
-from shared.schemas import Mode
+from shared.schemas import LLM_MODES, Mode
 from shared.validation_messages import problem_of
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _share_out(settings: Settings, listener: socket.socket) -> Member | int:
     from service.commands.process_parent import Parent
     from service.storage.locks import StoreUnusable
 
-    embeds = settings.llm_url is None and settings.mode in ("guided", "llm")
+    embeds = settings.llm_url is None and settings.mode in LLM_MODES
     try:
         parent = Parent(settings, listener, partial(_host_llm, settings) if embeds else None)
     except StoreUnusable as error:

@@ -11,8 +11,8 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
 from service.deciding.llm_timeout import QueryLimits
 from service.deciding.stopwatch import Deadline
-from service.llm.answers import Completion, NoDecision
-from service.llm.calibration import LabelReader, sharpened
+from service.llm.answers import Completion, NoDecision, raised
+from service.llm.calibration import LabelReader
 from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
@@ -78,7 +78,7 @@ class LlmQueries:
             self._labels.calibrate(ask, answer.model, prompt.static, template.content_free(), [template.labels])
         probabilities = None
         if answer.by_label is not None:
-            probabilities = candidates.by_action(sharpened(answer.by_label[0], template.sharpness))
+            probabilities = candidates.by_action(raised(answer.by_label[0], template.sharpness))
         return LlmAdvice(prompt, probabilities, answer.reason, answer.completion, answer.calibrated, answer.model)
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from shared.actions import Action
@@ -47,9 +47,14 @@ class TokenPosition:
 
     def untempered(self, temperature: float) -> TokenPosition:
         """The same with the probabilities at temperature 1: ``q^T``, renormalised."""
-        raised = {token: q**temperature for token, q in self.likeliest.items()}
-        total = sum(raised.values())
-        return TokenPosition(self.token, {token: p / total for token, p in raised.items()} if total else {})
+        return TokenPosition(self.token, raised(self.likeliest, temperature))
+
+
+def raised(probabilities: Mapping[str, float], exponent: float) -> dict[str, float]:
+    """``p ** exponent``, renormalised: above 1 nearer to a choice of the likeliest. Empty where all are 0."""
+    powers = {token: p**exponent for token, p in probabilities.items()}
+    total = sum(powers.values())
+    return {token: p / total for token, p in powers.items()} if total else {}
 
 
 @dataclass(frozen=True, slots=True)

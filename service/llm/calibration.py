@@ -84,12 +84,6 @@ def calibrated(measured: Mapping[str, float], bias: Mapping[str, float]) -> dict
     return _normalised({label: value / max(offered[label], least) for label, value in measured.items()})
 
 
-def sharpened(measured: Mapping[str, float], exponent: float) -> dict[str, float]:
-    """``p(a) ** exponent``, renormalised: nearer to a choice of the likeliest label where the exponent is above 1."""
-    most = max(measured.values())
-    return _normalised({label: (value / most) ** exponent for label, value in measured.items()})
-
-
 class LabelReader:
     """Reads the labels that an LLM answers, and measures its label bias, for every mission of an edge.
 

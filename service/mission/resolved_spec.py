@@ -7,9 +7,7 @@ from typing import Literal, Self
 from pydantic import Field
 
 from service.config.settings import Settings
-from shared.schemas import Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
-
-_LLM_MODES = ("llm", "guided")
+from shared.schemas import LLM_MODES, Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
 
 
 class ResolvedPromptStyle(PromptStyle):
@@ -35,7 +33,7 @@ class ResolvedSpec(MissionSpec):
     def of(cls, spec: MissionSpec, settings: Settings) -> Self:
         """The spec, with the service's settings and the defaults of its mode for what it leaves open."""
         mode = spec.mode or settings.mode
-        adapted = settings.adapted and mode in _LLM_MODES
+        adapted = settings.adapted and mode in LLM_MODES
         # The compact prompt has no demonstrations.
         row_format = spec.prompt.format or ("compact" if adapted and not spec.prompt.demonstrations else "csv")
         compact = row_format == "compact"
@@ -64,7 +62,7 @@ class ResolvedSpec(MissionSpec):
     @property
     def uses_llm(self) -> bool:
         """Whether an LLM has a part in the decisions."""
-        return self.mode in _LLM_MODES
+        return self.mode in LLM_MODES
 
     @property
     def uses_attention(self) -> bool:

@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from shared.guidance import GuidanceAnswer
 from shared.missions import MissionStatus
 from shared.scenario import Scenario
-from shared.schemas import MissionSpec, Mode, Uplink
+from shared.schemas import LLM_MODES, MissionSpec, Mode, Uplink
 from simulator.cli.running import INTERRUPTED
 from simulator.client import EdgeClient
 from simulator.client.lossy_transport import LossyTransport
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from simulator.flying.pilots import Choice, Pilot
 
 API_KEY = "AICVDS_API_KEY"
-_LLM_MODES = ("llm", "guided")
 # Without a requested deadline the edge's default applies, which may be as long as the paper's step.
 DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
@@ -60,8 +59,8 @@ class Job:
     ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. A ``named`` mission may exist at the
     edge before the flight. ``note`` is the operator's. Before take-off the mission waits,
     at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses
-    is searched for ``bound_s`` seconds at most; 0 searches none. ``reference`` is a mode
-    without an LLM in which the same edge flies the same world once more, after a mission whose mode has one.
+    is searched for ``bound_s`` seconds at most; 0 searches none. ``reference`` is a mode without an LLM in which the
+    same edge flies the same world once more, after a mission whose mode has one.
     """
 
     site: Site
@@ -122,7 +121,7 @@ def conduct(
             pilot.on_request = requests.append
             flight = _fly(job, pilot, console, progress)
         operator = _operator(probe, job.mission_id, flight)
-        again = _reference(job, ground, console) if created.mode in _LLM_MODES and not flight.interrupted else None
+        again = _reference(job, ground, console) if created.mode in LLM_MODES and not flight.interrupted else None
     extra = {"operator": operator, "without_llm": again}
     code = _conclude(job, flight, created.mode, model, extra, console)
     if pilot.last_error is not None:

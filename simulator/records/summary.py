@@ -110,11 +110,10 @@ class Summary(FlightFacts):
     transmissions. ``llm_asked`` counts decisions for which the LLM was queried, with a usable answer or not.
     ``uplink_bytes_mean`` is the mean size of a request, ``attention_bytes_mean`` the mean size of the attention weights
     that a UAV fetched for its decision. ``trust`` is the mean weight of each adviser over the decisions of source
-    ``guided``. ``without_llm`` is the packets that the same edge
-    lost in the same world in mode ``policy``, ``null`` where that was not flown. ``bound`` is ``null`` where
-    ``bound_missing`` says why. ``operator`` is ``null`` without a note and
-    orders. ``real_uavs`` is left out of a simulated mission; with it, losses are those that beacons told of, and
-    ``uavs`` are those of one command.
+    ``guided``. ``without_llm`` is the packets that the same edge lost in the same world in mode ``policy``, ``null``
+    where that was not flown. ``bound`` is ``null`` where ``bound_missing`` says why. ``operator`` is ``null`` without
+    a note and orders. ``real_uavs`` is left out of a simulated mission; with it, losses are those that beacons told
+    of, and ``uavs`` are those of one command.
     """
 
     decisions: int

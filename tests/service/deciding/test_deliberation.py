@@ -19,8 +19,6 @@ from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
 from service.deciding.stopwatch import Deadline
 from service.learning.trust import LLM
-from service.llm.answers import Completion, NoDecision, TokenPosition
-from service.llm.calibration import calibrated, probabilities, sharpened
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet, velocity_options
 from service.prompting.guided_prompt import GuidedTemplate
@@ -56,10 +54,6 @@ def deliberation(mission: Mission, step: int = 0) -> tuple[AttendedState, Delibe
     return view, Deliberation.of(view)
 
 
-def completion(text: str, **first_token: float) -> Completion:
-    return Completion(text, None, None, None, (TokenPosition(text, first_token),) if first_token else ())
-
-
 def test_every_row_has_four_letters_whose_velocities_rise() -> None:
     view, made = deliberation(guided())
     offer = made.candidates
@@ -90,72 +84,6 @@ def test_the_static_block_never_changes_and_the_rest_is_short() -> None:
     _, later = deliberation(mission, step=3)
     assert later.prompt.static.encode() == first.prompt.static.encode()
     assert later.prompt.experiences.splitlines()[-1] == "20,0>7:3"
-
-
-def test_calibration_takes_a_favourite_label_away() -> None:
-    """An LLM that says A whatever is asked, and prefers B a little where B is better."""
-    bias = {"A": 0.9, "B": 0.05, "C": 0.05}
-    told = {"A": 0.85, "B": 0.11, "C": 0.04}
-    assert max(told, key=lambda label: told[label]) == "A"
-    corrected = calibrated(told, bias)
-    assert max(corrected, key=lambda label: corrected[label]) == "B"
-    assert sum(corrected.values()) == pytest.approx(1.0)
-    # What says no more than the bias says nothing.
-    assert calibrated(bias, bias) == pytest.approx(dict.fromkeys("ABC", 1 / 3))
-
-
-def test_sharpened_probabilities_are_nearer_to_a_choice() -> None:
-    told = {"A": 0.5, "B": 0.25, "C": 0.25}
-    assert sharpened(told, 1.0) == pytest.approx(told)
-    assert sharpened(told, 4.0) == pytest.approx({"A": 16 / 18, "B": 1 / 18, "C": 1 / 18})
-    assert sharpened({"A": 1e-12, "B": 1e-300}, 4.0) == pytest.approx({"A": 1.0, "B": 0.0})
-
-
-def test_probabilities_come_from_the_tokens_told_or_else_from_the_answer() -> None:
-    def told(made: Completion, labels: str) -> dict[str, float]:
-        return probabilities(made, [labels])[0]
-
-    assert told(completion("x", A=0.6, B=0.2, the=0.2), "AB") == pytest.approx({"A": 0.75, "B": 0.25})
-    # C was not among the likeliest tokens.
-    assert told(completion("A", A=0.6, B=0.2), "ABC")["C"] == pytest.approx(0.1 / 0.9)
-    assert told(completion(" B\n"), "AB") == pytest.approx({"A": 0.025, "B": 0.975})
-    with pytest.raises(NoDecision):
-        told(completion("hello", the=1.0), "AB")
-
-
-def test_several_lists_are_read_place_by_place_or_line_by_line() -> None:
-    likeliest = {"A": 0.9, "B": 0.1}, {"\n": 1.0}, {"C": 0.5, "B": 0.2, "A": 0.3}
-    places = tuple(TokenPosition(token, told) for token, told in zip(("A", "\n", "B"), likeliest, strict=True))
-    read = probabilities(Completion("A\nB", None, None, None, places), ["AB", "AB"])
-    assert read == [pytest.approx({"A": 0.9, "B": 0.1}), pytest.approx({"A": 0.6, "B": 0.4})]
-    # Of the second label no probabilities came: then the text counts, for both.
-    read = probabilities(Completion("A\nB", None, None, None, places[:2]), ["AB", "AB"])
-    assert [max(place, key=lambda label: place[label]) for place in read] == ["A", "B"]
-    for text in ("A", "A\nB\nA", "A\nC", ""):
-        with pytest.raises(NoDecision):
-            probabilities(completion(text), ["AB", "AB"])
-
-
-def test_a_single_label_is_read_where_it_should_stand_though_something_else_was_drawn() -> None:
-    """ServerPool that cannot be held to the labels begin with a line's end, say."""
-    (told,) = probabilities(
-        Completion("\n", None, None, None, (TokenPosition("\n", {"": 0.6, "A": 0.3, "B": 0.1}),)), ["AB"]
-    )
-    assert told == pytest.approx({"A": 0.75, "B": 0.25})
-
-
-def test_a_certain_answer_leaves_no_label_without_a_bias() -> None:
-    (bias,) = probabilities(completion("E", E=1.0, F=5e-324), ["ABEF"])
-    assert min(bias.values()) > 0
-    corrected = calibrated({"A": 0.5, "B": 0.5}, bias)
-    assert corrected == pytest.approx({"A": 0.5, "B": 0.5})
-
-
-def test_a_low_temperature_is_undone() -> None:
-    p = {"A": 0.6, "B": 0.3, "C": 0.1}
-    cooled = {label: value**5 / sum(v**5 for v in p.values()) for label, value in p.items()}
-    assert TokenPosition("A", cooled).untempered(0.2).likeliest == pytest.approx(p)
-    assert TokenPosition("A", {}).untempered(0.2).likeliest == {}
 
 
 def test_the_velocities_offered_are_spread_over_what_serves_the_sensor() -> None:
