@@ -39,7 +39,7 @@ DECISION = {
     "velocity": 5,
     "source": "guided",
     "reason": None,
-    "model": "SmolLM2-135M-Instruct.Q4_1",
+    "model": "SmolLM2-135M-Instruct.Q8_0",
     "top_k": [{"sensor_id": 0, "score": -0.156479}, {"sensor_id": 2, "score": -0.304903}],
     "guided": {
         "trust": {"llm": 0.2, "planner": 0.6, "value": 0.1, "policy": 0.1},
@@ -198,7 +198,7 @@ ANSWERS: dict[tuple[str, str], Any] = {
         "ready": True,
         "decides": "guided",
         "llm": "ready",
-        "model": "SmolLM2-135M-Instruct.Q4_1",
+        "model": "SmolLM2-135M-Instruct.Q8_0",
         "standing_by": 0,
         "constraint": "grammar",
         "detail": None,

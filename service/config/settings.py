@@ -75,8 +75,7 @@ class Settings(BaseSettings):
     # LoRA adapter with which the embedded LLM reads operators' notes, a GGUF file of `aicvds distill-orders`. Unset:
     # the package's own, if it has one. `off`: none.
     llm_orders: str | None = None
-    # Threads of the embedded llama.cpp. 0: cores - 1. With as many threads as cores, llama.cpp's spinning workers need
-    # a hundred times as long for a token when anything else runs.
+    # Threads of the embedded llama.cpp. 0: as many as cores.
     llm_threads: int = Field(0, ge=0, le=256)
     # Tokens of the embedded model's context. Settings whose longest prompt does not fit are refused.
     llm_context: int = Field(4096, ge=512, le=131_072)
@@ -214,8 +213,8 @@ class Settings(BaseSettings):
 
     @property
     def embedded_threads(self) -> int:
-        """Threads for the embedded llama.cpp: the setting, or cores - 1, at least 1."""
-        return self.llm_threads or max(1, usable_cores() - 1)
+        """Threads for the embedded llama.cpp: the setting, or a thread for each core."""
+        return self.llm_threads or usable_cores()
 
 
 def _checked_url(url: str) -> str:

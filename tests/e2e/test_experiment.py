@@ -184,7 +184,7 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
         assert result.schemes[asked]["llm_decided_pct"].mean > 60
     for unasked in ("value_reach", "edge_policy"):
         assert result.schemes[unasked]["llm_decided_pct"].mean == 0
-    assert result.model == "SmolLM2-135M-Instruct.Q4_1"
+    assert result.model == "SmolLM2-135M-Instruct.Q8_0"
     assert not any("not the LLM's" in note for note in result.notes)
     assert json.loads((tmp_path / "llm-models" / "results.json").read_text())["command"] == (
         f"aicvds experiment llm-models --steps 1 --seeds 1 --out {tmp_path}"

@@ -168,6 +168,6 @@ def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkey
         assert client.post("/decide", json=report(mission_id="early", step=1)).json()["reason"] is None
 
 
-def test_threads_default_to_one_core_less_than_there_are() -> None:
-    assert Settings().embedded_threads == max(1, usable_cores() - 1)
+def test_threads_default_to_one_for_each_core() -> None:
+    assert Settings().embedded_threads == usable_cores()
     assert Settings(llm_threads=3).embedded_threads == 3

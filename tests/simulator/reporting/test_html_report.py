@@ -124,7 +124,7 @@ def test_the_page_has_the_sources_of_the_decisions(flight: Flight, drawn: str) -
 
 @pytest.mark.parametrize("mode", ["llm", "guided", "value", "policy"])
 def test_no_page_predicts_what_its_table_contradicts(flight: Flight, figures_of: Drawn, mode: str) -> None:
-    summary = summary_of(flight, "SmolLM2-135M-Instruct.Q4_1").model_copy(
+    summary = summary_of(flight, "SmolLM2-135M-Instruct.Q8_0").model_copy(
         update={"mode": mode, "lost_packets": {"aic_vds": 8, "eof": 204}, "loss_events": {"aic_vds": 6, "eof": 50}}
     )
     html = render_report(summary, SHORT, flight.decisions, figures_of)
