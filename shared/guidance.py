@@ -221,7 +221,8 @@ GuidanceState = Literal["none", "compiling", "proposed", "confirmed", "rejected"
 class GuidanceStatus(Wire):
     """``GET /missions/{id}/guidance``: the operator's note, the guidance from it, and its status.
 
-    The edge obeys only ``confirmed`` guidance.
+    The edge obeys only ``confirmed`` guidance. The compact prompt shows ``proposed`` guidance too, which the LLM alone
+    decides by in mode ``llm``.
     """
 
     mission_id: MissionId

@@ -19,7 +19,7 @@ MAX_SENSORS = 10_000
 MAX_STEP = 1_000_000
 # A UAV that waited longer reports this much.
 MAX_ROUND_TRIP_MS = 600_000.0
-# Characters of an operator's note, which is part of every prompt.
+# Characters of an operator's note, which is part of every long prompt.
 MAX_NOTE = 280
 # The type of the problem that the edge does not hold the omitted part of a report: the client is to send it in full.
 INCOMPLETE = "urn:aicvds:problem:incomplete"

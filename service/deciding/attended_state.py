@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from service.deciding.prompt_view import PromptView
 from service.deciding.stopwatch import Stopwatch
 from service.guidance.step_guidance import StepGuidance
 from service.learning.modules import Sample, top_k
@@ -18,6 +19,7 @@ from service.mission.decisions import Pending
 from service.mission.mission import Mission
 from service.prompting.row_formats import cells
 from shared.actions import Action
+from shared.channel import FloatArray
 from shared.features import Reach, State, augment
 from shared.schemas import Candidate, UavState
 
@@ -29,6 +31,7 @@ class AttendedState:
     Attributes:
         reserved: IDs of the sensors that other UAVs have in this step.
         guidance: what the operator's guidance asks of this step, if it asks for anything.
+        prompt_view: what the prompt shows, which may have orders that are not confirmed yet.
         admissible: rows of the state that may be chosen, n of them.
         features: shape ``(n, d)``, the attention module's input.
         contexts: shape ``(n, d')``, its output ``z_j``.
@@ -42,6 +45,7 @@ class AttendedState:
     state: State
     reserved: frozenset[int]
     guidance: StepGuidance | None
+    prompt_view: PromptView
     admissible: list[int]
     features: NDArray[np.float32]
     contexts: NDArray[np.float32]
@@ -76,10 +80,11 @@ class AttendedState:
         if obeyed is not None:
             reach = state.reach_ahead(uav.uav_id, scenario)
             guidance = StepGuidance.of(obeyed, state, reach, step, mission.records.visits, scenario)
+        view = PromptView.of(mission, state, uav.uav_id, step, guidance)
         watch.ended.append(("augment", perf_counter()))
         admissible: list[int] = np.flatnonzero(state.admissible).tolist()
         features = state.features(scenario)
-        kept, scores, contexts = _attend(mission, features, admissible, guidance)
+        kept, scores, contexts = _attend(mission, features, admissible, view.added)
         rows = [admissible[i] for i in kept]
         candidates = [
             Candidate(sensor_id=sensor, score=round(scores[i], 6))
@@ -93,6 +98,7 @@ class AttendedState:
             state=state,
             reserved=reserved,
             guidance=guidance,
+            prompt_view=view,
             admissible=admissible,
             features=features,
             contexts=contexts,
@@ -166,15 +172,14 @@ class AttendedState:
 
 
 def _attend(
-    mission: Mission, features: NDArray[np.float32], admissible: list[int], guidance: StepGuidance | None
+    mission: Mission, features: NDArray[np.float32], admissible: list[int], added: FloatArray | None
 ) -> tuple[list[int], list[float], NDArray[np.float32]]:
     """Places in ``admissible`` of the sensors to keep, best first, the scores of all ``(n,)``, and their contexts."""
     if not admissible:
         return [], [], np.empty(0, dtype=np.float32)
     scores, contexts = mission.learner.weights.score(features)
-    if guidance is not None:
+    if added is not None:
         # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
-        added = guidance.worth[:, admissible].max(axis=0) / mission.scenario.queue_capacity
-        scores = scores + added.astype(np.float32)
+        scores = scores + (added[admissible] / mission.scenario.queue_capacity).astype(np.float32)
     kept = top_k(scores, mission.top_k) if mission.uses_attention else list(range(len(admissible)))
     return kept, scores.tolist(), contexts

@@ -218,8 +218,9 @@ def candidates_of(state: AttendedState, template: GuidedTemplate) -> CandidateSe
     """The LLM's candidates, at velocities that the operator allows; the state has at least one row."""
     mission = state.mission
     view = Viewpoint(mission.belief, state.uav_id, state.step, learned=mission.belief_source == "fleet")
-    candidates = template.candidates(state.state, state.reach, state.shown(), view)
-    guidance = state.guidance
+    shown = state.prompt_view
+    candidates = template.candidates(shown.state, shown.reach or state.reach, state.shown(), view)
+    guidance = shown.guidance
     if guidance is None:
         return candidates
     rows = {int(sensor): row for row, sensor in enumerate(state.state.ids)}

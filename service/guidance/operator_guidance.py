@@ -34,7 +34,7 @@ class OperatorGuidance:
         self._doubts: list[str] = []
 
     def propose(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
-        """Propose the guidance that an LLM made of the note; it has no effect until the operator confirms it."""
+        """Propose the guidance that an LLM made of the note; until the operator confirms it, a prompt alone has it."""
         if self.status == "compiling":
             self.status, self._proposed, self._origin, self._model = "proposed", guidance, "llm", model
             self._doubts = list(doubts)
@@ -78,6 +78,11 @@ class OperatorGuidance:
     def _obey(self, guidance: Guidance) -> None:
         self.confirmed = guidance
         self.orders = guidance or None
+
+    @property
+    def read(self) -> Guidance | None:
+        """The orders that a prompt shows: the LLM's reading of the note until the operator answers, then ``orders``."""
+        return self._proposed or None if self.status == "proposed" else self.orders
 
     def report(self, mission_id: str) -> GuidanceStatus:
         """The body of ``GET /missions/{id}/guidance``."""

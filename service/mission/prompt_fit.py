@@ -27,7 +27,7 @@ def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Te
     ranked = spec.uses_attention and spec.prompt.order == "score"
     rows = spec.top_k if spec.uses_attention else scenario.sensors
     if spec.prompt.format == "compact":
-        return CompactTemplate(scenario, rows=rows, note=note)
+        return CompactTemplate(scenario, rows=rows)
     if spec.mode == "guided":
         return GuidedTemplate(scenario, rows=rows, experiences=experiences, ranked=ranked, note=note)
     examples = solved(spec, spec.features, scenario, weights, spec.top_k if spec.uses_attention else None)

@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
-from service.prompting.prompt import note_block
 from service.prompting.row_formats import UNKNOWN, Cells
 from shared.actions import Action
 from shared.channel import FloatArray
@@ -30,7 +29,7 @@ from shared.features import Reach, State
 from shared.learned_channel import LIKELY, ExpectedLinks
 from shared.scenario import Scenario
 
-STATIC = "{note}Collect packets. Answer with one letter."
+STATIC = "Collect packets. Answer with one letter."
 # A sensor's sign: the one at its ID, modulo their number. Between digits each is one token of the embedded model.
 SIGNS = "abcdefghijklmnopqrstuvwxyzαβγδεζηθικλμνοπρςστυφχωбвгдежзийклмнопрстуфхцчшщыьюяàáâãäåæçèéêëìíîïñòóôõöùúûüý"
 
@@ -128,17 +127,21 @@ def row_digits(state: State, reach: Reach, outlook: Outlook, scenario: Scenario)
 
 
 class CompactTemplate(GuidedTemplate):
-    """The template of the compact prompt; its rows are shuffled, and its letters carry no rank."""
+    """The template of the compact prompt; its rows are shuffled, and its letters carry no rank.
+
+    It has no note. The caller gives :meth:`candidates` a state in which the note's orders are queues:
+    :mod:`service.guidance.orders_as_queues`.
+    """
 
     # The adapter is trained on soft targets: 0.23 is the mean of its highest probability among some 20 candidates. In
     # four development missions without the planner its advice loses 0.44, 0.33, 0.30, 0.29 and 0.29 packets a decision
     # with the exponents 1, 2, 3, 5 and 10, the learned values 0.29 and the look-ahead 0.25 (the rollout evaluator's).
     sharpness = 4.0
 
-    def __init__(self, scenario: Scenario, *, rows: int, note: str | None = None) -> None:
-        super().__init__(scenario, rows=rows, experiences=0, ranked=False, note=note)
+    def __init__(self, scenario: Scenario, *, rows: int) -> None:
+        super().__init__(scenario, rows=rows, experiences=0, ranked=False)
         self._scenario = scenario
-        self.static = STATIC.format(note=note_block(note))
+        self.static = STATIC
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """An experience such as ``7d9X``.

@@ -6,7 +6,7 @@ from shared.guidance import Guidance, SensorWish
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.operators import Intent, Operator
 from simulator.experiments.plan import Experiment, FigureSpec, Setup
-from simulator.experiments.schemes import NAMED_BY_OPTION, OFF, Backing, Scheme, over_edge
+from simulator.experiments.schemes import ADAPTED, NAMED_BY_OPTION, OFF, Backing, Scheme, over_edge
 
 # Each has a visit and a rule for velocities, in different wordings; none is a worked example of the edge.
 _NOTES = tuple(
@@ -31,10 +31,25 @@ def _flown(mode: str, says: str, label: str, backing: Backing = NAMED_BY_OPTION)
     return over_edge(f"{mode}_{says}", f"mode {mode}, {label}", mode=mode, operator=operator, backing=backing)
 
 
+def _adapted(says: str, label: str) -> Scheme:
+    operator = Operator.model_validate({"says": says, "notes": _NOTES})
+    return over_edge(
+        f"llm_adapted_{says}",
+        f"mode llm with the adapter, {label}",
+        backing=ADAPTED,
+        verify="off",
+        planner="off",
+        operator=operator,
+    )
+
+
 def _schemes(setup: Setup) -> list[Scheme]:
     with_llm = [
         _flown("llm", "nothing", "no note"),
         _flown("llm", "note", "note in the prompt"),
+        _adapted("nothing", "no note"),
+        _adapted("note", "note in the prompt"),
+        _adapted("structure", "operator's structure"),
         _flown("guided", "nothing", "no note"),
         _flown("guided", "note", "note in the prompt"),
         _flown("guided", "agrees", "compiled note, confirmed where right"),
@@ -62,7 +77,12 @@ EXPERIMENT = Experiment(
     ),
     when_quick="no_llm",
     reference="guided_nothing",
-    pairs=(("llm_note", "llm_nothing"), ("value_structure", "value_nothing"), ("policy_structure", "policy_nothing")),
+    pairs=(
+        ("llm_note", "llm_nothing"),
+        ("llm_adapted_note", "llm_adapted_nothing"),
+        ("value_structure", "value_nothing"),
+        ("policy_structure", "policy_nothing"),
+    ),
     paired_measures=(*_OBEYED, "lost_packets"),
     notes=(
         f"{len(_NOTES)} notes, one after another by seed, each with a visit to a sensor and a rule for velocities: "

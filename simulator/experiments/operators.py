@@ -23,9 +23,10 @@ class Intent(Record):
 class Operator(Record):
     """An operator; a flight's seed selects its note.
 
-    ``says`` is ``nothing``; the ``note`` alone, which the prompt then contains; ``agrees``, the note with the LLM's
+    ``says`` is ``nothing``; the ``note`` alone, which the prompt then has; ``agrees``, the note with the LLM's
     compilation confirmed if it equals the intended guidance and rejected otherwise; or ``structure``, the note with the
-    intended guidance as a structure.
+    intended guidance as a structure. The flight begins once the LLM has read the note, within the first step of a fleet
+    in real time.
     """
 
     says: Literal["nothing", "note", "agrees", "structure"]
@@ -44,11 +45,11 @@ class Operator(Record):
         meant = self.intent(seed).meant
         if self.says == "structure":
             return edge.answer_guidance(mission_id, GuidanceAnswer(guidance=meant)).status
-        if self.says == "agrees":
+        if self.says != "nothing":
             deadline = time.monotonic() + _WAIT_S
             while (compiled := edge.guidance(mission_id)).status == "compiling" and time.monotonic() < deadline:
                 time.sleep(_POLL_S)
-            if compiled.status == "proposed":
+            if self.says == "agrees" and compiled.status == "proposed":
                 answer: Literal["confirm", "reject"] = "confirm" if compiled.guidance == meant else "reject"
                 return edge.answer_guidance(mission_id, GuidanceAnswer(answer=answer)).status
         return edge.guidance(mission_id).status

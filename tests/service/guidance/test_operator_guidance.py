@@ -252,7 +252,7 @@ def test_the_note_stands_in_the_static_block_and_nothing_else_changes() -> None:
     plain, noted = GuidedTemplate(PAPER, **kinds).static, GuidedTemplate(PAPER, **kinds, note=NOTE).static
     assert noted.replace(f"The operator's note, to be obeyed: {NOTE}\n\n", "") == plain
     for mode in ("llm", "guided"):
-        made = Mission("test", MissionSpec(note="at {sensor} {0}"), Settings(mode=mode))
+        made = Mission("test", MissionSpec(note="at {sensor} {0}"), Settings(mode=mode, llm_adapter="off"))
         assert "to be obeyed: at {sensor} {0}\n" in made.template.static
 
 

@@ -1,0 +1,49 @@
+"""What a prompt shows of one UAV's state, and the orders that it goes by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+from service.guidance.orders_as_queues import as_queues
+from service.guidance.step_guidance import StepGuidance
+from service.mission.mission import Mission
+from service.prompting.compact_prompt import CompactTemplate
+from shared.channel import FloatArray
+from shared.features import Reach, State
+
+
+@dataclass(frozen=True, slots=True)
+class PromptView:
+    """The view of J sensors from which a prompt is written.
+
+    Attributes:
+        state, reach: as the prompt shows them. The compact prompt has the orders in them, as queues; the reach is None
+            where it is the state's own.
+        guidance: what the candidates' velocities obey in this step.
+        added: shape ``(J,)``, packets to add to the worth of each sensor as attention chooses the prompt's rows; None
+            where there are no orders.
+    """
+
+    state: State
+    reach: Reach | None
+    guidance: StepGuidance | None
+    added: FloatArray | None
+
+    @classmethod
+    def of(cls, mission: Mission, state: State, uav_id: int, step: int, confirmed: StepGuidance | None) -> Self:
+        """By the confirmed orders, and with the compact prompt by the LLM's own reading of the note before that.
+
+        An order that is not confirmed yet is in the prompt alone: in mode ``guided`` only the LLM's advice follows it.
+        """
+        scenario, visits = mission.scenario, mission.records.visits
+        added = None if confirmed is None else confirmed.worth.max(axis=0)
+        read = mission.guidance.read
+        if read is None or not isinstance(mission.template, CompactTemplate):
+            return cls(state, None, confirmed, added)
+        reach = state.reach_ahead(uav_id, scenario)
+        shown, seen = as_queues(state, reach, read, step, visits, scenario)
+        if mission.mode != "llm":
+            return cls(shown, seen, confirmed, added)
+        guidance = StepGuidance.of(read, state, reach, step, visits, scenario)
+        return cls(shown, seen, guidance, (seen.worth - reach.worth).max(axis=0))
