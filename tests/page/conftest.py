@@ -10,6 +10,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 from tests.e2e.processes import serving_edge
@@ -30,6 +31,12 @@ expect.set_options(timeout=PATIENCE_S * 1e3)
 
 Start = Callable[..., tuple[str, subprocess.Popen[str]]]
 Open = Callable[..., Page]
+Report = Callable[..., dict[str, Any]]
+
+
+def violations(page: Page) -> list[str]:
+    found = Axe().run(page).response["violations"]
+    return [f"{one['id']}: {one['help']}: {[node['target'] for node in one['nodes']][:3]}" for one in found]
 
 
 # Playwright runs an event loop in this thread as long as it lives: tests of other files could run none.

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import json
 import re
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 from service.api.app import create_app
 from service.config.settings import Settings
 from simulator.commands import simulate
-from tests.e2e.processes import output_until, run, started
-from tests.page.conftest import Open, Start
+from tests.page.conftest import Open, Report, Start, violations
 from tests.running import serving
 from tests.service.stub_llm import wait_for
 from tests.simulator.undrawn import reports_undrawn
@@ -27,9 +24,7 @@ from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.needs("chromium")
 
-Report = Callable[..., dict[str, Any]]
 REFUSED = ("Failed to load resource",)
-GONE = (*REFUSED, "net::ERR_")
 # Of the missions that are flown for a page: ten steps of three UAVs.
 STEPS, DECISIONS = 10, 30
 HOSTILE = '<img src=x onerror="window.hacked = 1"><script>window.hacked = 1</script>'
@@ -69,11 +64,6 @@ def fly(url: str, out: Path, *options: str) -> None:
             simulate.main(["--edge", url, "--steps", str(STEPS), "--no-bound", "--out", str(out / "run"), *options])
             == 0
         )
-
-
-def violations(page: Page) -> list[str]:
-    found = Axe().run(page).response["violations"]
-    return [f"{one['id']}: {one['help']}: {[node['target'] for node in one['nodes']][:3]}" for one in found]
 
 
 def test_a_mission_appears_while_it_flies(another_edge: str, visit: Open, tmp_path: Path) -> None:
@@ -229,52 +219,6 @@ def test_a_mission_that_is_deleted_and_made_again_begins_anew(visit: Open, edge:
     httpx.post(f"{edge}/decide", json=report(mission_id="again", step=5), timeout=PATIENCE_S)
     expect(page.locator("#feed li")).to_have_count(1)
     expect(page.locator("#feed li")).to_contain_text("step 5")
-
-
-@pytest.mark.long
-def test_a_lost_connection_is_told_and_taken_up_again(visit: Open, start: Start, report: Report) -> None:
-    url, process = start(AICVDS_MODE="value")
-    httpx.post(f"{url}/decide", json=report(), timeout=PATIENCE_S)
-    page = visit(url, expected=GONE)
-    expect(page.locator("#connection")).to_have_text("Connected")
-    process.send_signal(signal.SIGTERM)
-    process.wait(PATIENCE_S)
-    expect(page.locator("#connection")).to_have_text("Connection lost, trying again")
-    expect(page.locator("#trouble")).to_contain_text("The edge does not answer")
-    port = url.rsplit(":", 1)[1]
-    with started("serve", "--port", port, AICVDS_MODE="value") as again:
-        output_until(again, "startup complete")
-        httpx.post(f"{url}/decide", json=report(step=7), timeout=PATIENCE_S)
-        expect(page.locator("#connection")).to_have_text("Connected")
-        expect(page.locator("#trouble")).to_be_hidden()
-        expect(page.locator("#feed li")).to_have_count(1)
-        expect(page.locator("#feed li")).to_contain_text("step 7")
-
-
-@pytest.mark.long
-def test_the_page_asks_for_a_key_where_the_edge_does(visit: Open, start: Start, report: Report, tmp_path: Path) -> None:
-    keys = str(tmp_path / "keys.json")
-    key = run("keys", "add", "fleet", "--file", keys, "--scopes", "decide", "admin").stdout.strip()
-    reader = run("keys", "add", "reader", "--file", keys, "--scopes", "decide").stdout.strip()
-    url, _ = start(AICVDS_MODE="value", AICVDS_KEYS=keys)
-    httpx.post(f"{url}/decide", json=report(), timeout=PATIENCE_S, headers={"Authorization": f"Bearer {key}"})
-    page = visit(url, expected=REFUSED)
-    asked = page.get_by_role("dialog", name="This edge asks for a key")
-    expect(asked).to_be_visible()
-    assert violations(page) == []
-    asked.get_by_label("Key", exact=True).fill("wrong")
-    page.keyboard.press("Enter")
-    expect(asked).to_be_hidden()
-    expect(asked).to_be_visible()
-    expect(asked).to_contain_text("The key that was given is not known here")
-    asked.get_by_label("Key", exact=True).fill(reader)
-    page.keyboard.press("Enter")
-    expect(page.locator("#feed li")).to_have_count(1)
-    assert page.evaluate("[localStorage.length, document.cookie]") == [0, ""]
-    assert reader not in page.url
-    # It counts no more: the stream ends, and the page asks again.
-    run("keys", "remove", "reader", "--file", keys)
-    expect(asked).to_be_visible()
 
 
 @pytest.mark.long
