@@ -102,11 +102,11 @@ class EmbeddedServer:
 
     @contextmanager
     def request(self, system: str, trained: str) -> Iterator[dict[str, Any]]:
-        """While a request runs, its fields: the adapter answers prompts whose static block ends as ``trained``."""
+        """While a request runs, its fields: the adapter answers prompts whose static block is ``trained``."""
         if not self.without_adapter:
             yield {}
             return
-        if not system.endswith(trained):
+        if system != trained:
             self._bare_requests += 1
             yield self.without_adapter
             return

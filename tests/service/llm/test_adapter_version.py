@@ -99,7 +99,7 @@ def test_the_adapter_answers_only_the_prompt_that_it_was_trained_on(note: str | 
             return sent
 
     paper = SCENARIOS["paper"]
-    compact = CompactTemplate(paper, rows=5, note=note).static
+    compact = CompactTemplate(paper, rows=5).static
     assert fields(compact) == {}
     assert fields(Template(paper, experiences=8, note=note).static) == OFF
     assert fields("Rewrite the note.") == OFF
