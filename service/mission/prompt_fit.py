@@ -91,8 +91,8 @@ class PromptFit:
         style = self.spec.prompt
         lines = style.experiences + (NEAREST if style.selection == "similar" else 0)
         needed = prompt_tokens(style.format, self._rows * uavs, lines, self.spec.features, self.demonstrations)
-        # A tokenizer makes at most one token of each byte.
-        return needed + len(note_block(self.spec.note).encode())
+        # A tokenizer makes at most one token of each byte. The compact prompt has no text of the note.
+        return needed + (0 if self._compact else len(note_block(self.spec.note).encode()))
 
     @property
     def _compact(self) -> bool:

@@ -54,6 +54,7 @@ def test_velocities_and_confirmations_are_shares() -> None:
     ("says", "orders", "status"),
     [
         ("nothing", ORDERS, "none"),
+        ("note", ORDERS, "proposed"),
         ("agrees", ORDERS, "confirmed"),
         ("agrees", "visit sensor 1 every 2 steps", "rejected"),
         ("agrees", "do as you please", "failed"),
@@ -69,7 +70,7 @@ def test_an_operator_confirms_only_the_intended_guidance(edge: Edge, says: str, 
             own.put_mission("test", MissionSpec(note=operator.note(0)))
             assert operator.answer(own, "test", 0) == status
             understood = own.guidance("test").guidance
-    assert (understood == MEANT) == (status == "confirmed")
+    assert (understood == MEANT) == (status in ("confirmed", "proposed"))
 
 
 def test_a_flight_records_its_guidance_and_obeys(edge: Edge) -> None:
