@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import ipaddress
+import os
 import socket
 import sys
 from collections.abc import Callable
@@ -66,6 +67,9 @@ class Serve:
 
 def main(argv: list[str]) -> int:
     """Serve until SIGTERM or Ctrl-C; returns the exit code."""
+    # GNU OpenMP's threads spin at llama.cpp's barriers, even while another process has the core that they wait for. The
+    # library reads this variable once, when torch loads it.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     args = tyro.cli(Serve, prog="aicvds serve", args=argv)
     if not 0 <= args.port <= 65535:
         return _refused(f"--port {args.port} is not between 0 and 65535")

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import secrets
 from collections.abc import Awaitable, Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import xllamacpp
+
 from service.config.settings import Settings
 from service.llm.adapter_version import DECISIONS, ORDERS, check_adapter
 from service.llm.model_file import embedded_model
-
-# GNU OpenMP's threads spin at llama.cpp's barriers. Where another process has a core for a moment, they would spin for
-# all of it. The library reads this once, as it is loaded.
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-
-import xllamacpp  # noqa: E402
 
 # By default llama.cpp uses up to 8 GB of host memory for old prompts.
 _PROMPT_CACHE_MIB = 64
