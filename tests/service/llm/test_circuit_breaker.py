@@ -159,7 +159,9 @@ def test_who_stood_in_a_queue_does_not_open_it(edge: Edge, report: Report, monke
             slot.open()
             # The LLM's word was heard, where another has the sensor that it names too.
             assert served.result().json()["reason"] in (None, "answer_reserved")
-            assert {asked.result().json()["reason"] for asked in late} == {"llm_timeout"}
+            reasons = {asked.result().json()["reason"] for asked in late}
+            # On a busy machine a UAV may come so late that the others have every sensor.
+            assert reasons - {"no_candidate"} == {"llm_timeout"}
             slot.came += 1
         assert client.get("/readyz").json()["llm"] == "ready"
 
