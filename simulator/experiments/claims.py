@@ -6,7 +6,7 @@ A result of a quick run gets no verdict. "Zero" is as in ``evidence.settled_at``
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from shared.scenario import Scenario
@@ -25,6 +25,8 @@ from simulator.experiments.plots import label_of, measured
 from simulator.experiments.result import Interval, Paired, Result
 
 CLAIM_SEEDS = 30
+# The experiment whose schemes, by the paper's names for them, are of the LLM with the adapter.
+WITH_ADAPTER = "adapter-claims"
 # The tolerance of "zero at step 20" in steps.
 NEAR_STEPS = 4
 # The paper's numbers.
@@ -83,6 +85,15 @@ class Finding:
 def judge(runs: Runs) -> list[Finding]:
     """A finding for each of the paper's claims, including those of experiments not run."""
     return [_finding(claim, runs) for claim in CLAIMS]
+
+
+def judge_with_adapter(runs: Runs) -> list[Finding]:
+    """The findings of experiment ``adapter-claims``, whose flights test every claim; none where it was not run."""
+    result = runs.get(WITH_ADAPTER)
+    if result is None:
+        return []
+    found = judge({claim.experiment: result for claim in CLAIMS})
+    return [replace(finding, experiment=WITH_ADAPTER) for finding in found]
 
 
 def _finding(claim: Claim, runs: Runs) -> Finding:

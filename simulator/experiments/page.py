@@ -112,6 +112,7 @@ def render_page(results: Mapping[str, Result], drawn: Mapping[str, Sequence[tupl
     findings = claims.judge(results)
     return environment.get_template("results.md.j2").render(
         findings=findings,
+        adapted=claims.judge_with_adapter(results),
         verdicts={v: sum(f.verdict is v for f in findings) for v in claims.Verdict},
         experiments=[*EXPERIMENTS, *sorted(results.keys() - set(EXPERIMENTS))],
         results=results,

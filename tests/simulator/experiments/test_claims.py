@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from simulator.experiments.claims import Finding, Verdict, judge
+from simulator.experiments.claims import WITH_ADAPTER, Finding, Verdict, judge, judge_with_adapter
 from simulator.experiments.evidence import beats_chance, difference, settled_at
 from simulator.experiments.result import Result, Sweep
 from tests.simulator.experiments.made_results import interval, result, zero_from
@@ -135,6 +135,23 @@ def test_claims_without_a_run_or_a_measurement_have_no_verdict() -> None:
     assert finding("MADQN reaches zero", flown(eof=20)).why == "not measured: lost_packets_per_step of madqn"
     assert finding("loses less than EOF", flown(llm=4, eof=20)).why == "not measured: lost_packets of wqcs, madqn"
     assert finding("loses less than EOF", flown(llm=24, eof=20)).verdict is NOT
+
+
+def test_one_experiment_answers_every_claim_for_the_llm_with_its_adapter() -> None:
+    lost = {"llm": 42.0, "k3": 80.0, "llm_all": 42.0, "llm_chance": 380.0, "eof": 176.0, "wqcs": 228.0, "madqn": 138.0}
+    made = result(
+        WITH_ADAPTER,
+        {name: {"lost_packets": value} for name, value in lost.items()},
+        curves={"llm": zero_from(4)},
+        sweep=Sweep(label="k", at={"llm": 5.0, "k3": 3.0}),
+    )
+    found = {finding.stated: finding for finding in judge_with_adapter({WITH_ADAPTER: made})}
+    assert {finding.experiment for finding in found.values()} == {WITH_ADAPTER}
+    assert found["AIC-VDS loses nothing from step 4"].verdict is REPRODUCED
+    assert found["so AIC-VDS loses less than EOF, WQCS and MADQN"].verdict is REPRODUCED
+    assert found["k=3 is worse than k=5"].verdict is REPRODUCED
+    assert found["EOF reaches zero only by step 20"].verdict is None
+    assert judge_with_adapter({}) == []
 
 
 def test_a_verdict_on_few_seeds_is_marked() -> None:

@@ -105,6 +105,15 @@ def test_the_papers_statements_have_our_numbers_and_a_verdict_each(written: Path
     assert "not run" in rows["attention halves the prompt"]
 
 
+def test_the_statements_are_judged_again_for_the_llm_with_its_adapter(written: Path, tmp_path: Path) -> None:
+    heading = "The same statements, of the LLM with its adapter"
+    assert heading not in written.read_text()
+    adapted = result("adapter-claims", {"llm": {"lost_packets": 42.0}}, curves={"llm": zero_from(30)})
+    text = page(stored(tmp_path, scheduler(), adapted))
+    rows = re.findall(r"^\| AIC-VDS loses nothing from step 4 \| (.+) \|$", text.split(heading)[1], re.MULTILINE)
+    assert len(rows) == 1 and "**not reproduced** |" in rows[0] and "(#adapter-claims)" in rows[0]
+
+
 def test_a_quick_run_is_marked_and_gets_no_verdict(tmp_path: Path) -> None:
     text = page(stored(tmp_path, scheduler().model_copy(update={"quick": True, "figures": []})))
     assert "**quick run**" in section(text, "scheduler")
