@@ -29,6 +29,8 @@ def _default_store() -> str:
     return str(home / "aicvds" / "missions.db")
 
 
+# A forward pass of a model of some 100 million weights meets a barrier some 200 times; more threads mostly wait there.
+_MOST_EMBEDDED_THREADS = 8
 # Variables of `aicvds simulate`, `aicvds mqtt` and docker-compose.yml, often in the same .env file.
 _SIMULATORS = {
     f"AICVDS_{name}"
@@ -75,7 +77,7 @@ class Settings(BaseSettings):
     # LoRA adapter with which the embedded LLM reads operators' notes, a GGUF file of `aicvds distill-orders`. Unset:
     # the package's own, if it has one. `off`: none.
     llm_orders: str | None = None
-    # Threads of the embedded llama.cpp. 0: as many as cores.
+    # Threads of the embedded llama.cpp. 0: as many as cores, at most 8.
     llm_threads: int = Field(0, ge=0, le=256)
     # Tokens of the embedded model's context. Settings whose longest prompt does not fit are refused.
     llm_context: int = Field(4096, ge=512, le=131_072)
@@ -213,8 +215,8 @@ class Settings(BaseSettings):
 
     @property
     def embedded_threads(self) -> int:
-        """Threads for the embedded llama.cpp: the setting, or a thread for each core."""
-        return self.llm_threads or usable_cores()
+        """Threads for the embedded llama.cpp: the setting, or a thread for each core, at most eight."""
+        return self.llm_threads or min(usable_cores(), _MOST_EMBEDDED_THREADS)
 
 
 def _checked_url(url: str) -> str:

@@ -9,7 +9,6 @@ import pytest
 from fastapi import FastAPI
 
 from service.api.app import create_app
-from service.config.cores import usable_cores
 from service.config.settings import Settings
 from service.llm.embedded import EmbeddedServer
 from tests.running import serving
@@ -168,6 +167,10 @@ def test_decisions_and_health_go_on_while_the_model_loads(report: Report, monkey
         assert client.post("/decide", json=report(mission_id="early", step=1)).json()["reason"] is None
 
 
-def test_threads_default_to_one_for_each_core() -> None:
-    assert Settings().embedded_threads == usable_cores()
-    assert Settings(llm_threads=3).embedded_threads == 3
+@pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (8, 8), (64, 8)])
+def test_threads_default_to_one_for_each_core_up_to_eight(
+    cores: int, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.config.settings.usable_cores", lambda: cores)
+    assert Settings().embedded_threads == threads
+    assert Settings(llm_threads=12).embedded_threads == 12
