@@ -24,8 +24,10 @@ def problem_of(error: Mapping[str, Any], known: Collection[str] = ()) -> str:
 
     Args:
         error: one of ``ValidationError.errors()``.
-        known: the names that stand beside the field; an unknown field gets the nearest of them as a suggestion.
+        known: the names that fields have anywhere; an unknown field gets the nearest of them as a suggestion.
     """
+    if error["type"] == "extra_forbidden" and error["loc"][-1] in known:
+        return "there is no such field here, but elsewhere in the API"
     if error["type"] == "extra_forbidden":
         return f"there is no such field{suggestion(str(error['loc'][-1]), known)}"
     text = _PLAIN.get(error["type"], str(error["msg"]))
