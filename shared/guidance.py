@@ -154,6 +154,20 @@ class Guidance(Received):
                 late[since, now] = sum(LATE_PACKETS * (self.overdue(step + n, last) > 0) for n in steps)
         return late
 
+    def beside(self, in_force: Guidance, levels: int) -> Guidance:
+        """These orders and those in force at once.
+
+        Of a sensor that both name, these count. The velocities are those of 0..levels - 1 m/s that both allow, or
+        where none is left those that the orders in force allow.
+        """
+        if not in_force:
+            return self
+        named = {wish.sensor_id for wish in self.sensors}
+        others = [wish for wish in in_force.sensors if wish.sensor_id not in named]
+        allowed, both = in_force.allowed(levels), in_force.allowed(levels) & self.allowed(levels)
+        forbidden = np.flatnonzero(~(both if both.any() else allowed)).tolist()
+        return Guidance(sensors=[*self.sensors, *others][:MAX_WISHES], forbidden_velocities=forbidden)
+
     def in_words(self) -> str:
         """The orders in plain English, from the structure alone."""
         said = []
@@ -246,7 +260,9 @@ class GuidanceAnswer(Received):
 
     answer: Literal["confirm", "reject"] | None = None
     guidance: Guidance | None = None
-    note: Note | None = Field(None, description="a new note in plain words; the prompt keeps the mission's first one")
+    note: Note | None = Field(
+        None, description="a new note in plain words; a long prompt keeps the text of the mission's first one"
+    )
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:

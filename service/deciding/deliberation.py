@@ -219,7 +219,8 @@ def candidates_of(state: AttendedState, template: GuidedTemplate) -> CandidateSe
     mission = state.mission
     view = Viewpoint(mission.belief, state.uav_id, state.step, learned=mission.belief_source == "fleet")
     shown = state.prompt_view
-    candidates = template.candidates(shown.state, shown.reach or state.reach, state.shown(), view)
+    seen, offered = shown.reach or state.reach, shown.offered or state.reach
+    candidates = template.candidates(shown.state, seen, offered, state.shown(), view)
     guidance = shown.guidance
     if guidance is None:
         return candidates

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
+
 from service.guidance.orders_as_queues import as_queues
 from service.guidance.step_guidance import StepGuidance
 from service.mission.mission import Mission
@@ -20,6 +22,7 @@ class PromptView:
     Attributes:
         state, reach: as the prompt shows them. The compact prompt has the orders in them, as queues; the reach is None
             where it is the state's own.
+        offered: the reach that the candidates' velocities are chosen by; None where it is the state's own.
         guidance: what the candidates' velocities obey in this step.
         added: shape ``(J,)``, packets to add to the worth of each sensor as attention chooses the prompt's rows; None
             where there are no orders.
@@ -27,6 +30,7 @@ class PromptView:
 
     state: State
     reach: Reach | None
+    offered: Reach | None
     guidance: StepGuidance | None
     added: FloatArray | None
 
@@ -34,16 +38,18 @@ class PromptView:
     def of(cls, mission: Mission, state: State, uav_id: int, step: int, confirmed: StepGuidance | None) -> Self:
         """By the confirmed orders, and with the compact prompt by the LLM's own reading of the note before that.
 
-        An order that is not confirmed yet is in the prompt alone: in mode ``guided`` only the LLM's advice follows it.
+        An order that is not confirmed yet is in the prompt alone: in mode ``guided`` only the LLM's advice follows it,
+        and the candidates are those without it. Orders in force stay until the operator confirms others.
         """
         scenario, visits = mission.scenario, mission.records.visits
         added = None if confirmed is None else confirmed.worth.max(axis=0)
         read = mission.guidance.read
         if read is None or not isinstance(mission.template, CompactTemplate):
-            return cls(state, None, confirmed, added)
+            return cls(state, None, None, confirmed, added)
         reach = state.reach_ahead(uav_id, scenario)
         shown, seen = as_queues(state, reach, read, step, visits, scenario)
         if mission.mode != "llm":
-            return cls(shown, seen, confirmed, added)
+            return cls(shown, seen, seen if read is mission.guidance.orders else None, confirmed, added)
         guidance = StepGuidance.of(read, state, reach, step, visits, scenario)
-        return cls(shown, seen, guidance, (seen.worth - reach.worth).max(axis=0))
+        ordered = np.where(guidance.allowed[:, None], seen.worth - reach.worth, -np.inf)
+        return cls(shown, seen, seen, guidance, ordered.max(axis=0))

@@ -81,8 +81,10 @@ class OperatorGuidance:
 
     @property
     def read(self) -> Guidance | None:
-        """The orders that a prompt shows: the LLM's reading of the note until the operator answers, then ``orders``."""
-        return self._proposed or None if self.status == "proposed" else self.orders
+        """The orders that a prompt shows: ``orders``, and beside them a reading that nobody has answered yet."""
+        if self.status != "proposed" or not self._proposed:
+            return self.orders
+        return self._proposed.beside(self.confirmed, self._scenario.max_velocity + 1)
 
     def report(self, mission_id: str) -> GuidanceStatus:
         """The body of ``GET /missions/{id}/guidance``."""

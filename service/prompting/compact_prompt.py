@@ -154,11 +154,13 @@ class CompactTemplate(GuidedTemplate):
         shown = digits([_NINE * np.sqrt(max(packets, 0) / self._scenario.queue_capacity), _NINE * cost])
         return f"{shown[0]}{sign(action.sensor_id)}{shown[1]}{'X' if failed else 'Y'}"
 
-    def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
+    def candidates(
+        self, state: State, seen: Reach, offered: Reach, shown: Sequence[int], view: Viewpoint
+    ) -> CandidateSet:
         """The candidates for these rows of a state, with the whole user message as their text."""
         scenario = self._scenario
         outlook = Outlook.of(view, scenario)
-        numbers = row_digits(state, reach, outlook, scenario)
+        numbers = row_digits(state, seen, outlook, scenario)
         level = _NINE / scenario.max_velocity
 
         def write(rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
@@ -171,7 +173,7 @@ class CompactTemplate(GuidedTemplate):
                 for letter, own, row in zip(letters, signs, shown_digits, strict=True)
             )
 
-        return CandidateSet.of(state, reach, shown, self.letters, write)
+        return CandidateSet.of(state, offered, shown, self.letters, write)
 
     def content_free(self, uavs: Sequence[int] = ()) -> list[str]:
         """None: the adapter is trained with shuffled rows, so it has no bias towards letters to be measured."""

@@ -91,8 +91,15 @@ class GuidedTemplate(Template):
         """A line such as ``52,3>7:0``, with the cost in tenths."""
         return f"{seen['queue']},{seen['age']}>{action.velocity}:{min(99, round(10 * cost))}\n"
 
-    def candidates(self, state: State, reach: Reach, shown: Sequence[int], view: Viewpoint) -> CandidateSet:
-        """The candidates for these rows of a state, in this order."""
+    def candidates(
+        self, state: State, seen: Reach, offered: Reach, shown: Sequence[int], view: Viewpoint
+    ) -> CandidateSet:
+        """The candidates for these rows of a state, in this order.
+
+        Args:
+            seen: the reach that the compact prompt's rows show.
+            offered: the reach that the velocities are chosen by.
+        """
 
         def write(rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
             text = ""
@@ -102,7 +109,7 @@ class GuidedTemplate(Template):
                 text += f"{letter}{cell['queue']},{cell['age']},{span}\n"
             return text
 
-        return CandidateSet.of(state, reach, shown, self.letters, write)
+        return CandidateSet.of(state, offered, shown, self.letters, write)
 
     def choice_prompt(
         self, candidates: CandidateSet, state: State, experiences: Sequence[str], nearest: Sequence[str] = ()

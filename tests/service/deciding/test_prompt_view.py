@@ -91,8 +91,51 @@ def test_in_mode_guided_a_reading_is_in_the_rows_alone() -> None:
     state = flown.state()
     assert prompted(state)[0][2] == 0
     assert state.kept_ids == before.kept_ids
-    actions = candidates_of(state, template_of(flown.mission)).actions
-    assert max(velocity for _, velocity in actions) > 6
+    template = template_of(flown.mission)
+    assert candidates_of(state, template).actions == candidates_of(before, template).actions
+    assert candidates_of(state, template).rows != candidates_of(before, template).rows
+
+
+def test_orders_in_force_stay_in_the_prompt_beside_a_second_note_that_was_only_read() -> None:
+    flown = Flown("llm")
+    flown.mission.answer_guidance(GuidanceAnswer(guidance=ORDERS))
+    flown.mission.answer_guidance(GuidanceAnswer(note="visit sensor 7 now and then"))
+    second = {"sensors": [{"sensor_id": 7, "visit_every": 4}], "min_velocity": 3}
+    flown.mission.propose_guidance(Guidance.model_validate(second), "an LLM")
+    state = flown.state()
+    shown, true = prompted(state)
+    assert shown[2] == 0 < true[2]
+    assert min(shown[4], shown[7]) >= 0.75 * CAPACITY
+    velocities = {velocity for _, velocity in candidates_of(state, template_of(flown.mission)).actions}
+    assert velocities <= {3, 4, 5, 6}
+
+
+@pytest.mark.parametrize("second", [{}, {"min_velocity": 9}])
+def test_a_reading_that_orders_nothing_or_the_contrary_takes_no_order_in_force_away(second: dict[str, int]) -> None:
+    flown = Flown("llm")
+    flown.mission.answer_guidance(GuidanceAnswer(guidance=ORDERS))
+    flown.mission.answer_guidance(GuidanceAnswer(note="hm"))
+    flown.mission.propose_guidance(Guidance.model_validate(second), "an LLM")
+    state = flown.state()
+    assert prompted(state)[0][2] == 0
+    assert max(velocity for _, velocity in candidates_of(state, template_of(flown.mission)).actions) <= 6
+
+
+def test_a_visit_that_only_forbidden_velocities_bring_in_reach_takes_no_row() -> None:
+    """Attention adds what orders add at velocities that the operator allows."""
+    for steps in range(2, 8):
+        for sensor in range(PAPER.sensors):
+            flown = Flown("llm", steps=steps)
+            orders = {"sensors": [{"sensor_id": sensor, "visit_every": 2}], "max_velocity": 3}
+            flown.mission.answer_guidance(GuidanceAnswer(guidance=Guidance.model_validate(orders)))
+            state = flown.state()
+            view, row = state.prompt_view, np.flatnonzero(state.state.ids == sensor)
+            if not len(row) or view.reach is None or view.added is None or state.reach.likely[:4, row[0]].any():
+                continue
+            if state.reach.likely[4:, row[0]].any():
+                assert view.added[row[0]] <= view.reach.packets[:4, row[0]].max()
+                return
+    raise AssertionError("no such sensor")
 
 
 def test_a_rejected_reading_leaves_the_prompt_and_a_confirmed_one_stays() -> None:

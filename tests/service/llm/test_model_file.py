@@ -9,8 +9,9 @@ import pytest
 from gguf import GGMLQuantizationType, GGUFReader, GGUFWriter
 from gguf.quants import dequantize, quantize
 
+from service.config.settings import Settings
 from service.llm import model_file
-from service.llm.model_file import EMBEDDED_NAME, GGUF_NAME, fetch_model, sha256
+from service.llm.model_file import EMBEDDED_NAME, GGUF_NAME, ModelMissing, embedded_model, fetch_model, sha256
 from service.llm.requantize import to_eight_bits
 
 Q4_1, Q8_0 = GGMLQuantizationType.Q4_1, GGMLQuantizationType.Q8_0
@@ -60,6 +61,20 @@ def test_a_damaged_file_is_made_again_and_a_whole_one_is_left_alone(
     assert fetch_model(tmp_path).stat().st_mtime_ns == first
     made.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert fetch_model(tmp_path).read_bytes() == whole
+    (tmp_path / f"{EMBEDDED_NAME}.sha256").write_bytes(b"\xff\xfe")
+    assert fetch_model(tmp_path).read_bytes() == whole
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(
         [GGUF_NAME, EMBEDDED_NAME, f"{EMBEDDED_NAME}.sha256"]
     )
+
+
+def test_what_an_earlier_version_fetched_serves_where_the_new_file_is_not_there(tmp_path: Path) -> None:
+    settings = Settings(cache_dir=tmp_path)
+    with pytest.raises(ModelMissing, match="run `aicvds model fetch`"):
+        embedded_model(settings)
+    earlier = written(tmp_path / GGUF_NAME)
+    assert embedded_model(settings) == earlier
+    with pytest.raises(ModelMissing, match="check AICVDS_LLM_GGUF"):
+        embedded_model(Settings(cache_dir=tmp_path, llm_gguf=tmp_path / "own.gguf"))
+    made = written(tmp_path / EMBEDDED_NAME)
+    assert embedded_model(settings) == made
