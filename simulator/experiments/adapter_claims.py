@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from simulator.experiments.claims import WITH_ADAPTER
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
 from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.result import Sweep
@@ -35,7 +34,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
 
 
 EXPERIMENT = Experiment(
-    name=WITH_ADAPTER,
+    name="adapter-claims",
     title="The paper's statements, with the adapter",
     summary="mode llm with the adapter: what the paper states of losses by step, k, attention, tokens and fairness",
     schemes=_schemes,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from shared.scenario import Scenario
+from simulator.experiments import adapter_claims
 from simulator.experiments.evidence import (
     METHOD,
     ZERO,
@@ -26,7 +27,7 @@ from simulator.experiments.result import Interval, Paired, Result
 
 CLAIM_SEEDS = 30
 # The experiment whose schemes, by the paper's names for them, are of the LLM with the adapter.
-WITH_ADAPTER = "adapter-claims"
+WITH_ADAPTER = adapter_claims.EXPERIMENT.name
 # The tolerance of "zero at step 20" in steps.
 NEAR_STEPS = 4
 # The paper's numbers.
