@@ -164,7 +164,8 @@ class Guidance(Received):
             return self
         named = {wish.sensor_id for wish in self.sensors}
         others = [wish for wish in in_force.sensors if wish.sensor_id not in named]
-        allowed, both = in_force.allowed(levels), in_force.allowed(levels) & self.allowed(levels)
+        allowed = in_force.allowed(levels)
+        both = allowed & self.allowed(levels)
         forbidden = np.flatnonzero(~(both if both.any() else allowed)).tolist()
         return Guidance(sensors=[*self.sensors, *others][:MAX_WISHES], forbidden_velocities=forbidden)
 

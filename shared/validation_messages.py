@@ -27,7 +27,7 @@ def problem_of(error: Mapping[str, Any], known: Collection[str] = ()) -> str:
         known: the names that fields have anywhere; an unknown field gets the nearest of them as a suggestion.
     """
     if error["type"] == "extra_forbidden" and error["loc"][-1] in known:
-        return "there is no such field here, but elsewhere in the API"
+        return "there is no such field in this place"
     if error["type"] == "extra_forbidden":
         return f"there is no such field{suggestion(str(error['loc'][-1]), known)}"
     text = _PLAIN.get(error["type"], str(error["msg"]))

@@ -29,7 +29,7 @@ def _default_store() -> str:
     return str(home / "aicvds" / "missions.db")
 
 
-# A forward pass of a model of some 100 million weights meets a barrier some 200 times; more threads mostly wait there.
+# A small model's products are short, and the threads meet after each. More than two threads were not measured.
 _MOST_EMBEDDED_THREADS = 8
 # Variables of `aicvds simulate`, `aicvds mqtt` and docker-compose.yml, often in the same .env file.
 _SIMULATORS = {

@@ -8,6 +8,7 @@ from simulator.experiments.schemes import (
     ADAPTED,
     CHANCE,
     Scheme,
+    adapted_llm,
     at_full_speed,
     available_locals,
     edge_planner,
@@ -22,7 +23,7 @@ _HEURISTICS = ("eof", "wqcs", "max_gain", "nearest")
 
 def _schemes(setup: Setup) -> list[Scheme]:
     return [
-        over_edge("llm_adapted", "mode llm, with the adapter", backing=ADAPTED, verify="off", planner="off"),
+        adapted_llm(),
         llm(),
         over_edge("llm_chance", "uniform draws in place of an LLM", backing=CHANCE),
         guided("guided_adapted", "guided, with the adapter", backing=ADAPTED),

@@ -5,22 +5,14 @@ from __future__ import annotations
 from simulator.experiments.measures import LOSS_CURVES, LOSSES
 from simulator.experiments.plan import Experiment, FigureSpec, Setup
 from simulator.experiments.result import Sweep
-from simulator.experiments.schemes import ADAPTED, CHANCE, Scheme, available_locals, over_edge
+from simulator.experiments.schemes import CHANCE, Scheme, adapted_llm, available_locals, over_edge
 
 _TOP_K = 5
 _OTHER_KS = (1, 2, 3, 7, 10)
 
 
 def _adapted(name: str, label: str, top_k: int = _TOP_K, attention: str = "on") -> Scheme:
-    return over_edge(
-        name,
-        f"with the adapter, {label}",
-        backing=ADAPTED,
-        verify="off",
-        planner="off",
-        top_k=top_k,
-        attention=attention,
-    )
+    return adapted_llm(name, f"with the adapter, {label}", top_k=top_k, attention=attention)
 
 
 def _schemes(setup: Setup) -> list[Scheme]:

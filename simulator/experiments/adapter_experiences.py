@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.plan import Experiment, FigureSpec, Setup
-from simulator.experiments.schemes import ADAPTED, Scheme, over_edge
+from simulator.experiments.schemes import Scheme, adapted_llm
 
 _COUNTS = (0, 8, 30)
 
 
 def _unlearned(experiences: int) -> Scheme:
-    return over_edge(
+    return adapted_llm(
         f"unlearned_{experiences}",
         f"unlearned rows, {experiences} experiences",
-        backing=ADAPTED,
-        verify="off",
-        planner="off",
         belief="reported",
         features="reach",
         prompt={"experiences": experiences},
@@ -23,8 +20,7 @@ def _unlearned(experiences: int) -> Scheme:
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
-    learned = over_edge("llm_adapted", "mode llm, with the adapter", backing=ADAPTED, verify="off", planner="off")
-    return [*map(_unlearned, _COUNTS), learned]
+    return [*map(_unlearned, _COUNTS), adapted_llm()]
 
 
 EXPERIMENT = Experiment(

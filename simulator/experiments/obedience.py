@@ -6,7 +6,7 @@ from shared.guidance import Guidance, SensorWish
 from simulator.experiments.measures import LOSSES
 from simulator.experiments.operators import Intent, Operator
 from simulator.experiments.plan import Experiment, FigureSpec, Setup
-from simulator.experiments.schemes import ADAPTED, NAMED_BY_OPTION, OFF, Backing, Scheme, over_edge
+from simulator.experiments.schemes import NAMED_BY_OPTION, OFF, Backing, Scheme, adapted_llm, over_edge
 
 # Each has a visit and a rule for velocities, in different wordings; none is a worked example of the edge.
 _NOTES = tuple(
@@ -33,14 +33,7 @@ def _flown(mode: str, says: str, label: str, backing: Backing = NAMED_BY_OPTION)
 
 def _adapted(says: str, label: str) -> Scheme:
     operator = Operator.model_validate({"says": says, "notes": _NOTES})
-    return over_edge(
-        f"llm_adapted_{says}",
-        f"mode llm with the adapter, {label}",
-        backing=ADAPTED,
-        verify="off",
-        planner="off",
-        operator=operator,
-    )
+    return adapted_llm(f"llm_adapted_{says}", f"mode llm with the adapter, {label}", operator=operator)
 
 
 def _schemes(setup: Setup) -> list[Scheme]:

@@ -146,6 +146,11 @@ def llm() -> Scheme:
     return over_edge("llm", "AIC-VDS, mode llm")
 
 
+def adapted_llm(name: str = "llm_adapted", label: str = "mode llm, with the adapter", **options: Any) -> Scheme:
+    """The embedded LLM with its adapter; neither planner nor verifier takes part."""
+    return over_edge(name, label, backing=ADAPTED, verify="off", planner="off", **options)
+
+
 def guided(name: str = "guided", label: str = "AIC-VDS, mode guided", **spec: Any) -> Scheme:
     """The LLM as one adviser among others."""
     return over_edge(name, label, mode="guided", **spec)

@@ -73,7 +73,7 @@ def test_a_body_without_a_content_type_is_a_415_that_says_which(edge: Edge, repo
     [
         ("/missions/m", {"topk": 3}, "there is no such field; did you mean top_k?"),
         ("/missions/m", {"prompt": {"formatt": "csv"}}, "did you mean format?"),
-        ("/missions/m", {"deadline_ms": 100}, "there is no such field here, but elsewhere in the API"),
+        ("/missions/m", {"deadline_ms": 100}, "there is no such field in this place"),
         ("/missions/m", {"zzzz": 3}, "there is no such field"),
         ("/missions/m", {"note": "a\nb"}, "note: must be one paragraph"),
         ("/missions/m", [], "must be a JSON object"),
