@@ -161,15 +161,15 @@ def load(target: Target, uavs: list[Uav], seconds: float) -> dict[str, float]:
         await asyncio.gather(*(_flies(target, uav, began + seconds, took_ms) for uav in uavs))
         return took_ms, time.perf_counter() - began
 
-    busy_s = _processor_s(target.process)
+    busy_s = processor_s(target.process)
     took_ms, lasted = asyncio.run(all_of_them())
-    busy_s = _processor_s(target.process) - busy_s
+    busy_s = processor_s(target.process) - busy_s
     p50, p99 = np.percentile(took_ms, [50, 99])
     cpu = busy_s * 1e3 / len(took_ms)
     return {"p50": float(p50), "p99": float(p99), "rps": len(took_ms) / lasted, "cpu": cpu}
 
 
-def _processor_s(process: int) -> float:
+def processor_s(process: int) -> float:
     """Seconds of processor time of a process and of those that it started."""
     first = psutil.Process(process)
     times = [each.cpu_times() for each in (first, *first.children(recursive=True))]
@@ -214,7 +214,7 @@ def litellm_program(choice: str, console: Console) -> str | None:
     return str(program)
 
 
-def _edge(settings: dict[str, str], stack: ExitStack, checkout: Path | None = None) -> tuple[int, int]:
+def edge_of(settings: dict[str, str], stack: ExitStack, checkout: Path | None = None) -> tuple[int, int]:
     """Start an edge of this checkout or another, and wait for its LLM; returns its process and its port."""
     port = usable_port(0)
     python = str(checkout / ".venv/bin/python") if checkout else sys.executable
@@ -238,8 +238,8 @@ def start(folder: Path, litellm: str | None, before: Path | None, stack: ExitSta
     made = subprocess.run([python, "-m", "shared.cli", *add], check=True, capture_output=True, text=True)
     key = made.stdout.split()[-1]
     settings = {**EDGE, "AICVDS_LLM_URL": upstream, "AICVDS_KEYS": str(keys)}
-    edge = _edge({**settings, "AICVDS_STORE": str(folder / "missions.db")}, stack)
-    storeless = _edge({**settings, "AICVDS_STORE": "none"}, stack)
+    edge = edge_of({**settings, "AICVDS_STORE": str(folder / "missions.db")}, stack)
+    storeless = edge_of({**settings, "AICVDS_STORE": "none"}, stack)
     targets = [
         Target("bare", forwards, bare, "/decide", lambda uav: uav.report(outcomes=False)),
         Target("edge", *edge, "/decide", lambda uav: uav.report(outcomes=True), key),
@@ -247,7 +247,7 @@ def start(folder: Path, litellm: str | None, before: Path | None, stack: ExitSta
         Target("edge, no store", *storeless, "/decide", lambda uav: uav.report(outcomes=True), key),
     ]
     if before is not None:
-        other = _edge({**settings, "AICVDS_STORE": str(folder / "before.db")}, stack, before.absolute())
+        other = edge_of({**settings, "AICVDS_STORE": str(folder / "before.db")}, stack, before.absolute())
         targets.insert(2, Target("before", *other, "/decide", lambda uav: uav.report(outcomes=True), key))
     # LiteLLM is to forward the edge's own query.
     load(targets[1], [Uav(n) for n in range(FLEET)], 1.0)

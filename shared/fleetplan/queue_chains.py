@@ -48,13 +48,6 @@ class QueueChains:
         moved[:, 0] = np.cumsum(odds, axis=1)[rows, levels]
         return np.asarray(odds + chance[:, None] * (moved - odds))
 
-    def served_alike(self, odds: Floats, levels: int, chance: float) -> Floats:
-        """As :meth:`served`, by the same transfer over the same link."""
-        moved = np.zeros_like(odds)
-        moved[:, 1 : odds.shape[1] - levels] = odds[:, levels + 1 :]
-        moved[:, 0] = np.cumsum(odds[:, : levels + 1], axis=1)[:, -1]
-        return np.asarray(odds + np.float32(chance) * (moved - odds))
-
 
 @dataclass(frozen=True)
 class Arriving:

@@ -44,6 +44,9 @@ _JOINT_UAVS = 4
 _NEAR_HORIZON = 4
 _MOST_SENSORS = 40
 _NEAR_SENSORS = 16
+# A plan that is expected to lose fewer packets is not improved: no search could save more. Two thirds of the plans in
+# scenario `paper` are such.
+_NEGLIGIBLE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,25 +76,33 @@ class Draft:
     def search(self, seconds: float = math.inf) -> Plan:
         """The best plan found within the work and the wall clock, never worse than the search's start.
 
+        The last plan stays, without a search, where it is expected to lose next to nothing.
+
         Raises:
             ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
         """
+        last = with_fixed(self.problem, self.before)
         if self.problem.chains is not None:
-            return self._search_uncertain(seconds)
-        start = self.before
+            return self._search_uncertain(last, seconds)
+        lost, cost = price(self.problem, last)
+        if cost < _NEGLIGIBLE:
+            return Plan(last, lost, cost, 0.0, "FEASIBLE", 0.0, 0.0)
+        start = last
         if not self.saved:
             greedy = look_ahead(self.problem)
-            start = min(start, greedy, key=lambda actions: price(self.problem, actions)[1])
+            start = greedy if price(self.problem, greedy)[1] < cost else last
         return plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
 
-    def _search_uncertain(self, seconds: float) -> Plan:
+    def _search_uncertain(self, last: IntArray, seconds: float) -> Plan:
         """The plan over uncertain links, from the better of the last plan and the greedy one."""
         begun = time.perf_counter()
         loss = ExpectedLoss(self.problem)
-        starts = [with_fixed(self.problem, actions) for actions in (self.before, look_ahead(self.problem))]
-        actions = searched(self.problem, min(starts, key=loss.of), seconds)
+        actions, cost = last, loss.of(last)
+        if cost >= _NEGLIGIBLE:
+            greedy = with_fixed(self.problem, look_ahead(self.problem))
+            actions, cost = searched(loss, [last, greedy], seconds)
         lost, _ = price(self.problem, actions)
-        return Plan(actions, lost, loss.of(actions), 0.0, "FEASIBLE", time.perf_counter() - begun, 0.0)
+        return Plan(actions, lost, cost, 0.0, "FEASIBLE", time.perf_counter() - begun, 0.0)
 
 
 class RecedingHorizon:
@@ -105,6 +116,8 @@ class RecedingHorizon:
 
     Where links are uncertain, :func:`shared.fleetplan.uav_by_uav.searched` finds the plan, and the objective is the
     exact expectation of :class:`shared.fleetplan.expected_loss.ExpectedLoss`.
+
+    The last plan stays where it is expected to lose less than 0.05 packets.
 
     The solver's deterministic time limits CP-SAT's search, so that a mission repeats to the bit. Steps that are solved
     early save time for others. Without saved time a short search starts from the better of the last plan and

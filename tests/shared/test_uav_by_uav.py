@@ -93,9 +93,9 @@ def cheapest(whole: FleetProblem) -> float:
 def test_a_plan_gets_cheaper(seed: int) -> None:
     whole = random_problem(seed)
     start = random_plan(whole, seed)
-    found = searched(whole, start)
-    assert ExpectedLoss(whole).of(found) < ExpectedLoss(whole).of(start)
-    np.testing.assert_array_equal(found, searched(whole, start))
+    found, cost = searched(ExpectedLoss(whole), [start])
+    assert cost < ExpectedLoss(whole).of(start)
+    np.testing.assert_array_equal(found, searched(ExpectedLoss(whole), [start])[0])
     for row in found[:, :, 0].tolist():
         served = [sensor for sensor in row if sensor != NOWHERE]
         assert len(set(served)) == len(served)
@@ -105,8 +105,21 @@ def test_a_plan_gets_cheaper(seed: int) -> None:
 def test_one_uavs_plan_is_close_to_the_best_of_all(seed: int) -> None:
     allowed = np.array([True, False, True, False, True])
     whole = random_problem(seed, uavs=1, allowed=allowed)
-    found, best = ExpectedLoss(whole).of(searched(whole, random_plan(whole, seed))), cheapest(whole)
+    (_, found), best = searched(ExpectedLoss(whole), [random_plan(whole, seed)]), cheapest(whole)
     assert best - 1e-3 <= found <= 1.1 * best
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_searchs_cost_is_the_expected_loss_of_its_plan(seed: int) -> None:
+    whole = random_problem(seed, uavs=3)
+    found, cost = searched(ExpectedLoss(whole), [random_plan(whole, seed), random_plan(whole, seed + 50)])
+    assert cost == pytest.approx(ExpectedLoss(whole).of(found), abs=1e-3)
+
+
+def test_the_search_begins_with_the_best_start() -> None:
+    whole = random_problem(3)
+    plans = sorted((random_plan(whole, seed) for seed in range(6)), key=ExpectedLoss(whole).of)
+    np.testing.assert_array_equal(searched(ExpectedLoss(whole), plans[::-1], -1.0)[0], plans[0])
 
 
 def test_the_expected_loss_is_the_mean_over_links() -> None:
@@ -124,7 +137,7 @@ def test_a_uav_goes_to_the_place_with_the_highest_chance() -> None:
     chance = np.zeros((1, SUMS, SENSORS))
     chance[0, 1, 0], chance[0, 3, 0] = 0.2, 0.9
     whole = problem([chance, np.zeros_like(chance)])
-    found = searched(whole, np.array([[(0, 1), (1, 0)], [(2, 4), (1, 0)], [(2, 4), (1, 0)]]))
+    found, _ = searched(ExpectedLoss(whole), [np.array([[(0, 1), (1, 0)], [(2, 4), (1, 0)], [(2, 4), (1, 0)]])])
     assert found[0, 0].tolist() == [0, 3]
 
 
@@ -132,7 +145,7 @@ def test_two_uavs_exchange_their_sensors() -> None:
     # UAV 0 alone reaches sensor 1, and both reach sensor 0, UAV 0 a little better.
     first, second = np.zeros((1, SUMS, SENSORS)), np.zeros((1, SUMS, SENSORS))
     first[..., 0], first[..., 1], second[..., 0] = 0.9, 0.85, 0.8
-    found = searched(problem([first, second]), np.tile([[0, 0], [NOWHERE, 0]], (HORIZON, 1, 1)))
+    found, _ = searched(ExpectedLoss(problem([first, second])), [np.tile([[0, 0], [NOWHERE, 0]], (HORIZON, 1, 1))])
     assert found[:, 0, 0].tolist().count(1) == HORIZON
     assert found[:, 1, 0].tolist().count(0) == HORIZON
 
@@ -145,7 +158,8 @@ def test_fixed_actions_reserved_sensors_and_forbidden_velocities_stay(seed: int)
     whole = random_problem(seed, fixed={0: np.array([(0, 3)])}, usable=usable, allowed=allowed)
     start = random_plan(whole, seed)
     start[0, 1, 0] = 2
-    found = searched(whole, start)
+    found, cost = searched(ExpectedLoss(whole), [start])
+    assert cost == pytest.approx(ExpectedLoss(whole).of(found), abs=1e-3)
     assert found[0, 0].tolist() == [0, 3]
     assert found[0, 1, 0] not in (0, 1)
     assert set(found[:, 1, 1].tolist()) <= {0, 2, 4}
@@ -158,15 +172,15 @@ def test_an_overdue_sensor_is_visited_though_it_loses_nothing() -> None:
     late = np.zeros((HORIZON + 1, HORIZON + 1, SENSORS))
     late[0, :, 2] = 30.0
     start = np.array([[(0, 0)], [(1, 0)], [(0, 0)]])
-    assert 2 not in searched(problem([chance]), start)[:1, 0, 0]
-    found = searched(problem([chance], late=late), start)
+    assert 2 not in searched(ExpectedLoss(problem([chance])), [start])[0][:1, 0, 0]
+    found, cost = searched(ExpectedLoss(problem([chance], late=late)), [start])
     assert found[0, 0, 0] == 2
     loss = ExpectedLoss(problem([chance], late=late))
-    assert loss.of(found) < loss.of(start)
+    assert cost == loss.of(found) < loss.of(start)
 
 
 def test_without_time_the_plan_stays() -> None:
     whole = random_problem(0)
     start = random_plan(whole, 0)
-    np.testing.assert_array_equal(searched(whole, start, -1.0), start)
-    assert not np.array_equal(searched(whole, start, math.inf), start)
+    np.testing.assert_array_equal(searched(ExpectedLoss(whole), [start], -1.0)[0], start)
+    assert not np.array_equal(searched(ExpectedLoss(whole), [start], math.inf)[0], start)
