@@ -13,11 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from service.deciding.sampled_futures import SampledFutures
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import VELOCITY_BONUS, urgency
@@ -207,7 +209,7 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     scenario, sensors, count = state.scenario, len(state.sensors), len(candidates)
     entries = count * max(1, sensors) * (scenario.max_velocity + 1) * len(state.links) * state.horizon
     continuations = [{}, state.plans] if state.plans else [{}]
-    futures = _SampledFutures.of(state, int(np.clip(_MAX_ENTRIES // (entries * len(continuations)), 1, _FUTURES)))
+    futures = SampledFutures.of(state, int(np.clip(_MAX_ENTRIES // (entries * len(continuations)), 1, _FUTURES)))
     # A sensor that is not simulated is out of every UAV's reach: its link never holds.
     rows = np.searchsorted(state.sensors, [sensor for sensor, _ in candidates])
     known = np.isin([sensor for sensor, _ in candidates], state.sensors)
@@ -226,38 +228,18 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     return Evaluation(np.min(losses, axis=0), cost.reshape(count, many).mean(axis=1))
 
 
-@dataclass(frozen=True, slots=True)
-class _SampledFutures:
-    """M futures sampled from the belief: queues ``(M, n)``, arrivals ``(H, M, n)``, and the sensors' fades ``(M, n)``.
+class _Offers(NamedTuple):
+    """One UAV's choice in a step of look-ahead, after each sum S of velocities.
 
-    A fade is the excess of a sensor's path losses over their means, in standard deviations, the same in all steps:
-    infinite where the radio is dead.
+    Attributes:
+        sensors: shape ``(m,)``, those that it may reach within the horizon, and one that it may not, if there is one.
+        packets: shape ``(S, m, V)``, that one more step at each velocity can move.
+        holds: shape ``(S, m, V)``, the probability that the link holds; None: 1.
     """
 
-    start: FloatArray
-    arrivals: FloatArray
-    fades: FloatArray
-
-    @classmethod
-    def of(cls, state: RolloutState, count: int) -> _SampledFutures:
-        """Sample futures, each with its own arrival rates, because a rarely heard sensor may fill fast."""
-        scenario, random, shape = (
-            state.scenario,
-            np.random.default_rng(state.seed),
-            (count, len(state.sensors)),
-        )
-        capacity = float(scenario.queue_capacity)
-        rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
-        drawn = random.uniform(scenario.initial_queue_min * capacity, capacity, shape)
-        start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age)
-        expected = rates
-        if state.dispersion > 1.0:
-            # A Poisson number of a Gamma mean has a variance above its mean.
-            spread = state.dispersion - 1.0
-            expected = random.gamma(np.maximum(rates + state.bursts[:, None], 1e-9) / spread, spread)
-        arrivals = random.poisson(expected, (state.horizon, *shape)).astype(np.float64)
-        fades = np.where(random.uniform(size=shape) < state.alive, random.standard_normal(shape), np.inf)
-        return cls(np.minimum(start, capacity), arrivals, fades)
+    sensors: NDArray[np.int64]
+    packets: FloatArray
+    holds: FloatArray | None
 
 
 class _RolloutBatch:
@@ -278,17 +260,11 @@ class _RolloutBatch:
         )
         levels = np.arange(scenario.queue_capacity + 1, dtype=np.float64)[:, None]
         self._urgency = urgency(levels, state.rates, scenario)
-        # By UAV, shape (sum of velocities so far + 1, n, V): packets that one more step at each velocity can move.
-        self._ahead = {
-            uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.links.items()
-        }
-        # The same of the margins, and of the probability that the link holds.
-        self._margins = {
-            uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.margins.items()
-        }
-        self._holds = {
-            uav: sliding_window_view(table, scenario.max_velocity + 1, axis=0) for uav, table in state.holds.items()
-        }
+        # By UAV, shape (sum of velocities so far + 1, n, V): packets that one more step at each velocity can move, and
+        # the margins of its links.
+        self._ahead = {uav: self._windows(table) for uav, table in state.links.items()}
+        self._margins = {uav: self._windows(table) for uav, table in state.margins.items()}
+        self._offered = {uav: self._offers(uav) for uav in state.links} if len(state.sensors) else {}
         self._fades = fades
         self._flown = {uav: np.zeros(len(queue), dtype=np.int64) for uav in self._ahead}
         self._queue = queue
@@ -345,17 +321,38 @@ class _RolloutBatch:
         late = 0.0 if self._waiting is None else self._waiting.end_step()
         return np.asarray((over * self._weights).sum(axis=1) + late)
 
+    def _windows(self, table: FloatArray) -> FloatArray:
+        """The table ``(C, n)`` at one more step of each velocity, ``(C - V + 1, n, V)``."""
+        return sliding_window_view(table, len(self._bonus), axis=0)
+
+    def _offers(self, uav: int) -> _Offers:
+        """What look-ahead chooses from."""
+        near = np.asarray((self._state.links[uav] > 0).any(axis=0))
+        # All sensors out of reach are alike, and of equal ones the first is chosen.
+        near[(~near).argmax()] = True
+        some = np.flatnonzero(near)
+        holds = self._state.holds.get(uav)
+        tables = [self._state.links[uav], *([] if holds is None else [holds])]
+        packets, *likely = (np.ascontiguousarray(self._windows(table[:, some])) for table in tables)
+        return _Offers(some, packets, likely[0] if likely else None)
+
     def _look_ahead(self, uav: int, served: NDArray[np.bool_]) -> None:
         """One step of look-ahead, as in :func:`service.deciding.advisers.look_ahead`."""
         if not len(self._columns):
             return
-        ahead = self._ahead[uav][self._flown[uav]]
-        urgencies = self._urgency[self._queue.astype(np.int64), self._columns]
-        movable = np.minimum(ahead, np.where(served, 0.0, self._queue)[..., None])
-        if uav in self._holds:
-            movable *= self._holds[uav][self._flown[uav]]
-        worth = (urgencies * self._weights)[..., None] * movable + self._bonus
-        sensor, velocity = np.unravel_index(worth.reshape(len(worth), -1).argmax(axis=1), worth.shape[1:])
+        offers, flown = self._offered[uav], self._flown[uav]
+        some = offers.sensors
+        queue = self._queue[:, some]
+        urgencies = self._urgency[queue.astype(np.int64), some] * self._weights[some]
+        # In place, because the arrays are large.
+        worth = offers.packets.take(flown, axis=0)
+        np.minimum(worth, np.where(served[:, some], 0.0, queue)[..., None], out=worth)
+        if offers.holds is not None:
+            worth *= offers.holds.take(flown, axis=0)
+        worth *= urgencies[..., None]
+        worth += self._bonus
+        best, velocity = np.unravel_index(worth.reshape(len(worth), -1).argmax(axis=1), worth.shape[1:])
+        sensor = some[best]
         self._serve(sensor, self._link(uav, sensor, velocity), served)
         self._flown[uav] += velocity
 

@@ -1,0 +1,47 @@
+"""The futures that the rollout evaluator flies candidates through: queues, arrivals and links drawn from the belief."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from shared.channel import FloatArray
+
+if TYPE_CHECKING:
+    from service.deciding.rollout_evaluator import RolloutState
+
+
+@dataclass(frozen=True, slots=True)
+class SampledFutures:
+    """M futures sampled from the belief: queues ``(M, n)``, arrivals ``(H, M, n)``, and the sensors' fades ``(M, n)``.
+
+    A fade is the excess of a sensor's path losses over their means, in standard deviations, the same in all steps:
+    infinite where the radio is dead.
+    """
+
+    start: FloatArray
+    arrivals: FloatArray
+    fades: FloatArray
+
+    @classmethod
+    def of(cls, state: RolloutState, count: int) -> SampledFutures:
+        """Sample futures, each with its own arrival rates, because a rarely heard sensor may fill fast."""
+        scenario, random, shape = (
+            state.scenario,
+            np.random.default_rng(state.seed),
+            (count, len(state.sensors)),
+        )
+        capacity = float(scenario.queue_capacity)
+        rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
+        drawn = random.uniform(scenario.initial_queue_min * capacity, capacity, shape)
+        start = np.where(state.unknown, drawn, state.queue) + random.poisson(rates * state.age)
+        expected = rates
+        if state.dispersion > 1.0:
+            # A Poisson number of a Gamma mean has a variance above its mean.
+            spread = state.dispersion - 1.0
+            expected = random.gamma(np.maximum(rates + state.bursts[:, None], 1e-9) / spread, spread)
+        arrivals = random.poisson(expected, (state.horizon, *shape)).astype(np.float64)
+        fades = np.where(random.uniform(size=shape) < state.alive, random.standard_normal(shape), np.inf)
+        return cls(np.minimum(start, capacity), arrivals, fades)
