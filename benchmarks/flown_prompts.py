@@ -16,7 +16,7 @@ from paper_template import EXPERIENCES, Newest, PaperTemplate
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import candidates_of, template_of
-from service.deciding.rollout_evaluator import RolloutState
+from service.deciding.rollout_state import RolloutState
 from service.llm.request_bodies import chat_body, label_body
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet

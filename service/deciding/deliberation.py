@@ -27,7 +27,8 @@ import numpy as np
 
 from service.deciding.advisers import ADVISERS, SMOOTHING
 from service.deciding.attended_state import AttendedState
-from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
+from service.deciding.rollout_evaluator import Evaluation, evaluate
+from service.deciding.rollout_state import RolloutState
 from service.learning.trust import CAP, LLM, PLANNER, RATE, Advice, Trust
 from service.llm.answers import Completion
 from service.mission.mission import Mission

@@ -11,7 +11,7 @@ model, which is the edge's belief, the best candidate is therefore expected to l
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,177 +19,19 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from service.deciding.rollout_state import RolloutState
 from service.deciding.sampled_futures import SampledFutures
 from shared.actions import Action
 from shared.channel import FloatArray
 from shared.features import VELOCITY_BONUS, urgency
-from shared.fleetplan import FleetBelief
-from shared.fleetplan.arrivals import Arrivals
-from shared.guidance import NO_GUIDANCE, Guidance, Waiting
-from shared.scenario import Scenario
+from shared.guidance import Waiting
 
-# Steps. Losses after the horizon do not count, because the positions where look-ahead leaves the UAVs are arbitrary.
-# The planner's horizon has four more steps without visits. With these the evaluator rated a planner's action 1.3
-# packets a decision worse than the best and random actions 2.2; without them 0.4 and 1.1 (240 decisions on 8 worlds of
-# scenario `paper`, without the plan).
-_HORIZON = 8
 # Sampled futures. All candidates are flown through the same ones, so that arrivals cause no difference between them. On
 # 8 worlds of scenario `paper`, flying the best candidate of an earlier evaluator lost 38 packets with 8 futures, 33
 # with 24 and 30 with 48.
 _FUTURES = 48
-# Array entries of one evaluation, about 5 ns each; larger worlds get fewer futures.
+# Array entries of one evaluation, with the sensors out of reach; larger worlds get fewer futures.
 _MAX_ENTRIES = 20_000_000
-_MAX_SENSORS = 64
-_MAX_UAVS = 10
-
-
-@dataclass(frozen=True, slots=True)
-class RolloutState:
-    """A copy of the belief for the evaluation of one UAV's candidates, so that another thread may evaluate.
-
-    Attributes:
-        sensors: shape ``(n,)``, IDs of the simulated sensors: those in reach of a UAV within the horizon.
-        queue: shape ``(n,)``, the last known packets.
-        unknown: shape ``(n,)``, whether the queue is unknown and is sampled as the world samples it.
-        age: shape ``(n,)``, steps since the queue was known.
-        arrived, watched: shape ``(n,)``, shape and rate of the Gamma belief of the packets a step.
-        dispersion: the variance of the packets of a step over a Poisson's.
-        bursts: shape ``(horizon, n)``, packets above the rate that are expected in each step.
-        links: by UAV, shape ``(horizon x max_velocity + 1, n)``: the packets that the UAV can move over a link that
-            holds, by the sum of its velocities so far.
-        margins: by UAV, of the same shape: the link's path loss below the threshold, in standard deviations of its
-            uncertainty; empty if the links are certain.
-        holds: by UAV, of the same shape: the probability that the link holds; empty if the links are certain.
-        alive: shape ``(n,)``, the probability that each sensor's radio works.
-        decided: the velocities of the UAVs that already have a decision in this step.
-        reserved: shape ``(n,)``, sensors that other UAVs have in this step.
-        plans: by UAV, shape ``(steps, 2)``: planned sensors, as indices into ``sensors`` (-1: none), and velocities.
-        guidance: the confirmed guidance.
-        visited: shape ``(J,)``, the step of each sensor's last visit.
-    """
-
-    scenario: Scenario
-    uav: int
-    horizon: int
-    seed: tuple[int, int, int]
-    sensors: NDArray[np.int64]
-    queue: FloatArray
-    unknown: NDArray[np.bool_]
-    age: NDArray[np.int64]
-    arrived: FloatArray
-    watched: FloatArray
-    dispersion: float
-    bursts: FloatArray
-    links: dict[int, FloatArray]
-    margins: dict[int, FloatArray]
-    holds: dict[int, FloatArray]
-    alive: FloatArray
-    decided: dict[int, int]
-    reserved: NDArray[np.bool_]
-    plans: dict[int, NDArray[np.int64]]
-    guidance: Guidance
-    step: int
-    visited: NDArray[np.int64]
-
-    @property
-    def rates(self) -> FloatArray:
-        """Packets a step that are expected, ``(n,)``."""
-        return self.arrived / self.watched
-
-    @classmethod
-    def of(
-        cls,
-        belief: FleetBelief,
-        scenario: Scenario,
-        step: int,
-        uav: int,
-        *,
-        seed: int = 0,
-        reserved: Collection[int] = (),
-        plans: Mapping[int, NDArray[np.int64] | Sequence[Action]] | None = None,
-        guidance: Guidance = NO_GUIDANCE,
-    ) -> RolloutState:
-        """The state before this UAV's decision at this step; ``plans`` are the fleet's from this step on."""
-        horizon = _horizon(scenario, step)
-        # Any subset of UAVs will do, because the UAVs' distances change within the horizon.
-        others = [other for other in belief.present(step) if other != uav][: _MAX_UAVS - 1]
-        flown = np.arange(horizon * scenario.max_velocity + 1) * scenario.step_s
-        expected = {i: belief.links(i, flown) for i in (uav, *others)}
-        links = {i: found.packets.astype(np.float64) for i, found in expected.items()}
-        margins = {i: found.margin for i, found in expected.items() if found.margin is not None}
-        sensors = _most_urgent(belief, scenario, step, guidance, links.values())
-        decided = belief.decided(step)
-        flying = [(decided[other], expected[other].likely) for other in set(decided) & set(others)]
-        moved = [(sensor, int(likely[velocity, sensor])) for (sensor, velocity), likely in flying]
-        queue, age, unknown, visited = _after(belief, step, moved)
-        burst = belief.arrivals.burst(step)[sensors] * Arrivals.burst_over(np.arange(horizon + 1)[:, None])
-        return cls(
-            scenario=scenario,
-            uav=uav,
-            horizon=horizon,
-            seed=(seed, step, uav),
-            sensors=sensors,
-            queue=queue[sensors],
-            unknown=unknown[sensors],
-            age=age[sensors],
-            arrived=belief.arrivals.arrived[sensors],
-            watched=belief.arrivals.watched[sensors],
-            dispersion=belief.arrivals.dispersion,
-            bursts=np.diff(burst, axis=0),
-            links={i: table[:, sensors] for i, table in links.items()},
-            margins={i: table[:, sensors] for i, table in margins.items()},
-            holds={i: expected[i].hold[:, sensors] for i in margins},
-            alive=belief.channel.failures.alive(sensors),
-            decided={i: decided[i][1] for i in others if i in decided},
-            reserved=np.isin(sensors, list(reserved)),
-            plans={i: _indexed(sensors, actions[:horizon]) for i, actions in (plans or {}).items() if i in links},
-            guidance=guidance,
-            step=step,
-            visited=visited,
-        )
-
-
-def _horizon(scenario: Scenario, step: int) -> int:
-    left = scenario.steps - step
-    # A fleet may fly on past the scenario's last step.
-    return min(_HORIZON, left) if left > 0 else _HORIZON
-
-
-def _after(
-    belief: FleetBelief, step: int, moved: Sequence[tuple[int, int]]
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]]:
-    """Queues, their ages, whether they are unknown, and last visits, ``(J,)`` each, after the step's decisions.
-
-    Args:
-        moved: the sensors that other UAVs have in this step, with the packets that they move.
-    """
-    # Nothing can be collected from a sensor with a flat battery, so its losses do not distinguish candidates.
-    queue = np.where(belief.battery > 0, belief.base, 0.0)
-    age = np.maximum(step - belief.since, 0)
-    unknown = (belief.base_variance > 0) & (belief.battery > 0)
-    visited = belief.visited.copy()
-    for sensor, link in moved:
-        queue[sensor] = max(0.0, float(belief.queue(step)[sensor] - link))
-        age[sensor], unknown[sensor] = 0, False
-        if link > 0:
-            visited[sensor] = step
-    return queue, age, unknown, visited
-
-
-def _most_urgent(
-    belief: FleetBelief, scenario: Scenario, step: int, guidance: Guidance, links: Iterable[FloatArray]
-) -> NDArray[np.int64]:
-    """The sensors in reach by these links that overflow soonest, after those with a visit interval in the guidance."""
-    reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links], axis=0))
-    room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.arrivals.rate, 1e-9)
-    room = np.where(np.isfinite(guidance.every(scenario.sensors)), -np.inf, room)
-    return np.sort(reached[np.argsort(room[reached], kind="stable")[:_MAX_SENSORS]])
-
-
-def _indexed(sensors: NDArray[np.int64], actions: NDArray[np.int64] | Sequence[Action]) -> NDArray[np.int64]:
-    """A plan's actions with indices into ``sensors`` in place of IDs, ``(steps, 2)``."""
-    index = {int(sensor): row for row, sensor in enumerate(sensors)}
-    return np.array([(index.get(j, -1), v) for j, v in actions], dtype=np.int64).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from service.deciding.rollout_state import RolloutState
 from shared.channel import FloatArray
-
-if TYPE_CHECKING:
-    from service.deciding.rollout_evaluator import RolloutState
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,8 @@ import numpy as np
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import candidates_of, template_of
-from service.deciding.rollout_evaluator import RolloutState, evaluate
+from service.deciding.rollout_evaluator import evaluate
+from service.deciding.rollout_state import RolloutState
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
 from service.prompting.compact_prompt import SIGNS, failing_signs, sign

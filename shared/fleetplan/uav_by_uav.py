@@ -270,8 +270,7 @@ class _Ways:
         if after is None:
             return np.zeros(len(self.scores), dtype=np.float32)
         stage = np.minimum(after.stages[self._uav][self.places], others)
-        changed = (stage != assumed).any(axis=0)
-        far = changed.copy()
+        far = np.asarray((stage != assumed).any(axis=0))
         far[self._near] = False
         total = self._above(self.odds, self._near, stage, assumed)
         if far.any():

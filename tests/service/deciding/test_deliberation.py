@@ -16,7 +16,8 @@ from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import Deliberation, LlmAdvice
 from service.deciding.llm_query import LlmQueries
-from service.deciding.rollout_evaluator import Evaluation, RolloutState, evaluate
+from service.deciding.rollout_evaluator import Evaluation, evaluate
+from service.deciding.rollout_state import RolloutState
 from service.deciding.stopwatch import Deadline
 from service.learning.trust import LLM
 from service.mission.mission import Mission

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.deciding.rollout_evaluator import RolloutState, evaluate
+from service.deciding.rollout_evaluator import evaluate
+from service.deciding.rollout_state import RolloutState
 from shared.actions import Action
 from shared.channel import FloatArray, channel_gain_db
 from shared.fleetplan import FleetBelief

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from service.config.settings import Settings
 from service.deciding.advisers import look_ahead
 from service.deciding.deliberation import Deliberation
-from service.deciding.rollout_evaluator import RolloutState, evaluate
+from service.deciding.rollout_evaluator import evaluate
+from service.deciding.rollout_state import RolloutState
 from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
