@@ -45,8 +45,8 @@ def trained(options: type[Training], name: str, argv: list[str]) -> int:
 
 
 def _check(args: Training) -> None:
-    if isinstance(args, Distill) and not args.rollouts:
-        raise ValueError("name at least one file of `aicvds explore`")
+    if isinstance(args, Distill) and not args.rollouts and args.begin is None:
+        raise ValueError("name at least one file of `aicvds explore`, or an adapter with --begin")
     for name in ("steps", "batch", "workers"):
         if getattr(args, name, 1) < 1:
             raise ValueError(f"--{name} {getattr(args, name)} is not at least 1")

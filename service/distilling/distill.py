@@ -25,7 +25,7 @@ _EVALUATED = 300
 
 
 def distill(args: Distill, console: Console) -> None:
-    """Train an adapter and write its files.
+    """Train an adapter and write its files; without rollouts, write the earlier adapter's.
 
     Raises:
         OSError, ValueError: a file cannot be read, or has nothing to train on.
@@ -34,6 +34,9 @@ def distill(args: Distill, console: Console) -> None:
     """
     device = prepared(args)
     gguf = embedded_model(Settings())
+    if not args.rollouts:
+        _write_adapter(DecisionStudent(gguf, STATIC, args.rank, device, args.begin), args.out)
+        return
     training: list[PromptExample] = []
     held_out: dict[str, list[PromptExample]] = {}
     with ordered_map(args.workers, args.ray) as each:
@@ -64,9 +67,7 @@ def _report(found: dict[str, Agreement], console: Console) -> None:
 
 
 def _write(student: DecisionStudent, found: dict[str, Agreement], gguf: Path, examples: int, args: Distill) -> None:
-    student.write_peft(args.out / "peft")
-    target = args.out / "adapter.gguf"
-    student.write_gguf(target, DECISIONS)
+    target = _write_adapter(student, args.out)
     card = {
         "prompt_version": PROMPT_VERSION,
         "base": gguf.name,
@@ -82,3 +83,12 @@ def _write(student: DecisionStudent, found: dict[str, Agreement], gguf: Path, ex
         "held_out": {name: asdict(one) for name, one in sorted(found.items())},
     }
     (args.out / "card.json").write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def _write_adapter(student: DecisionStudent, folder: Path) -> Path:
+    """Write the adapter in both formats; returns llama.cpp's file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    student.write_peft(folder / "peft")
+    target = folder / "adapter.gguf"
+    student.write_gguf(target, DECISIONS)
+    return target

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import gguf
@@ -22,6 +23,25 @@ _NAMES = {
     "mlp.down_proj": "ffn_down",
 }
 _HALVES = {"lora_A": "lora_a", "lora_B": "lora_b"}
+_ALPHA = "adapter.lora.alpha"
+
+
+@dataclass(frozen=True)
+class AdapterWeights:
+    """A LoRA adapter's numbers, as peft has them.
+
+    Attributes:
+        weights: by peft's name, A ``(r, in)`` and B ``(out, r)``.
+        alpha: the adapter adds ``alpha / r B A`` to each matrix.
+    """
+
+    weights: dict[str, NDArray[np.float32]]
+    alpha: float
+
+    @property
+    def rank(self) -> int:
+        """``r``."""
+        return next(len(values) for name, values in self.weights.items() if ".lora_A." in name)
 
 
 def write_gguf_adapter(
@@ -46,7 +66,7 @@ def write_gguf_adapter(
     writer = gguf.GGUFWriter(path, "llama")
     writer.add_string("general.type", "adapter")
     writer.add_string("adapter.type", "lora")
-    writer.add_float32("adapter.lora.alpha", alpha)
+    writer.add_float32(_ALPHA, alpha)
     writer.add_uint32(version.key, version.number)
     for name, values in weights.items():
         target, half = _target(name)
@@ -57,6 +77,44 @@ def write_gguf_adapter(
     writer.write_kv_data_to_file()
     writer.write_tensors_to_file()
     writer.close()
+
+
+def read_gguf_adapter(path: Path, *, heads: int, kv_heads: int) -> AdapterWeights:
+    """What :func:`write_gguf_adapter` wrote, in its 16 bits.
+
+    Args:
+        path: the file.
+        heads, kv_heads: the model's attention heads.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no LoRA adapter of a model of architecture ``llama``.
+    """
+    try:
+        reader = gguf.GGUFReader(path)
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{path} is no GGUF file: {error}") from None
+    alpha = reader.get_field(_ALPHA)
+    if alpha is None:
+        raise ValueError(f"{path} is no LoRA adapter")
+    weights = {}
+    for tensor in reader.tensors:
+        name = _peft_name(tensor.name)
+        values = np.asarray(tensor.data, dtype=np.float32)
+        if name.endswith(("q_proj.lora_B.weight", "k_proj.lora_B.weight")):
+            values = _unpermuted(values, heads if "q_proj" in name else kv_heads)
+        weights[name] = values
+    return AdapterWeights(weights, float(alpha.contents()))
+
+
+def _peft_name(name: str) -> str:
+    """peft's name of a tensor that llama.cpp names so."""
+    block, _, rest = name.partition(".")[2].partition(".")
+    for theirs, ours in _NAMES.items():
+        for part, half in _HALVES.items():
+            if rest == f"{ours}.weight.{half}":
+                return f"base_model.model.model.layers.{block}.{theirs}.{part}.weight"
+    raise ValueError(f"{name} is no adapter weight of a model of architecture llama")
 
 
 def _target(name: str) -> tuple[str, str]:
@@ -74,3 +132,9 @@ def _permuted(rows: NDArray[np.float32], heads: int) -> NDArray[np.float32]:
     shape = rows.shape
     halves = rows.reshape(heads, 2, shape[0] // heads // 2, *shape[1:])
     return np.asarray(halves.swapaxes(1, 2).reshape(shape))
+
+
+def _unpermuted(rows: NDArray[np.float32], heads: int) -> NDArray[np.float32]:
+    shape = rows.shape
+    pairs = rows.reshape(heads, shape[0] // heads // 2, 2, *shape[1:])
+    return np.asarray(pairs.swapaxes(1, 2).reshape(shape))

@@ -16,8 +16,9 @@ class Training:
 
     out: Annotated[Path, arg(metavar="FOLDER")]
     """Folder of the examples, the checkpoint and the adapter."""
-    begin: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """A peft/ folder of an earlier run to go on from, with new examples; by default the adapter begins at zero."""
+    begin: Annotated[Path | None, arg(metavar="FOLDER|FILE")] = None
+    """The adapter to go on from, with new examples: an earlier run's peft/ folder, or an adapter.gguf, such as the one
+    that ships. Its rank stays. By default the adapter begins at zero."""
     steps: int = 3000
     """Steps of Adam."""
     batch: int = 16
@@ -48,6 +49,8 @@ class Distill(Training):
     16 decisions takes some 4 s of one core.
 
     The folder gets adapter.gguf for llama.cpp (AICVDS_LLM_ADAPTER), peft/ for vLLM, and card.json with the result.
+
+    With --begin and no recording nothing is trained, and the folder gets the earlier adapter in both formats.
     """
 
     rollouts: Annotated[tyro.conf.Positional[tuple[Path, ...]], arg(metavar="FILE")]

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from service.distilling.gguf_adapter import write_gguf_adapter
+from service.distilling.gguf_adapter import read_gguf_adapter, write_gguf_adapter
 from service.llm.adapter_version import Version
 
 _MATRICES = ["q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj"]
@@ -23,7 +23,11 @@ class Student:
 
     Args:
         static: the prompts' static block.
-        begin: a folder of an earlier adapter.
+        begin: an earlier adapter, as a folder that peft wrote or as a GGUF file; its rank counts.
+
+    Raises:
+        OSError: the earlier adapter cannot be read.
+        ValueError: it is none of this model.
 
     Attributes:
         tokenizer: the model's.
@@ -32,7 +36,7 @@ class Student:
 
     def __init__(self, gguf: Path, static: str, rank: int, device: str, begin: Path | None = None) -> None:
         # Their imports take seconds.
-        from peft import LoraConfig, PeftModel, get_peft_model
+        from peft import LoraConfig, PeftModel, get_peft_model, set_peft_model_state_dict
         from transformers import AutoModelForCausalLM, AutoTokenizer, GgufConfig
 
         self.tokenizer: Any = AutoTokenizer.from_pretrained(gguf.parent, gguf_file=gguf.name)
@@ -46,11 +50,19 @@ class Student:
         with warnings.catch_warnings():
             # peft 0.21 reads an attribute that transformers 5.23 has renamed.
             warnings.filterwarnings("ignore", "`is_gradient_checkpointing` is deprecated", FutureWarning)
-            if begin is None:
-                config = LoraConfig(r=rank, lora_alpha=2 * rank, target_modules=_MATRICES, bias="none")
-                self.model: Any = get_peft_model(base, config)
+            if begin is not None and begin.is_dir():
+                self.model: Any = PeftModel.from_pretrained(base, begin, is_trainable=True)
             else:
-                self.model = PeftModel.from_pretrained(base, begin, is_trainable=True)
+                earlier = None if begin is None else read_gguf_adapter(begin, **_heads(base.config))
+                rank, alpha = (rank, 2.0 * rank) if earlier is None else (earlier.rank, earlier.alpha)
+                config = LoraConfig(r=rank, lora_alpha=round(alpha), target_modules=_MATRICES, bias="none")
+                self.model = get_peft_model(base, config)
+                if earlier is not None:
+                    weights = {name: torch.from_numpy(values) for name, values in earlier.weights.items()}
+                    try:
+                        set_peft_model_state_dict(self.model, weights)
+                    except RuntimeError as mismatch:
+                        raise ValueError(f"{begin} is no adapter of {gguf.name}: {mismatch}") from None
         if device == "cpu":
             # torch's fused attention takes a quarter of a step on a CPU: its backward pass is slow for short prompts.
             self.model.base_model.model.set_attn_implementation("eager")
@@ -108,7 +120,6 @@ class Student:
 
     def write_gguf(self, path: Path, version: Version) -> None:
         """Write the adapter for llama.cpp, with the version of the prompt that it was trained on."""
-        config = self.model.config
         weights = {
             name.replace(".default", ""): weight.detach().float().cpu().numpy()
             for name, weight in self.model.named_parameters()
@@ -119,8 +130,7 @@ class Student:
             weights,
             version,
             alpha=self.model.peft_config["default"].lora_alpha,
-            heads=config.num_attention_heads,
-            kv_heads=config.num_key_value_heads,
+            **_heads(self.model.config),
         )
 
     def _frame(self, static: str) -> tuple[list[int], list[int]]:
@@ -134,6 +144,11 @@ class Student:
         head, _, tail = whole.rpartition(mark)
         before, after = self.tokenizer([head, tail], add_special_tokens=False).input_ids
         return before, after
+
+
+def _heads(config: Any) -> dict[str, int]:
+    """The attention heads of a model."""
+    return {"heads": config.num_attention_heads, "kv_heads": config.num_key_value_heads}
 
 
 def _dtype(device: str) -> torch.dtype:

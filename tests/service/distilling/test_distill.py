@@ -33,6 +33,7 @@ from service.distilling.examples import (
     prompt_examples,
 )
 from service.distilling.examples_file import examples_of
+from service.distilling.gguf_adapter import write_gguf_adapter
 from service.distilling.loss import Outputs, Targets, answer_loss, loss_of
 from service.distilling.options import Distill
 from service.llm.adapter_version import DECISIONS, PROMPT_VERSION, check_adapter
@@ -234,6 +235,44 @@ def test_it_writes_an_adapter_for_llama_cpp_one_for_vllm_and_a_card(distilled: P
     assert (card["prompt_version"], card["steps"]) == (PROMPT_VERSION, 3)
     assert 15 < card["examples"] <= 30
     assert 0.0 <= card["held_out"]["paper unlearned, experienced"]["sensor"] <= 1.0
+
+
+@pytest.mark.long
+def test_an_adapter_goes_on_from_its_gguf_file(changed: tuple[DecisionStudent, Path], tmp_path: Path) -> None:
+    assert main(["--begin", str(changed[1]), "--out", str(tmp_path)]) == 0
+    # Its rank and its scale are the file's, and no number has moved to another place.
+    assert (tmp_path / "adapter.gguf").read_bytes() == changed[1].read_bytes()
+    again = DecisionStudent(embedded_model(Settings()), STATIC, 8, "cpu", tmp_path / "peft")
+    for name, weight in changed[0].model.named_parameters():
+        if "lora_" in name:
+            assert torch.equal(again.model.get_parameter(name), weight.half().float()), name
+
+
+def test_an_adapter_to_go_on_from_has_to_be_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = str(tmp_path / "out")
+    assert main(["--out", out]) == 2
+    assert "name at least one file of `aicvds explore`, or an adapter with --begin" in capsys.readouterr().err
+    wrong = tmp_path / "wrong.gguf"
+    wrong.write_bytes(b"GGUF of something else, but long enough to have a version")
+    assert main(["--begin", str(wrong), "--out", out]) == 2
+    assert f"{wrong} is no GGUF file" in capsys.readouterr().err
+    gguf = embedded_model(Settings())
+    assert main(["--begin", str(gguf), "--out", out]) == 2
+    assert f"{gguf} is no LoRA adapter" in capsys.readouterr().err
+    assert main(["--begin", str(tmp_path / "none.gguf"), "--out", out]) == 2
+    assert "none.gguf" in capsys.readouterr().err
+
+
+def test_an_adapter_of_another_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other.gguf"
+    name = "base_model.model.model.layers.0.mlp.up_proj"
+    weights = {
+        f"{name}.lora_A.weight": np.ones((2, 64), np.float32),
+        f"{name}.lora_B.weight": np.ones((96, 2), np.float32),
+    }
+    write_gguf_adapter(other, weights, DECISIONS, alpha=4.0, heads=9, kv_heads=3)
+    assert main(["--begin", str(other), "--out", str(tmp_path / "out")]) == 2
+    assert f"{other} is no adapter of SmolLM2-135M-Instruct.Q8_0.gguf" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
