@@ -40,7 +40,7 @@ def planned(horizon: RecedingHorizon) -> Plan:
 def test_a_plan_that_is_expected_to_lose_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     horizon = heard(queue=10.0)
     first = planned(horizon)
-    assert first.objective < 0.05
+    assert first.objective < 1e-6
 
     def searched(*_: object, **__: object) -> Plan:
         raise AssertionError("a search that can save nothing")
@@ -56,13 +56,15 @@ def test_over_uncertain_links_it_stays_too(monkeypatch: pytest.MonkeyPatch) -> N
     draft = horizon.draft([0])
     assert draft is not None and draft.problem.chains is not None
     first = planned(horizon)
-    assert first.objective < 0.05
+    assert first.objective < 1e-6
     monkeypatch.setattr("shared.fleetplan.receding.searched", None)
     np.testing.assert_array_equal(planned(horizon).actions, first.actions)
 
 
-def test_a_plan_that_loses_packets_is_searched() -> None:
-    horizon = heard(queue=60.0)
+@pytest.mark.parametrize(("queue", "least"), [(60.0, 0.05), (51.0, 0.005)])
+def test_a_plan_that_loses_packets_is_searched(queue: float, least: float) -> None:
+    # In bursty worlds plans that were expected to lose 0.01 packets, and so stayed, lost a hundred.
+    horizon = heard(queue=queue)
     first = planned(horizon)
-    assert first.objective > 0.05 and first.work > 0.0
+    assert first.objective > least and first.work > 0.0
     assert planned(horizon).work > 0.0
