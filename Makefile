@@ -5,6 +5,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || echo python3)
 TORCH_INDEX ?=
 MINUTES ?= 10
+# Processes that run tests. Many tests wait for leases, time limits and starts of processes, so one more than cores.
+WORKERS ?= $(shell cores=$$(getconf _NPROCESSORS_ONLN); echo $$((cores < 4 ? cores + 1 : 4)))
 IMAGES ?= auto
 AICVDS_BUILD_NETWORK ?= default
 TORCH := $(shell grep '^torch==' constraints.txt)
@@ -42,7 +44,7 @@ install: .venv/installed
 demo: install
 	$(BIN)/aicvds demo --out runs/demo
 
-PYTEST = $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 test: install
 	$(PYTEST)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import gguf
 import numpy as np
@@ -27,21 +28,53 @@ _ALPHA = "adapter.lora.alpha"
 
 
 @dataclass(frozen=True)
-class AdapterWeights:
-    """A LoRA adapter's numbers, as peft has them.
+class GgufAdapter:
+    """A LoRA adapter that :func:`write_gguf_adapter` wrote, in its 16 bits.
 
     Attributes:
-        weights: by peft's name, A ``(r, in)`` and B ``(out, r)``.
+        tensors: by llama.cpp's name, A ``(r, in)`` and B ``(out, r)``.
         alpha: the adapter adds ``alpha / r B A`` to each matrix.
     """
 
-    weights: dict[str, NDArray[np.float32]]
+    tensors: dict[str, NDArray[np.float32]]
     alpha: float
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a file.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is no LoRA adapter.
+        """
+        try:
+            reader = gguf.GGUFReader(path)
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"{path} is no GGUF file: {error}") from None
+        alpha = reader.get_field(_ALPHA)
+        if alpha is None:
+            raise ValueError(f"{path} is no LoRA adapter")
+        tensors = {tensor.name: np.asarray(tensor.data, dtype=np.float32) for tensor in reader.tensors}
+        return cls(tensors, float(alpha.contents()))
 
     @property
     def rank(self) -> int:
         """``r``."""
-        return next(len(values) for name, values in self.weights.items() if ".lora_A." in name)
+        return next(len(values) for name, values in self.tensors.items() if name.endswith("lora_a"))
+
+    def weights(self, heads: int, kv_heads: int) -> dict[str, NDArray[np.float32]]:
+        """By peft's name, A and B, for a model with so many attention heads.
+
+        Raises:
+            ValueError: the adapter is none of a model of architecture ``llama``.
+        """
+        found = {}
+        for ours, values in self.tensors.items():
+            name = _peft_name(ours)
+            if name.endswith(("q_proj.lora_B.weight", "k_proj.lora_B.weight")):
+                values = _unpermuted(values, heads if "q_proj" in name else kv_heads)
+            found[name] = values
+        return found
 
 
 def write_gguf_adapter(
@@ -77,34 +110,6 @@ def write_gguf_adapter(
     writer.write_kv_data_to_file()
     writer.write_tensors_to_file()
     writer.close()
-
-
-def read_gguf_adapter(path: Path, *, heads: int, kv_heads: int) -> AdapterWeights:
-    """What :func:`write_gguf_adapter` wrote, in its 16 bits.
-
-    Args:
-        path: the file.
-        heads, kv_heads: the model's attention heads.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: it is no LoRA adapter of a model of architecture ``llama``.
-    """
-    try:
-        reader = gguf.GGUFReader(path)
-    except (ValueError, IndexError) as error:
-        raise ValueError(f"{path} is no GGUF file: {error}") from None
-    alpha = reader.get_field(_ALPHA)
-    if alpha is None:
-        raise ValueError(f"{path} is no LoRA adapter")
-    weights = {}
-    for tensor in reader.tensors:
-        name = _peft_name(tensor.name)
-        values = np.asarray(tensor.data, dtype=np.float32)
-        if name.endswith(("q_proj.lora_B.weight", "k_proj.lora_B.weight")):
-            values = _unpermuted(values, heads if "q_proj" in name else kv_heads)
-        weights[name] = values
-    return AdapterWeights(weights, float(alpha.contents()))
 
 
 def _peft_name(name: str) -> str:

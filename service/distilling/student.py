@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, from_numpy
 from torch.nn.functional import linear
 
-from service.distilling.gguf_adapter import read_gguf_adapter, write_gguf_adapter
+from service.distilling.gguf_adapter import GgufAdapter, write_gguf_adapter
 from service.llm.adapter_version import Version
 
 _MATRICES = ["q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj"]
@@ -35,6 +35,8 @@ class Student:
     """
 
     def __init__(self, gguf: Path, static: str, rank: int, device: str, begin: Path | None = None) -> None:
+        # To load the model takes longer than to find out that this file is none.
+        earlier = None if begin is None or begin.is_dir() else GgufAdapter.read(begin)
         # Their imports take seconds.
         from peft import LoraConfig, PeftModel, get_peft_model, set_peft_model_state_dict
         from transformers import AutoModelForCausalLM, AutoTokenizer, GgufConfig
@@ -50,19 +52,18 @@ class Student:
         with warnings.catch_warnings():
             # peft 0.21 reads an attribute that transformers 5.23 has renamed.
             warnings.filterwarnings("ignore", "`is_gradient_checkpointing` is deprecated", FutureWarning)
-            if begin is not None and begin.is_dir():
+            if begin is not None and earlier is None:
                 self.model: Any = PeftModel.from_pretrained(base, begin, is_trainable=True)
             else:
-                earlier = None if begin is None else read_gguf_adapter(begin, **_heads(base.config))
                 rank, alpha = (rank, 2.0 * rank) if earlier is None else (earlier.rank, earlier.alpha)
                 config = LoraConfig(r=rank, lora_alpha=round(alpha), target_modules=_MATRICES, bias="none")
                 self.model = get_peft_model(base, config)
-                if earlier is not None:
-                    weights = {name: torch.from_numpy(values) for name, values in earlier.weights.items()}
-                    try:
-                        set_peft_model_state_dict(self.model, weights)
-                    except RuntimeError as mismatch:
-                        raise ValueError(f"{begin} is no adapter of {gguf.name}: {mismatch}") from None
+            if earlier is not None:
+                weights = earlier.weights(**_heads(base.config))
+                try:
+                    set_peft_model_state_dict(self.model, {name: from_numpy(own) for name, own in weights.items()})
+                except RuntimeError as mismatch:
+                    raise ValueError(f"{begin} is no adapter of {gguf.name}: {mismatch}") from None
         if device == "cpu":
             # torch's fused attention takes a quarter of a step on a CPU: its backward pass is slow for short prompts.
             self.model.base_model.model.set_attn_implementation("eager")

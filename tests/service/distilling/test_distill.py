@@ -13,6 +13,7 @@ import httpx
 import numpy as np
 import pytest
 import torch
+from gguf import GGUFWriter
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -64,9 +65,11 @@ def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def distilled(rollouts: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def distilled(rollouts: Path, tmp_path_factory: pytest.TempPathFactory, loaded_once: None) -> Path:
     out = tmp_path_factory.mktemp("runs") / "adapter"
-    distill(Distill(rollouts=(rollouts,), out=out, steps=3, batch=4, rank=2), Console(quiet=True))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.distilling.distill._EVALUATED", 4)
+        distill(Distill(rollouts=(rollouts,), out=out, steps=3, batch=4, rank=2), Console(quiet=True))
     return out
 
 
@@ -256,13 +259,24 @@ def test_an_adapter_to_go_on_from_has_to_be_one(tmp_path: Path, capsys: pytest.C
     wrong.write_bytes(b"GGUF of something else, but long enough to have a version")
     assert main(["--begin", str(wrong), "--out", out]) == 2
     assert f"{wrong} is no GGUF file" in capsys.readouterr().err
-    gguf = embedded_model(Settings())
-    assert main(["--begin", str(gguf), "--out", out]) == 2
-    assert f"{gguf} is no LoRA adapter" in capsys.readouterr().err
+    write_gguf_model(model := tmp_path / "model.gguf")
+    assert main(["--begin", str(model), "--out", out]) == 2
+    assert f"{model} is no LoRA adapter" in capsys.readouterr().err
     assert main(["--begin", str(tmp_path / "none.gguf"), "--out", out]) == 2
     assert "none.gguf" in capsys.readouterr().err
 
 
+def write_gguf_model(path: Path) -> None:
+    """Write a GGUF file that is a model and no adapter, without its tensors."""
+    writer = GGUFWriter(path, "llama")
+    writer.write_header_to_file()
+    writer.write_kv_data_to_file()
+    writer.write_tensors_to_file()
+    writer.close()
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("loaded_once")
 def test_an_adapter_of_another_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = tmp_path / "other.gguf"
     name = "base_model.model.model.layers.0.mlp.up_proj"
@@ -353,6 +367,7 @@ def answered(gguf: Path, adapter: Path | None, text: str, times: int) -> np.ndar
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("loaded_once")
 def test_an_interrupted_training_goes_on_to_the_same_weights(
     rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,7 +30,7 @@ pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 
 
 @pytest.fixture(scope="module")
-def distilled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def distilled(tmp_path_factory: pytest.TempPathFactory, loaded_once: None) -> Path:
     out = tmp_path_factory.mktemp("runs") / "orders"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("service.distilling.distill_orders._EVALUATED", 8)
@@ -44,6 +44,7 @@ def test_the_folder_has_the_adapter_and_its_card(distilled: Path) -> None:
     assert (card["orders_version"], card["steps"], card["held_out_phrasings"]["notes"]) == (ORDERS.number, 3, 8)
 
 
+@pytest.mark.usefixtures("loaded_once")
 def test_a_loss_of_some_steps_falls_and_a_training_goes_on_where_it_was(tmp_path: Path) -> None:
     args = DistillOrders(out=tmp_path, steps=8, batch=4, rank=2, learning_rate=3e-3)
     examples = list(islice(note_examples(7), 4))
