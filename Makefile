@@ -5,8 +5,6 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || echo python3)
 TORCH_INDEX ?=
 MINUTES ?= 10
-# Processes that run tests. Many tests wait for leases, time limits and starts of processes, so one more than cores.
-WORKERS ?= $(shell cores=$$(getconf _NPROCESSORS_ONLN); echo $$((cores < 4 ? cores + 1 : 4)))
 IMAGES ?= auto
 AICVDS_BUILD_NETWORK ?= default
 TORCH := $(shell grep '^torch==' constraints.txt)
@@ -19,7 +17,7 @@ BIN := .venv/bin
 help:
 	@echo "make install   a virtual environment in .venv with everything, and the embedded model"
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
-	@echo "make test      install, run the tests: 4 minutes on 2 cores"
+	@echo "make test      install, run the tests: 8 minutes on 2 cores"
 	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
@@ -44,7 +42,7 @@ install: .venv/installed
 demo: install
 	$(BIN)/aicvds demo --out runs/demo
 
-PYTEST = $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: install
 	$(PYTEST)
