@@ -11,7 +11,7 @@ import pytest
 
 @pytest.fixture(scope="package")
 def loaded_once() -> Iterator[None]:
-    """A student has a copy of the model that the first one read: to read the GGUF file takes half a minute."""
+    """A student has a copy of the model that the first one read: to read the GGUF file takes many seconds."""
     from transformers import AutoModelForCausalLM, AutoTokenizer
 
     with pytest.MonkeyPatch.context() as patch:
