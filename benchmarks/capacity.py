@@ -29,10 +29,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import psycopg
 import tyro
 from fleet import UAVS, Flown, Radio, at_once, paced
+from processor_time import processor_s
 from ratios import ratio_of_medians, shown
 from rich.console import Console
 from rich.table import Table
@@ -105,7 +105,9 @@ class Database:
 
             self._server = get_server(folder, cleanup_mode="delete")
         self.url = str(self._server.get_uri())
-        self.process = psutil.Process(self._server.get_pid())
+        if (process := self._server.get_pid()) is None:
+            raise RuntimeError("PostgreSQL did not start")
+        self.process = process
 
     def counters(self) -> tuple[float, float]:
         """Commits, and bytes of the log."""
@@ -143,7 +145,7 @@ class Site:
             with EdgeClient(f"http://{HOST}:{port}", timeout_s=60) as client:
                 client.wait_ready(120)
             self.ports.append(port)
-            self._processes.append(psutil.Process(process.pid))
+            self._processes.append(process.pid)
 
     def missions(self, port: int, count: int) -> list[Flown]:
         """New missions of one edge."""
@@ -156,22 +158,9 @@ class Site:
     def used(self) -> Used:
         """Since the start."""
         commits, log_bytes = self._database.counters()
-        edge = sum(_processor_s(process) for process in self._processes)
-        return Used(
-            time.perf_counter(), edge, _processor_s(self._database.process), time.process_time(), commits, log_bytes
-        )
-
-
-def _processor_s(process: psutil.Process) -> float:
-    """Processor seconds of a process and its children."""
-    found = 0.0
-    for each in (process, *process.children(recursive=True)):
-        try:
-            times = each.cpu_times()
-        except psutil.NoSuchProcess:
-            continue
-        found += times.user + times.system
-    return found
+        edge = sum(processor_s(process) for process in self._processes)
+        database = processor_s(self._database.process)
+        return Used(time.perf_counter(), edge, database, time.process_time(), commits, log_bytes)
 
 
 def low_pace(site: Site, args: Capacity) -> dict[str, float]:
@@ -271,12 +260,12 @@ def modes(folder: Path, args: Capacity) -> dict[str, dict[str, float]]:
             # The first flight loads what is loaded late.
             for flight in range(args.flights + 1):
                 if flight == 1:
-                    used, began = -_processor_s(psutil.Process(process.pid)), time.perf_counter()
+                    used, began = -processor_s(process.pid), time.perf_counter()
                 options = ["--seed", str(flight), "--await-llm", "on", "--out", str(edge / str(flight))]
                 subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
                 summary = json.loads((edge / str(flight) / "summary.json").read_text())
                 decisions += summary["decisions"] if flight else 0
-            used += _processor_s(psutil.Process(process.pid))
+            used += processor_s(process.pid)
             found[name] = {"edge_s": used / decisions, "decisions_a_s": decisions / (time.perf_counter() - began)}
     return found
 
@@ -323,10 +312,10 @@ def renewal(database: Database, count: int) -> dict[str, float]:
     leases = Leases(engine)
     for number in range(count):
         leases.acquire(f"renewed-{number}", "http://edge:8000", 300)
-    began, before = time.perf_counter(), _processor_s(database.process)
+    began, before = time.perf_counter(), processor_s(database.process)
     for _ in range(_RENEWALS):
         assert len(leases.renew(300)) == count
-    used, took = _processor_s(database.process) - before, time.perf_counter() - began
+    used, took = processor_s(database.process) - before, time.perf_counter() - began
     engine.dispose()
     return {"leases": count, "seconds": took / _RENEWALS, "database_s": used / _RENEWALS}
 

@@ -35,8 +35,8 @@ from typing import Any
 
 import httpx
 import numpy as np
-import psutil
 import tyro
+from processor_time import processor_s
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -167,13 +167,6 @@ def load(target: Target, uavs: list[Uav], seconds: float) -> dict[str, float]:
     p50, p99 = np.percentile(took_ms, [50, 99])
     cpu = busy_s * 1e3 / len(took_ms)
     return {"p50": float(p50), "p99": float(p99), "rps": len(took_ms) / lasted, "cpu": cpu}
-
-
-def processor_s(process: int) -> float:
-    """Seconds of processor time of a process and of those that it started."""
-    first = psutil.Process(process)
-    times = [each.cpu_times() for each in (first, *first.children(recursive=True))]
-    return float(sum(each.user + each.system for each in times))
 
 
 @contextmanager

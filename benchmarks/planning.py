@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 import tyro
-from overhead import edge_of, processor_s
+from overhead import edge_of
+from processor_time import processor_s
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table

@@ -134,12 +134,15 @@ def _target(name: str) -> tuple[str, str]:
 
 
 def _permuted(rows: NDArray[np.float32], heads: int) -> NDArray[np.float32]:
-    shape = rows.shape
-    halves = rows.reshape(heads, 2, shape[0] // heads // 2, *shape[1:])
-    return np.asarray(halves.swapaxes(1, 2).reshape(shape))
+    """Transformers' rows in llama.cpp's order: of each head, the halves' first rows, then their second ones, and on."""
+    return _transposed(rows, heads, 2)
 
 
 def _unpermuted(rows: NDArray[np.float32], heads: int) -> NDArray[np.float32]:
-    shape = rows.shape
-    pairs = rows.reshape(heads, shape[0] // heads // 2, 2, *shape[1:])
-    return np.asarray(pairs.swapaxes(1, 2).reshape(shape))
+    return _transposed(rows, heads, len(rows) // heads // 2)
+
+
+def _transposed(rows: NDArray[np.float32], heads: int, groups: int) -> NDArray[np.float32]:
+    """Within each head, rows ``(groups, n)`` as ``(n, groups)``."""
+    parts = rows.reshape(heads, groups, -1, *rows.shape[1:])
+    return np.asarray(parts.swapaxes(1, 2).reshape(rows.shape))

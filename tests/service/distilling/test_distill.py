@@ -262,6 +262,9 @@ def test_an_adapter_to_go_on_from_has_to_be_one(tmp_path: Path, capsys: pytest.C
     write_gguf_model(model := tmp_path / "model.gguf")
     assert main(["--begin", str(model), "--out", out]) == 2
     assert f"{model} is no LoRA adapter" in capsys.readouterr().err
+    write_gguf_adapter(empty := tmp_path / "empty.gguf", {}, DECISIONS, alpha=4.0, heads=9, kv_heads=3)
+    assert main(["--begin", str(empty), "--out", out]) == 2
+    assert f"{empty} is no LoRA adapter" in capsys.readouterr().err
     assert main(["--begin", str(tmp_path / "none.gguf"), "--out", out]) == 2
     assert "none.gguf" in capsys.readouterr().err
 
