@@ -52,9 +52,9 @@ class GgufAdapter:
         except (ValueError, IndexError) as error:
             raise ValueError(f"{path} is no GGUF file: {error}") from None
         alpha = reader.get_field(_ALPHA)
-        tensors = {tensor.name: np.asarray(tensor.data, dtype=np.float32) for tensor in reader.tensors}
-        if alpha is None or not any(name.endswith("lora_a") for name in tensors):
+        if alpha is None or not any(tensor.name.endswith("lora_a") for tensor in reader.tensors):
             raise ValueError(f"{path} is no LoRA adapter")
+        tensors = {tensor.name: np.asarray(tensor.data, dtype=np.float32) for tensor in reader.tensors}
         return cls(tensors, float(alpha.contents()))
 
     @property
