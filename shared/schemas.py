@@ -12,6 +12,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from shared.names import few_names, plain
+from shared.problem import INCOMPLETE
 from shared.reasons import Reason
 from shared.scenario import Scenario
 
@@ -21,8 +22,6 @@ MAX_STEP = 1_000_000
 MAX_ROUND_TRIP_MS = 600_000.0
 # Characters of an operator's note, which is part of every long prompt.
 MAX_NOTE = 280
-# The type of the problem that the edge does not hold the omitted part of a report: the client is to send it in full.
-INCOMPLETE = "urn:aicvds:problem:incomplete"
 
 
 def _one_paragraph(text: str) -> str:
@@ -385,18 +384,3 @@ class Readiness(Wire):
     standing_by: int = Field(0, description="further healthy LLM servers")
     constraint: str | None = Field(None, description="how the server holds the LLM to the answer's form")
     detail: str | None = None
-
-
-class Problem(BaseModel):
-    """RFC 9457 ``application/problem+json``; ``errors`` names each field at fault."""
-
-    type: str = "about:blank"
-    title: str
-    status: int
-    detail: str
-    errors: list[dict[str, str]] = []
-    owner: str | None = Field(
-        None,
-        exclude_if=lambda value: value is None,
-        description="of a 421: the URL of the edge that has the mission; the header Location has the whole address",
-    )

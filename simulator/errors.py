@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.schemas import Problem
+from shared.problem import Problem
 
 
 class UsageError(Exception):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Any
 
+from shared.problem import Problem
 from shared.scenario import SCENARIOS
-from shared.schemas import Problem
 
 Example = dict[str, Any]
 

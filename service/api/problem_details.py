@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 
 from service.errors import Misdirected, Refused, Unavailable
 from shared.guidance import Guidance, GuidanceAnswer, SensorWish
+from shared.problem import Problem
 from shared.readings import ReadingsRequest, SensorReading
 from shared.scenario import Scenario
 from shared.schemas import (
@@ -23,7 +24,6 @@ from shared.schemas import (
     DecideRequest,
     FeedbackRequest,
     MissionSpec,
-    Problem,
     PromptStyle,
     SensorColumns,
 )

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from service.lorawan.counts import Counts
 from service.lorawan.waiting_readings import Intake, Waiting
+from shared.problem import Problem
 from shared.readings import MAX_AGE_S, ReadingsRequest, ReadingsResponse, SensorReading
-from shared.schemas import Problem
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
-from shared.schemas import Problem
+from shared.problem import Problem
 
 log = logging.getLogger(__name__)
 

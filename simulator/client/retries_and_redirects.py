@@ -22,9 +22,9 @@ from pydantic import BaseModel, ValidationError
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
+from shared.problem import INCOMPLETE, Problem
 from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.schemas import (
-    INCOMPLETE,
     MAX_ROUND_TRIP_MS,
     BatchRequest,
     BatchResponse,
@@ -34,7 +34,6 @@ from shared.schemas import (
     FeedbackResponse,
     MissionSpec,
     Outcome,
-    Problem,
     Readiness,
     UavState,
     Uplink,

@@ -16,6 +16,7 @@ from starlette.routing import Route
 
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionStatus
+from shared.problem import Problem
 from shared.scenario import Scenario, scenario_named
 from shared.schemas import (
     BatchRequest,
@@ -26,7 +27,6 @@ from shared.schemas import (
     FeedbackRequest,
     FeedbackResponse,
     MissionSpec,
-    Problem,
     Readiness,
     Tokens,
 )

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from shared.schemas import INCOMPLETE
+from shared.problem import INCOMPLETE
 from tests.service.keeping import running
 
 Body = dict[str, Any]

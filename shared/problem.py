@@ -1,0 +1,23 @@
+"""Errors on the wire: what every answer of the edge outside 2xx has in its body."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, Field
+
+# The type of the problem that the edge does not hold the omitted part of a report: the client is to send it in full.
+INCOMPLETE = "urn:aicvds:problem:incomplete"
+
+
+class Problem(BaseModel):
+    """RFC 9457 ``application/problem+json``; ``errors`` names each field at fault."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    errors: list[dict[str, str]] = []
+    owner: str | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="of a 421: the URL of the edge that has the mission; the header Location has the whole address",
+    )
