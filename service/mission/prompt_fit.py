@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from service.config.prompt_budget import prompt_tokens
 from service.errors import Refused
 from service.learning.modules import Weights
+from service.llm.adapter_version import TRAINED_ROWS
 from service.mission.resolved_spec import ResolvedSpec
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.demonstrations import solved
@@ -84,6 +85,15 @@ class PromptFit:
             "prompt",
             f"{shown} and {self._rows} sensors as {style.format} need up to {self._needed()} tokens "
             f"and AICVDS_LLM_CONTEXT is {self.context}: raise it, or lower {lower} or top_k",
+        )
+
+    def warning(self) -> str | None:
+        """What speaks against these prompts although the LLM can answer them."""
+        if not self._compact or self._rows <= TRAINED_ROWS:
+            return None
+        return (
+            f"its prompts have {self._rows} sensors, and the adapter was trained on {TRAINED_ROWS}: "
+            f"the LLM decides far better with attention and top_k {TRAINED_ROWS}"
         )
 
     def _needed(self, uavs: int = 1) -> int:
