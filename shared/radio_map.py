@@ -134,7 +134,7 @@ class RadioMap:
         new[:, _PLACE], new[:, _EXCESS], new[:, _NOISE], new[:, _TAKEN] = place, excess, 1.0, self.heard
         east, north = kept[:, :, 0] - new[:, :1], kept[:, :, 1] - new[:, 1:2]
         apart = east * east + north * north
-        slot, dropped = self._slots(kept, count, apart)
+        slot, dropped = _slots(kept, count, apart, self._kept.shape[1], self.heard)
         inverse = None if self.exact else self._replace(kept, new, slot, dropped, self._inverses(ids, size), apart)
         kept[np.arange(len(ids)), slot] = new
         self.count[ids] += ~dropped
@@ -173,7 +173,7 @@ class RadioMap:
             apart: shape ``(n, size)``, squared distances of the kept measurements from the new ones, square metres.
         """
         rows, fading = np.arange(len(kept)), self.kind.fading
-        covariance = self._covariance(np.sqrt(apart))
+        covariance = self.kind.covariance(np.sqrt(apart))
         left = kept[:, :, _MEASURED] - self.offset_db * kept[:, :, _ONES]
         known = (covariance[:, None] @ inverse)[:, 0]
         share = np.maximum(1.0 - (known * covariance).sum(axis=1), fading)
@@ -194,19 +194,6 @@ class RadioMap:
         inverse += known[:, :, None] * (known / free[:, None])[:, None, :]
         return inverse
 
-    def _slots(self, kept: FloatArray, count: IntArray, apart: FloatArray) -> tuple[IntArray, NDArray[np.bool_]]:
-        """The slot of each sensor that takes a new measurement, and whether it drops another for it.
-
-        Two measurements of the same place are kept. A third drops the oldest, so that no wrong one stays. A full record
-        without any of the place drops the nearest one, which tells the most of what the new one tells.
-        """
-        apart = np.where(np.arange(kept.shape[1]) < count[:, None], apart, np.inf)
-        same = apart <= _SAME_PLACE_M**2
-        full = count == self._kept.shape[1]
-        repeated = same.sum(axis=1) >= np.where(full, 1, _MOST_OF_PLACE)
-        oldest = np.where(same, kept[:, :, _TAKEN], self.heard).argmin(axis=1)
-        return np.where(repeated, oldest, np.where(full, apart.argmin(axis=1), count)), repeated | full
-
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
         shape = (len(places), len(which))
@@ -219,7 +206,7 @@ class RadioMap:
         known_at = self._kept.take(which, 0)[:, :kept]
         east, north = (places[None, :, None, axis] - known_at[:, None, :, axis] for axis in (0, 1))
         # (n, P, kept)
-        covariance = self._covariance(np.sqrt(east * east + north * north))
+        covariance = self.kind.covariance(np.sqrt(east * east + north * north))
         left = known_at[:, :, _MEASURED] - offset * known_at[:, :, _ONES]
         mean = offset + np.matmul(covariance, left[..., None])[..., 0]
         known = (covariance @ self._inverses(which, kept) * covariance).sum(axis=2)
@@ -245,7 +232,9 @@ class RadioMap:
             self._inverse = np.zeros((len(self._kept), most * (most + 1) // 2))
         if size := int(self.count[ids].max(initial=0)):
             used = np.arange(size) < self.count[ids, None]
-            inverse: FloatArray = np.linalg.inv(self._covariances(ids, size)).astype(np.float64, copy=False)
+            apart = _distances(self.places[ids, :size])
+            covariances = self.kind.covariances(apart, used, self.noise[ids, :size])
+            inverse: FloatArray = np.linalg.inv(covariances).astype(np.float64, copy=False)
             self._pack(ids, inverse * (used[:, :, None] & used[:, None, :]))
             self._kept[ids, :size, _MEASURED:] = _solved(self._inverses(ids, size), self._kept[ids, :size])
         self._estimate()
@@ -258,32 +247,13 @@ class RadioMap:
         weight = PRIOR_WEIGHT + int(self.count.sum())
         self.deviation_db = float(np.sqrt((PRIOR_WEIGHT * PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
 
-    def _covariance(self, apart_m: FloatArray) -> FloatArray:
-        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
-        kind = self.kind
-        return kind.sensor + kind.place * np.exp(-apart_m / kind.range_m)
-
-    def _covariances(self, ids: IntArray, kept: int) -> FloatArray:
-        """``K``, ``(n, kept, kept)``; the rows without a measurement are the identity's."""
-        used = np.arange(kept) < self.count[ids, None]
-        matrix = self._covariance(self._apart(ids, kept)) * (used[:, :, None] & used[:, None, :])
-        diagonal = 1.0 + self.kind.fading * (self.noise[ids, :kept] - 1.0)
-        matrix[:, np.arange(kept), np.arange(kept)] = np.where(used, diagonal, 1.0)
-        return np.asarray(matrix)
-
-    def _apart(self, ids: IntArray, kept: int) -> FloatArray:
-        """Distances between the places of each sensor's measurements, ``(n, kept, kept)``, metres."""
-        at = self._kept[ids, :kept, _PLACE]
-        east, north = (at[:, :, None, axis] - at[:, None, :, axis] for axis in (0, 1))
-        return np.asarray(np.sqrt(east * east + north * north))
-
     def _compare(self) -> None:
         """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
         every = np.flatnonzero(self.count)
         kept = int(self.count.max())
         used = np.arange(kept) < self.count[every, None]
         excess, noise = self.excess[every, :kept] * used, self.noise[every, :kept]
-        self.kind = KINDS[int(np.argmax(likelihoods(self._apart(every, kept), used, excess, noise)))]
+        self.kind = KINDS[int(np.argmax(likelihoods(_distances(self.places[every, :kept]), used, excess, noise)))]
         self._factor(every)
 
     def state_dict(self) -> dict[str, Any]:
@@ -328,3 +298,32 @@ def _solved(inverse: FloatArray, kept: FloatArray) -> FloatArray:
     both = np.ones((*kept.shape[:2], 2))
     both[..., 0] = kept[:, :, _EXCESS]
     return np.asarray(inverse @ both)
+
+
+def _slots(
+    kept: FloatArray, count: IntArray, apart: FloatArray, most: int, heard: int
+) -> tuple[IntArray, NDArray[np.bool_]]:
+    """The slot of each sensor that takes a new measurement, and whether it drops another for it.
+
+    Two measurements of the same place are kept. A third drops the oldest, so that no wrong one stays. A full record
+    without any of the place drops the nearest one, which tells the most of what the new one tells.
+
+    Args:
+        kept: shape ``(n, size, 7)``, the sensors' measurements.
+        count: shape ``(n,)``, how many of them there are.
+        apart: shape ``(n, size)``, their squared distances from the new ones, square metres.
+        most: measurements that a full record has.
+        heard: measurements so far, of all sensors.
+    """
+    apart = np.where(np.arange(kept.shape[1]) < count[:, None], apart, np.inf)
+    same = apart <= _SAME_PLACE_M**2
+    full = count == most
+    repeated = same.sum(axis=1) >= np.where(full, 1, _MOST_OF_PLACE)
+    oldest = np.where(same, kept[:, :, _TAKEN], heard).argmin(axis=1)
+    return np.where(repeated, oldest, np.where(full, apart.argmin(axis=1), count)), repeated | full
+
+
+def _distances(places: FloatArray) -> FloatArray:
+    """Distances between the places of each sensor's measurements, ``(n, kept, 2)``: ``(n, kept, kept)``, metres."""
+    east, north = (places[:, :, None, axis] - places[:, None, :, axis] for axis in (0, 1))
+    return np.asarray(np.sqrt(east * east + north * north))

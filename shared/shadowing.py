@@ -34,6 +34,20 @@ class Shadowing:
         """The share of the variance that no earlier measurement tells anything about."""
         return 1.0 - self.sensor - self.place
 
+    def covariance(self, apart_m: FloatArray) -> FloatArray:
+        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
+        return self.sensor + self.place * np.exp(-apart_m / self.range_m)
+
+    def covariances(self, apart_m: FloatArray, used: NDArray[np.bool_], noise: FloatArray) -> FloatArray:
+        """The covariances ``K`` of n sensors' measurements, ``(n, kept, kept)``; arguments as of :func:`likelihoods`.
+
+        The rows without a measurement are the identity's.
+        """
+        places = np.arange(used.shape[1])
+        matrices = self.covariance(apart_m) * (used[:, :, None] & used[:, None, :])
+        matrices[:, places, places] = np.where(used, 1.0 + self.fading * (noise - 1.0), 1.0)
+        return np.asarray(matrices)
+
 
 # The likelihood of the measurements chooses between them. The first is the assumption before.
 KINDS = (

@@ -18,6 +18,7 @@ from service.api.authentication import SCOPES
 from service.api.problem_details import documented
 from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
+from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
 from shared.guidance import GuidanceAnswer, GuidanceStatus
 from shared.missions import MissionAttention, MissionStatus
@@ -126,13 +127,13 @@ async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngin
     mission = await engine.missions.put(mission_id, body)
     engine.compiler.compile(mission)
     await engine.durable("mission_id", mission)
-    return mission.status()
+    return status_of(mission)
 
 
 @router.get("/missions/{mission_id}", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
     """Where a mission stands."""
-    return (await engine.missions.get(mission_id)).status()
+    return status_of(await engine.missions.get(mission_id))
 
 
 @router.delete(

@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from service.config.settings import Settings
 from service.errors import Refused
 from service.guidance.operator_guidance import OperatorGuidance
@@ -21,7 +19,6 @@ from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.mission.decisions import PENDING_PER_UAV, Pending, PendingDecisions, Reservation, Reservations
 from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled, ignore_event
 from service.mission.idempotency import IdempotentAnswers
-from service.mission.learned_world_status import learned_world
 from service.mission.planner import Planner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
 from service.mission.reports import Reports
@@ -33,7 +30,7 @@ from shared.actions import Action
 from shared.fleetplan import FleetBelief
 from shared.fleetplan.gain_measurements import Measured
 from shared.guidance import Guidance, GuidanceAnswer
-from shared.missions import MissionStatus, VisitDeadline
+from shared.missions import VisitDeadline
 from shared.readings import ReadingResult, SensorReading
 from shared.records import Records, take_report
 from shared.scenario import Scenario, scenario_named
@@ -266,31 +263,3 @@ class Mission:
         """How the operator's visit orders were kept in the steps that are over."""
         last = self.visit_orders.last
         return self.visit_orders.counts(last - 1 if self.pending.waits_for(last) else last)
-
-    def status(self) -> MissionStatus:
-        """The body of ``GET /missions/{id}``."""
-        visits = self.records.visits
-        return MissionStatus(
-            mission_id=self.mission_id,
-            scenario=self.scenario,
-            mode=self.mode,
-            top_k=self.top_k,
-            attention=self.spec.attention,
-            features=self.features,
-            belief=self.belief_source,
-            planner="off" if self.planner is None else "on",
-            verify=self.spec.verify,
-            prompt=self.spec.prompt,
-            init=self.spec.init,
-            seed=self.spec.seed,
-            note=self.guidance.note,
-            decisions=self.decisions,
-            feedback=self.feedback,
-            experiences=len(self.experiences.block),
-            learner_updates=self.learner.updates,
-            learner_loss=self.learner.last_loss,
-            visits={int(s): int(visits[s]) for s in np.flatnonzero(visits >= 0)},
-            learned=learned_world(self.belief),
-            deadlines=self.deadlines() or None,
-            readings=self.readings.merged or None,
-        )

@@ -2,6 +2,7 @@ import pytest
 
 from service.errors import Conflict, NotFound
 from service.mission.mission import Mission
+from service.mission.mission_status import status_of
 from shared.actions import Action
 from shared.schemas import Outcome
 from tests.service.making import attended, mission, uav
@@ -121,7 +122,7 @@ def test_an_answer_to_an_earlier_attempt_does_not_undo_a_later_one() -> None:
     with pytest.raises(Conflict):
         m.commit(view.pending("b" * 32, Action(1, 7)), slow)
     assert m.reservations.of_others(1, uav_id=1) == {4}
-    assert m.status().visits == {4: 1}
+    assert status_of(m).visits == {4: 1}
 
 
 def test_a_uav_that_asks_again_gives_its_first_sensor_back() -> None:
@@ -129,7 +130,7 @@ def test_a_uav_that_asks_again_gives_its_first_sensor_back() -> None:
     decide(m, 1, step=5, sensor=0)
     decide(m, 2, step=5, sensor=1)
     assert m.reservations.of_others(5, uav_id=1) == {1}
-    assert m.status().visits == {1: 5}
+    assert status_of(m).visits == {1: 5}
 
 
 @pytest.mark.parametrize("order", [(1, 2), (2, 1)])

@@ -10,6 +10,7 @@ import pytest
 from service.errors import Refused
 from service.mission.events import Event, Read
 from service.mission.mission import Mission
+from service.mission.mission_status import status_of
 from shared.actions import Action
 from shared.readings import SensorReading
 from tests.service.making import attended, mission, uav
@@ -40,7 +41,7 @@ def test_a_uav_knows_a_sensor_that_no_uav_has_heard() -> None:
     assert m.belief.base_variance[9] == 0
     # Rolled forward by its age.
     assert m.belief.queue(4)[9] == min(60.0, 55.0 + m.scenario.mean_arrival_rate)
-    assert m.status().readings == 1
+    assert status_of(m).readings == 1
 
 
 def test_a_battery_that_is_not_told_stays_as_it_was() -> None:
@@ -87,7 +88,7 @@ def test_a_reading_from_before_the_first_step_is_a_known_beginning() -> None:
 def test_before_the_first_report_no_age_has_a_step() -> None:
     m = mission()
     assert m.read([reading(age_s=1.0), reading(sensor_id=8, step=0)]) == ["early", "early"]
-    assert m.status().readings is None
+    assert status_of(m).readings is None
 
 
 def test_what_is_older_than_a_beacon_or_a_reading_changes_nothing() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from service.mission import visit_orders
+from service.mission.mission_status import status_of
 from service.mission.visit_orders import VisitOrders
 from shared.guidance import NO_GUIDANCE, Guidance, GuidanceAnswer, SensorWish
 from shared.missions import VisitDeadline
@@ -95,7 +96,7 @@ def test_a_restored_state_is_the_same() -> None:
 
 def test_a_mission_judges_steps_that_are_over() -> None:
     fleet = mission()
-    assert fleet.status().deadlines is None
+    assert status_of(fleet).deadlines is None
     fleet.answer_guidance(GuidanceAnswer(guidance=orders(s4=1)))
     first = decide(fleet, 1, step=0, sensor=4)
     assert lines(fleet.deadlines()) == [(4, 1, 0, None, 0, 0)]
@@ -105,7 +106,7 @@ def test_a_mission_judges_steps_that_are_over() -> None:
     assert lines(fleet.deadlines()) == [(4, 1, 0, None, 0, 1)]
     fleet.apply(outcome(second))
     assert lines(fleet.deadlines()) == [(4, 1, 0, None, 1, 1)]
-    assert fleet.status().deadlines == fleet.deadlines()
+    assert status_of(fleet).deadlines == fleet.deadlines()
 
 
 def test_a_decision_that_another_replaces_is_no_visit() -> None:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.mission.mission_status import status_of
 from service.prompting.experiences import Experience, Experiences
 from shared.actions import Action
 from shared.schemas import MissionSpec, Outcome, PromptStyle, Selection
@@ -163,7 +164,7 @@ def test_what_is_retrieved_stands_in_the_last_block(row_format: str) -> None:
 
 
 def test_a_mission_says_how_it_selects_and_the_service_has_a_default() -> None:
-    assert mission().status().prompt.selection == "recent"
-    assert mission(selection="best").status().prompt.selection == "best"
+    assert status_of(mission()).prompt.selection == "recent"
+    assert status_of(mission(selection="best")).prompt.selection == "best"
     spec = MissionSpec(prompt=PromptStyle(selection="similar"))
-    assert mission(spec, selection="best").status().prompt.selection == "similar"
+    assert status_of(mission(spec, selection="best")).prompt.selection == "similar"

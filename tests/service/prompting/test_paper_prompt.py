@@ -5,6 +5,7 @@ from typing import Any, Literal
 import pytest
 
 from service.errors import Refused
+from service.mission.mission_status import status_of
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt
 from shared.actions import Action
@@ -181,14 +182,14 @@ def test_no_experiences_means_no_block_and_no_word_of_it() -> None:
 def test_a_mission_says_how_many_experiences_it_keeps(told: int | None, kept: int) -> None:
     prompts = flown(105, MissionSpec(prompt=PromptStyle(experiences=told)))
     assert max(len(p.experiences.splitlines()) for p in prompts) == kept
-    status = mission(MissionSpec(prompt=PromptStyle(experiences=told))).status()
+    status = status_of(mission(MissionSpec(prompt=PromptStyle(experiences=told))))
     assert status.prompt.experiences == kept
 
 
 @pytest.mark.parametrize("row_format", FORMATS)
 def test_thirty_experiences_fit_the_embedded_models_context(row_format: Format) -> None:
     spec = MissionSpec(mode="llm", prompt=PromptStyle(format=row_format, experiences=30), top_k=10)
-    assert mission(spec).status().prompt.experiences == 30
+    assert status_of(mission(spec)).prompt.experiences == 30
 
 
 @pytest.mark.parametrize(

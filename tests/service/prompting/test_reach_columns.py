@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.deciding.attended_state import AttendedState
+from service.mission.mission_status import status_of
 from service.prompting.row_formats import columns
 from shared.channel import link_holds, packets_per_step
 from shared.features import FEATURES, LEVEL_FEATURES, distances_between, places_ahead
@@ -169,7 +170,7 @@ def test_every_scenario_flies_with_it(scenario: str) -> None:
     sensor, velocity = view.best_by_value()
     assert sensor in range(6)
     assert 0 <= velocity <= 14
-    assert m.status().features == "reach"
+    assert status_of(m).features == "reach"
 
 
 def _presets() -> tuple[Features, Features]:

@@ -15,6 +15,7 @@ import httpx
 import pytest
 
 from service.config.settings import Settings
+from service.mission.mission_status import status_of
 from service.storage import group_commit, journal
 from service.storage.recovery import restore_mission
 from service.storage.store import Store
@@ -56,7 +57,7 @@ def test_what_is_on_disk_is_the_mission_with_and_without_checkpoints(
     after = state(again)
     store.close()
     assert [name for name in before if not same(before[name], after[name])] == []
-    assert again.status() == mission.status()
+    assert status_of(again) == status_of(mission)
 
 
 def test_a_restarted_edge_flies_on(address: str, report: Report) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from service.config.settings import Settings
 from service.mission.mission import Mission
+from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal
 from service.storage.recovery import restore_mission
@@ -83,7 +84,7 @@ def visits(every: int) -> Guidance:
 def the_same(one: Mission, other: Mission) -> None:
     """Both know, tell and predict the same, to the bit."""
     assert same(state(one), state(other))
-    assert one.status() == other.status()
+    assert status_of(one) == status_of(other)
     ways = np.arange(0.0, 1200.0, 10.0)
     for uav in range(PAPER.uavs):
         ours, theirs = one.belief.links(uav, ways), other.belief.links(uav, ways)
@@ -113,7 +114,7 @@ async def test_a_restored_mission_expects_the_same_links(tmp_path: Path, checkpo
     assert kept is not None
     assert (kept.state is not None) == checkpointed and len(kept.events) > 20
     again = restore_mission("test", kept, settings)
-    learned = mission.status().learned
+    learned = status_of(mission).learned
     assert learned is not None
     # The world is one that there is something to learn of.
     assert learned.deviation_db > 2.0 and len(learned.excess_db) >= 4

@@ -16,6 +16,7 @@ from service.config.settings import Settings
 from service.edge.feedback import LearningQueue
 from service.learning.modules import top_k
 from service.mission.mission import Mission
+from service.mission.mission_status import status_of
 from shared.features import FEATURES
 from shared.missions import MissionAttention
 from shared.scenario import SCENARIOS
@@ -83,7 +84,7 @@ def test_weights_are_refreshed_after_some_steps() -> None:
     mission = Mission("m", MissionSpec(), Settings(mode="value"))
     wanted = reports.missing("m", 4, 0)
     assert wanted is not None and wanted.path == "/missions/m"
-    reports.take(0, 4, mission.status(), None)
+    reports.take(0, 4, status_of(mission), None)
     wanted = reports.missing("m", 4, 0)
     assert wanted is not None and (wanted.path, wanted.etag) == ("/missions/m/attention", None)
     reports.take(0, 4, attention_of(mission), '"v1"')
