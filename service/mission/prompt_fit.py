@@ -88,7 +88,7 @@ class PromptFit:
         )
 
     def warning(self) -> str | None:
-        """What speaks against these prompts although the LLM can answer them."""
+        """Why the LLM decides worse by these prompts than it could; None where it does not."""
         if not self._compact or self._rows <= TRAINED_ROWS:
             return None
         return (
