@@ -7,6 +7,7 @@ import json
 import math
 import re
 import shutil
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,9 @@ Body = dict[str, Any]
 
 # No clock decides: a search for a plan ends by the solver's deterministic time, and the deadline is far.
 SETTINGS = {"AICVDS_PLANNER_MS": "60000", "AICVDS_DEADLINE_MS": "60000", "AICVDS_LOG_LEVEL": "warning"}
-# Between machines whose arithmetic differs in the last bits.
-_NEARLY = 1e-4
+# Between machines whose arithmetic differs in the last bits, and between scores that are rounded to four digits: those
+# of a tie may be in another order.
+_NEARLY, _TIE = 1e-4, 2e-4
 
 
 class DrawingLlm(StubLlm):
@@ -135,7 +137,8 @@ def unlike(told: Any, expected: Any, exact: bool, at: str = "") -> list[str]:
     """Where an answer is not as expected; it may have fields more.
 
     Args:
-        exact: to the bit; else numbers nearly, and no digest of what has rounded numbers in it.
+        exact: to the bit; else numbers nearly, candidates of equal scores in any order, and no digest of what has
+            rounded numbers in it.
     """
     if isinstance(expected, dict) and isinstance(told, dict):
         digests = () if exact else ("etag", "prompts", "asked")
@@ -143,9 +146,22 @@ def unlike(told: Any, expected: Any, exact: bool, at: str = "") -> list[str]:
         both = [name for name in expected if name in told and name not in digests]
         return missing + [fault for name in both for fault in unlike(told[name], expected[name], exact, f"{at}.{name}")]
     if isinstance(expected, list) and isinstance(told, list) and len(told) == len(expected):
+        if not exact:
+            told, expected = _ties_in_order(told), _ties_in_order(expected)
         pairs = enumerate(zip(told, expected, strict=True))
         return [fault for place, pair in pairs for fault in unlike(*pair, exact, f"{at}[{place}]")]
     numbers = isinstance(expected, float) and isinstance(told, float)
     if numbers and not exact and math.isclose(told, expected, rel_tol=_NEARLY, abs_tol=_NEARLY):
         return []
     return [] if type(told) is type(expected) and told == expected else [f"{at}: {told!r}, not {expected!r}"]
+
+
+def _ties_in_order(rows: list[Any]) -> list[Any]:
+    """Candidates, best first, those of nearly the same score in the order of their actions; any other list as it is."""
+    if not all(isinstance(row, dict) and row.keys() >= {"score", "sensor_id", "velocity"} for row in rows):
+        return rows
+    ranks = np.cumsum([0.0, *(abs(before["score"] - row["score"]) > _TIE for before, row in pairwise(rows))])
+    order = sorted(
+        range(len(rows)), key=lambda place: (ranks[place], rows[place]["sensor_id"], rows[place]["velocity"])
+    )
+    return [rows[place] for place in order]

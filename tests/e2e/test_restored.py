@@ -34,3 +34,14 @@ def test_the_store_has_checkpoints_and_events_after_them() -> None:
     assert checkpointed - since.keys() and since.keys() - checkpointed and since.keys() & checkpointed
     assert missions == checkpointed | since.keys()
     assert kinds == {"reported", "decided", "settled", "guided", "answered"}
+
+
+def test_another_arithmetic_may_order_a_tie_otherwise_and_nothing_else() -> None:
+    one, two, worse = (
+        {"sensor_id": j, "velocity": 12, "score": score} for j, score in enumerate((-0.5, -0.5001, -0.9))
+    )
+    assert unlike([two, one, worse], [one, two, worse], exact=False) == []
+    assert unlike([two, one, worse], [one, two, worse], exact=True)
+    assert unlike([one, worse, two], [one, two, worse], exact=False)
+    # The sensor of a tie must be there.
+    assert unlike([one, one, worse], [one, two, worse], exact=False)
