@@ -17,7 +17,7 @@ BIN := .venv/bin
 help:
 	@echo "make install   a virtual environment in .venv with everything, and the embedded model"
 	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
-	@echo "make test      install, run the tests: 7 to 11 minutes on 2 cores"
+	@echo "make test      install, run the tests: 4 to 11 minutes on 2 cores"
 	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
