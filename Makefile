@@ -37,6 +37,7 @@ install: .venv/installed
 	rm -rf aic_vds.egg-info
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	$(BIN)/aicvds model fetch
+	$(BIN)/python -c 'from shared.fleetplan.annealing import warm_up; warm_up()'
 	@touch $@
 
 demo: install

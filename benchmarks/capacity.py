@@ -38,8 +38,8 @@ from rich.console import Console
 from rich.table import Table
 from sqlalchemy import create_engine
 
-from service.config.cores import usable_cores
 from service.storage.leases import Leases
+from shared.cores import usable_cores
 from simulator.client import EdgeClient
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 

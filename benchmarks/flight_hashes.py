@@ -12,7 +12,7 @@ A flight repeats to the bit if no wall clock decides. The planner's search has t
 time, and AICVDS_PLANNER_MS of wall clock, which has its largest value here; the deadline is a minute. Requests come one
 after another, so the edge learns from each outcome before the next decision. The radio of `lossy_uplink` draws its
 losses from the seed; its jitter only delays requests, and is off here. A flight in which a clock decided nevertheless
-is an error. Another version of OR-Tools may plan differently. Another processor rounds differently, which seldom
+is an error. Another version of numba may plan differently. Another processor rounds differently, which seldom
 changes a decision.
 """
 

@@ -35,8 +35,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from service.config.cores import usable_cores
 from service.config.settings import Settings
+from shared.cores import usable_cores
 from shared.scenario import Scenario, scenario_named
 
 _NEIGHBOUR = "while True: pass"

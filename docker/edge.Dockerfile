@@ -16,11 +16,10 @@ ARG TORCH_INDEX=""
 RUN pip install --no-deps ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$(grep '^torch==' constraints.txt)"
 COPY pyproject.toml ./
 # Without the source, this installs an empty aic-vds with all its requirements, and the layer stays valid after every
-# edit of the source. Torch's C++ headers and test programs are a fifth of it, and the image compiles nothing. OR-Tools
-# requires pandas.
+# edit of the source. Torch's C++ headers and test programs are a fifth of it, and the image needs none.
 RUN touch README.md LICENSE \
  && pip install --constraint constraints.txt '.[service,planner,mqtt,otel,postgres]' \
- && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test pandas/tests
+ && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test
 
 # Only these files, so that an edit elsewhere does not download the model again.
 FROM dependencies AS model
@@ -29,7 +28,7 @@ COPY service/__init__.py service/
 COPY service/commands/__init__.py service/commands/fetch_model.py service/commands/
 COPY service/llm/__init__.py service/llm/model_file.py service/llm/requantize.py service/llm/
 COPY service/prompting/__init__.py service/prompting/tokenizer.py service/prompting/
-COPY service/config/__init__.py service/config/settings.py service/config/prompt_budget.py service/config/cores.py service/config/
+COPY service/config/__init__.py service/config/settings.py service/config/prompt_budget.py service/config/
 RUN PYTHONPATH=/src AICVDS_CACHE_DIR=/opt/model aicvds model fetch
 
 FROM dependencies AS application
@@ -69,7 +68,9 @@ RUN python -m pip --python /opt/aicvds/bin/python install \
  && rm -r /tmp/wheels
 # A named volume mounted here takes this owner. Without a volume and with a read-only root, missions are not stored.
 RUN install --directory --owner=aicvds --group=aicvds /store
-ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none
+# The planner's search is compiled here, for any processor: with a read-only root every start would compile it again.
+ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none NUMBA_CPU_NAME=generic
+RUN python -c "from shared.fleetplan.annealing import warm_up; warm_up()"
 USER 10001:10001
 COPY docker/check_edge.py /opt/aicvds/
 RUN python /opt/aicvds/check_edge.py

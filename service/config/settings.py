@@ -9,8 +9,8 @@ from typing import Literal, Self
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.config.cores import usable_cores
 from service.config.prompt_budget import prompt_tokens
+from shared.cores import usable_cores
 from shared.schemas import Mode, Selection
 from shared.validation_messages import suggestion
 

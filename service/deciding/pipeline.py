@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from time import perf_counter
 
-from service.config.cores import usable_cores
 from service.config.settings import Settings
 from service.deciding.advisers import look_ahead
 from service.deciding.attended_state import AttendedState
@@ -19,9 +18,11 @@ from service.deciding.modes import modes_by_name
 from service.deciding.stopwatch import Deadline
 from service.mission.events import AdviserReport
 from service.mission.mission import Mission
+from service.mission.planner import prepare
 from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
+from shared.cores import usable_cores
 from shared.guidance import Guidance
 from shared.schemas import Tokens
 
@@ -61,6 +62,8 @@ class Pipeline:
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._evaluating = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="evaluator")
         self._plans: set[asyncio.Task[None]] = set()
+        if settings.planner == "on":
+            self._planning.submit(prepare)
         self._modes = modes_by_name(queries, self._evaluating)
 
     async def decide_one(self, task: DecisionTask) -> Decided:

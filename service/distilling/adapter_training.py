@@ -12,9 +12,9 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
-from service.config.cores import usable_cores
 from service.distilling.batches import Batches
 from service.distilling.options import Training
+from shared.cores import usable_cores
 
 _WARM_UP_STEPS = 30
 _MOST_GRADIENT = 1.0

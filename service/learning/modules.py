@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.config.cores import usable_cores
+from shared.cores import usable_cores
 from shared.features import FEATURES, LEVEL_FEATURES
 from shared.schemas import Features
 

@@ -8,8 +8,7 @@ from collections.abc import Collection
 from concurrent.futures import Executor
 from importlib.util import find_spec
 
-from shared.actions import Action
-from shared.fleetplan import Draft, FleetBelief, Plan, RecedingHorizon
+from shared.fleetplan import Draft, FleetBelief, Found, RecedingHorizon
 from shared.guidance import Guidance
 from shared.scenario import Scenario
 
@@ -21,9 +20,17 @@ MAX_UAVS = 20
 
 
 def can_plan(scenario: Scenario) -> bool:
-    """Whether OR-Tools is installed (extra ``planner``) and the fleet is small enough to plan for."""
+    """Whether numba is installed (extra ``planner``) and the fleet is small enough to plan for."""
     small = scenario.sensors <= MAX_SENSORS and scenario.uavs <= MAX_UAVS
-    return small and find_spec("ortools") is not None
+    return small and find_spec("numba") is not None
+
+
+def prepare() -> None:
+    """Load the search, so that no UAV waits for it; where none has searched before, this compiles it for seconds."""
+    if find_spec("numba") is not None:
+        from shared.fleetplan.annealing import warm_up
+
+        warm_up()
 
 
 class Planner(RecedingHorizon):
@@ -54,7 +61,7 @@ class Planner(RecedingHorizon):
         async with self._lock:
             horizon = self.copy()
 
-            def search() -> tuple[Draft, Plan] | None:
+            def search() -> tuple[Draft, Found] | None:
                 draft = horizon.draft(uavs, reserved)
                 return None if draft is None else (draft, draft.search(max(seconds, 0.01)))
 
@@ -65,15 +72,3 @@ class Planner(RecedingHorizon):
                 return
             if found is not None:
                 self.adopt(*found)
-
-    def action(self, uav: int, reserved: Collection[int] = ()) -> Action | None:
-        """The planned sensor and velocity of a UAV now.
-
-        None without a plan of this step, where nothing is in reach, or where the sensor is reserved meanwhile.
-        """
-        last = self._belief.uavs.get(uav)
-        actions = self.plans.get(uav)
-        if last is None or last.step != self.step or actions is None or not len(actions):
-            return None
-        sensor, velocity = actions[0].tolist()
-        return None if sensor < 0 or sensor in reserved else Action(int(sensor), int(velocity))

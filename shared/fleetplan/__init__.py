@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from shared.fleetplan.belief import FleetBelief
 from shared.fleetplan.greedy import look_ahead
-from shared.fleetplan.problem import Course, FleetProblem, fly, price
+from shared.fleetplan.problem import Course, FleetProblem, Found, fly
 from shared.fleetplan.receding import Draft, RecedingHorizon
-from shared.fleetplan.risk import neglect
 from shared.fleetplan.solver import Budget, Interrupted, News, Plan, least_loss, plan
 
 __all__ = [
@@ -15,6 +14,7 @@ __all__ = [
     "Draft",
     "FleetBelief",
     "FleetProblem",
+    "Found",
     "Interrupted",
     "News",
     "Plan",
@@ -22,7 +22,5 @@ __all__ = [
     "fly",
     "least_loss",
     "look_ahead",
-    "neglect",
     "plan",
-    "price",
 ]

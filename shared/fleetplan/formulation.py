@@ -15,9 +15,6 @@ quick, one for every sensor and every run of steps s..e in which more than W pac
 
 That is, without a visit in these steps the sensor loses the excess.
 
-After the last step a sensor's price depends on the stage of the nearest UAV (:mod:`shared.fleetplan.afterwards`). A UAV
-that ends below stage k (:mod:`shared.fleetplan.endings`) cancels the prices of that stage as a visit does.
-
 Batteries enter only as the packets that each can pay for over its best link, all steps together. This ignores the
 higher cost of a weak link, and so keeps every plan that the world allows: the proven bound stays valid.
 """
@@ -34,15 +31,11 @@ from numpy.typing import NDArray
 from ortools.sat.python import cp_model
 
 from shared.channel import IntArray, rate_bps
-from shared.fleetplan.endings import Endings
 from shared.fleetplan.problem import Course, FleetProblem, fly
 
 # The Booleans that serve a sensor in a step, and the packets that each moves.
 Visits = list[tuple[Any, int]]
 Links = Literal["exact", "cautious", "hopeful"]
-
-# The cost of a lost packet. CP-SAT's objective has integer coefficients, and an expected loss may be a fraction.
-SCALE = 100
 
 
 class Serve(NamedTuple):
@@ -80,21 +73,18 @@ class Formulation:
     def __init__(self, problem: FleetProblem, links: Links = "exact") -> None:
         self.problem = problem
         self._links = links
-        self._neglect = problem.neglect
         self.model = cp_model.CpModel()
         self.flown: list[list[Any]] = []
         self.serves: dict[Serve, Any] = {}
         self._queue: list[list[Any]] = []
         self._lost: list[list[Any]] = []
-        self._costs: list[Any] = []
-        self._endings = Endings(self.model, problem.afterwards)
         for uav in range(problem.uavs):
             self._fly(uav)
         self._exclude()
         visits = self._visits()
         for sensor, affordable in enumerate(_affordable(problem).tolist()):
             self._store(sensor, affordable, visits[sensor])
-        self.model.minimize(_total(self._costs))
+        self.model.minimize(_total(over for lost in self._lost for over in lost))
 
     @cached_property
     def _most(self) -> IntArray:
@@ -131,14 +121,10 @@ class Formulation:
             reached = links[step][start : start + (step + 1 - len(fixed)) * fastest + 1]
             now = model.new_int_var(start, start + len(reached) - 1, f"c_{uav}_{step}")
             velocity = now - (row[-1] if row else 0)
-            if problem.allowed is None:
-                model.add_linear_constraint(velocity, 0, fastest)
-            else:
-                model.add_linear_expression_in_domain(velocity, cp_model.Domain.from_values(problem.levels.tolist()))
+            model.add_linear_constraint(velocity, 0, fastest)
             row.append(now)
             self._serve_within(uav, step, now, np.minimum(reached, self._most[step]), start)
         self.flown.append(row)
-        self._endings.add(row[-1], summed[start:])
 
     def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray, start: int) -> None:
         """Add a Boolean for every sensor that the UAV can serve in this step and for every level of its links."""
@@ -194,7 +180,6 @@ class Formulation:
         self._must_visit(supply, lost, visits, capacity)
         self._queue.append(queue[1:])
         self._lost.append(lost)
-        self._expect(sensor, lost, visits)
 
     def _must_visit(self, supply: list[int], costs: list[Any], visits: list[Visits], room: int) -> None:
         """Let every run of steps without a visit cost the packets that have no room.
@@ -211,42 +196,6 @@ class Formulation:
                     within = _total(literal for step in visits[start:end] for literal, _ in step)
                     self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
 
-    def _expect(self, sensor: int, lost: list[Any], visits: list[Visits]) -> None:
-        """Add one sensor's cost: its weighted loss, or the price of neglecting it if that is more."""
-        neglect, weights = self._neglect, self.problem.weights
-        packet = SCALE if weights is None else round(SCALE * float(weights[sensor]))
-        if neglect is None:
-            self._costs += [packet * over for over in lost]
-            return
-        steps = np.rint(SCALE * neglect[:, :-1, sensor]).astype(int)
-        for step, column in enumerate(steps.T):
-            most = int(column.max(initial=0)) + packet * int(self._overflow[step, sensor])
-            cost = self.model.new_int_var(0, most, "")
-            self.model.add(cost >= packet * lost[step])
-            for since, expected in enumerate(column[: step + 1].tolist()):
-                if expected > (column[since + 1] if since < step else 0):
-                    _charge(self.model, cost, expected, visits[since : step + 1], [])
-            self._costs.append(cost)
-        self._expect_afterwards(sensor, visits)
-
-    def _expect_afterwards(self, sensor: int, visits: list[Visits]) -> None:
-        """Add one sensor's cost after the last step: the price of the stage at which the UAVs end."""
-        after = self.problem.neglect_afterwards
-        assert after is not None
-        prices = np.rint(SCALE * after[:, :, sensor]).astype(int)
-        cost = self.model.new_int_var(0, int(prices.max(initial=0)), "")
-        lower = np.zeros(prices.shape[1], dtype=int)
-        for stage, column in enumerate(prices):
-            near = self._endings.below(stage, sensor)
-            if near is None:
-                break
-            for since, expected in enumerate(column.tolist()):
-                following = column[since + 1] if since + 1 < len(column) else 0
-                if expected > following and expected > lower[since]:
-                    _charge(self.model, cost, expected, visits[since:], near)
-            lower = column
-        self._costs.append(cost)
-
     def hint(self, actions: IntArray) -> None:
         """Let the search start from these actions ``(H, I, 2)``, which begin with the fixed ones."""
         course = fly(self.problem, actions)
@@ -255,7 +204,6 @@ class Formulation:
             for step, variable in enumerate(row):
                 if not isinstance(variable, int):
                     self.model.add_hint(variable, int(flown[step, uav]))
-        self._endings.hint(flown[-1])
         served = self._served(actions, course)
         for serve, literal in self.serves.items():
             if not isinstance(self.flown[serve.uav][serve.step], int):
@@ -320,12 +268,6 @@ def _affordable(problem: FleetProblem) -> IntArray:
     # The lower limit is that of the flown world, for a world so noisy that no packet arrives.
     joules = world.transmit_power_w * world.packet_bits / max(float(rate_bps(0.0, world)), 1e-12)
     return np.asarray(np.floor(np.minimum(problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
-
-
-def _charge(model: cp_model.CpModel, cost: Any, expected: int, visits: list[Visits], near: list[Any]) -> None:
-    """Let a cost be at least the expected one, unless a visit, or a UAV that ends near, cancels it."""
-    made = [literal for now in visits for literal, _ in now]
-    model.add(cost + expected * _total([*made, *near]) >= expected)
 
 
 def _total(terms: Iterable[Any]) -> Any:

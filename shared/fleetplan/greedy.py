@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from shared.channel import FloatArray, IntArray
 from shared.fleetplan.problem import FleetProblem
-from shared.fleetplan.risk import normal_below
 from shared.scenario import Scenario
 
 # The worth of a metre a second in urgent packets: while a UAV dwells at few packets, sensors further on overflow.
 _VELOCITY_BONUS = 0.5
+_erf = np.frompyfunc(math.erf, 1, 1)
 
 
 def look_ahead(problem: FleetProblem) -> IntArray:
@@ -58,10 +58,15 @@ def look_ahead(problem: FleetProblem) -> IntArray:
     return actions
 
 
+def _normal_below(z: FloatArray) -> FloatArray:
+    """``Phi(z)`` by the standard library: planning needs no scipy."""
+    return np.asarray(0.5 * (1.0 + np.asarray(_erf(z / math.sqrt(2.0)), dtype=np.float64)))
+
+
 def _urgency(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArray:
     arrived = np.maximum(rate * world.overflow_horizon_steps, 1e-9)
     room = world.queue_capacity - queue
-    return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * normal_below((arrived - room) / np.sqrt(arrived)))
+    return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * _normal_below((arrived - room) / np.sqrt(arrived)))
 
 
 def _expected(problem: FleetProblem, uav: int, velocity: IntArray, step: int) -> IntArray | FloatArray:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.channel import FloatArray, IntArray, link_holds, packets_per_step, rate_bps
-from shared.fleetplan.afterwards import Afterwards
 from shared.fleetplan.queue_chains import QueueChains
 from shared.scenario import Scenario
 from shared.trajectory import Trajectory
@@ -31,24 +30,21 @@ class FleetProblem:
         fixed: by UAV, its first actions ``(n, 2)`` (sensor, velocity), n at most H, which begin every plan.
         usable: shape ``(H, J)``, whether a plan may serve a sensor in a step; ``None``: always. Fixed actions need not
             obey it.
-        risk: shape ``(H + 1, H + 1, J)``, for uncertain arrivals: ``risk[s, e]`` is each sensor's expected loss in
-            step e (H stands for all later steps) if no UAV has visited it since step s began. Its last visit was then
-            in step s - 1 and emptied it; s = 0 means before the plan. Only s <= e counts. ``None``: arrivals are
-            certain.
         allowed: shape ``(V,)``, whether a plan may fly each velocity 0..V - 1; ``None``: all. Fixed actions need not
             obey it.
         weights: shape ``(J,)``, the factor of each sensor's lost packets; ``None``: 1.
-        late: shape ``(H + 1, H + 1, J)`` as ``risk``: the price in packets of not visiting a sensor for so long,
-            beside its losses. Never less for an earlier s. ``None``: 0.
+        late: shape ``(H + 1, H + 1, J)``: ``late[s, e]`` is the price in packets, beside its losses, of each sensor's
+            lateness in step e (H stands for all later steps) if no UAV has visited it since step s began; s = 0 means
+            before the plan. Only s <= e counts. Never less for an earlier s. ``None``: 0.
         links: by UAV, shape ``(1, C, J)`` or, if they change by the step, ``(H, C, J)``: the whole packets that a step
             can move over the link after steps whose velocities sum to c, 0 where the link fails, with C at least
             ``H max_velocity + 1``. ``None``: by the formula.
-        chances: of the same shapes as ``links``: the probability that each link holds. A transfer then moves the share
-            ``chance`` of its packets, the expected ones. ``None``: 1.
-        afterwards: the risk after the horizon by the UAVs' last places, in place of ``risk[:, H]``; it needs a
-            ``risk``. ``None``: wherever the UAVs are, the risk is that.
-        chains: the queues' distributions, for a search of plans over uncertain links; the last sensor is then one
-            nowhere. ``None``: a plan is priced by its expected queues and the risk.
+        chances: of the same shapes as ``links``: the probability that each link holds. ``None``: 1.
+        chains: the queues' distributions, by which a search prices its plans; the last sensor is then one nowhere.
+            ``None``: a plan is priced by ``queue`` and ``arrivals``.
+        stages: by UAV, shape ``(C, J)``: after velocities that sum to c, the stage of ``chains`` whose losses after the
+            horizon count, higher the more steps the UAV needs to each sensor. The lowest of all UAVs counts. ``None``:
+            the first one.
 
     Raises:
         ValueError: a shape or a value is wrong; the message names the field.
@@ -63,14 +59,13 @@ class FleetProblem:
     arrivals: IntArray
     fixed: Mapping[int, IntArray] = field(default_factory=dict)
     usable: NDArray[np.bool_] | None = None
-    risk: FloatArray | None = None
     allowed: NDArray[np.bool_] | None = None
     weights: FloatArray | None = None
     late: FloatArray | None = None
     links: Sequence[IntArray] | None = None
     chances: Sequence[FloatArray] | None = None
-    afterwards: Afterwards | None = None
     chains: QueueChains | None = None
+    stages: Sequence[IntArray] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.places)
@@ -89,9 +84,8 @@ class FleetProblem:
             shapes["allowed"] = (self.scenario.max_velocity + 1,)
         if self.weights is not None:
             shapes["weights"] = (count,)
-        for name in ("risk", "late"):
-            if getattr(self, name) is not None:
-                shapes[name] = (self.horizon + 1, self.horizon + 1, count)
+        if self.late is not None:
+            shapes["late"] = (self.horizon + 1, self.horizon + 1, count)
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, must be {shape}")
@@ -103,7 +97,7 @@ class FleetProblem:
         if self.allowed is not None and not self.allowed.any():
             raise ValueError("allowed has no velocity")
         self._check_links(count)
-        self._check_afterwards(count)
+        self._check_stages(count)
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
                 shape = actions.shape
@@ -130,22 +124,19 @@ class FleetProblem:
         if not all(((chance >= 0) & (chance <= 1)).all() for chance in self.chances or ()):
             raise ValueError("chances must be probabilities, 0..1")
 
-    def _check_afterwards(self, count: int) -> None:
-        after = self.afterwards
-        if after is None:
+    def _check_stages(self, count: int) -> None:
+        if self.stages is None:
             return
-        if self.risk is None:
-            raise ValueError("afterwards needs a risk")
-        stages, sums = len(after.risk), self.horizon * self.scenario.max_velocity + 1
-        if not stages or after.risk.shape[1:] != (self.horizon + 1, count):
-            raise ValueError(f"afterwards.risk has shape {after.risk.shape}, must be (K, {self.horizon + 1}, {count})")
-        if len(after.stages) != self.uavs:
-            raise ValueError(f"afterwards.stages has tables of {len(after.stages)} UAVs, there are {self.uavs}")
-        for uav, table in enumerate(after.stages):
+        if self.chains is None:
+            raise ValueError("stages needs chains")
+        most, sums = len(self.chains.after), self.horizon * self.scenario.max_velocity + 1
+        if len(self.stages) != self.uavs:
+            raise ValueError(f"stages has tables of {len(self.stages)} UAVs, there are {self.uavs}")
+        for uav, table in enumerate(self.stages):
             if table.shape != (sums, count):
-                raise ValueError(f"afterwards.stages[{uav}] has shape {table.shape}, must be ({sums}, {count})")
-            if table.min() < 0 or table.max() >= stages:
-                raise ValueError(f"afterwards.stages[{uav}] must be stages, 0..{stages - 1}")
+                raise ValueError(f"stages[{uav}] has shape {table.shape}, must be ({sums}, {count})")
+            if table.min() < 0 or table.max() >= most:
+                raise ValueError(f"stages[{uav}] must be stages, 0..{most - 1}")
 
     @property
     def horizon(self) -> int:
@@ -167,23 +158,6 @@ class FleetProblem:
         """The velocities that a plan may fly, slowest first."""
         every = np.arange(self.scenario.max_velocity + 1)
         return every if self.allowed is None else every[self.allowed]
-
-    @property
-    def neglect(self) -> FloatArray | None:
-        """The price of neglecting sensors: the weighted risk and lateness; ``None`` without either."""
-        if self.late is None:
-            return self.risk if self.risk is None or self.weights is None else self.risk * self.weights
-        risk = np.zeros_like(self.late) if self.risk is None else self.risk
-        return self.late + (risk if self.weights is None else risk * self.weights)
-
-    @property
-    def neglect_afterwards(self) -> FloatArray | None:
-        """The price of neglecting sensors after the horizon, by stage: ``(K, H + 1, J)``, K = 1 without stages."""
-        neglect = self.neglect
-        if neglect is None or self.afterwards is None:
-            return None if neglect is None else neglect[None, :, -1]
-        risk = self.afterwards.risk if self.weights is None else self.afterwards.risk * self.weights
-        return risk if self.late is None else risk + self.late[:, -1]
 
     def distance(self, uav: int, velocity: IntArray) -> FloatArray:
         """Horizontal distances to all sensors, metres, ``(..., J)``, after steps whose velocities sum to ``(...)``."""
@@ -219,6 +193,18 @@ class FleetProblem:
         ]
 
 
+class Found(NamedTuple):
+    """A plan found by a search.
+
+    Attributes:
+        actions: shape ``(H, I, 2)``: sensor, velocity.
+        expected_loss: packets, with the price of lateness.
+    """
+
+    actions: IntArray
+    expected_loss: float
+
+
 @dataclass(frozen=True, eq=False)
 class Course:
     """The course of the sensors' queues when a fleet flies its actions.
@@ -246,13 +232,13 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
     link = np.zeros(actions.shape[:2], dtype=np.int64)
     for step, transfers in enumerate(_transfers(problem, actions)):
         left, served = queue[-1].copy(), set[int]()
-        for uav, (sensor, budget, joules, likely) in enumerate(transfers):
+        for uav, (sensor, budget, joules) in enumerate(transfers):
             affordable = int(battery[sensor] / joules + 1e-9)
             if budget is None or sensor in served or affordable < 1:
                 continue
             served.add(sensor)
             link[step, uav] = budget
-            moved = min(int(left[sensor]), _expected(budget, likely), affordable)
+            moved = min(int(left[sensor]), budget, affordable)
             left[sensor] -= moved
             battery[sensor] = max(0.0, float(battery[sensor]) - moved * joules)
         filled = left + problem.arrivals[step]
@@ -261,45 +247,26 @@ def fly(problem: FleetProblem, actions: IntArray) -> Course:
     return Course(np.array(queue), np.array(lost), link)
 
 
-def _expected(packets: int, chance: float) -> int:
-    """The expected packets of a transfer, rounded down."""
-    return packets if chance >= 1.0 else int(packets * chance + 1e-9)
+def with_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
+    """The actions, or full speed and sensor 0 for all UAVs, with the problem's fixed ones at the beginning.
 
-
-def price(problem: FleetProblem, actions: IntArray) -> tuple[int, float]:
-    """The lost packets of actions, and the objective of a plan: weighted losses and expected losses above them.
-
-    The expected loss in a step is the risk since the sensor's last visit. After the horizon the risk is that of each
-    sensor's stage in ``afterwards``. Links are certain: an uncertain one counts as one that holds.
+    The nearest allowed velocity replaces a forbidden one.
     """
-    course = fly(problem, actions)
-    lost = int(course.lost.sum())
-    paid = course.lost if problem.weights is None else course.lost * problem.weights
-    neglect, after = problem.neglect, problem.neglect_afterwards
-    if neglect is None or after is None:
-        return lost, float(paid.sum())
-    stage = np.zeros(problem.sensors, dtype=np.int64)
-    if problem.afterwards is not None:
-        stage = problem.afterwards.stage(actions[:, :, 1].sum(axis=0))
-    at_end = np.take_along_axis(after, stage[None, None, :], axis=0)[0]
-    visits = np.zeros((problem.horizon + 1, problem.sensors), dtype=np.bool_)
-    steps = np.repeat(np.arange(problem.horizon), problem.uavs)
-    visits[steps[served := course.link.ravel() > 0], actions[:, :, 0].ravel()[served]] = True
-    cost = 0.0
-    for step in range(problem.horizon + 1):
-        # visited[s]: whether a visit is in the steps s..e.
-        visited = np.logical_or.accumulate(visits[step::-1], axis=0)[::-1]
-        since = at_end if step == problem.horizon else neglect[: step + 1, step]
-        expected = np.where(visited, 0.0, since).max(axis=0)
-        cost += float((expected if step == problem.horizon else np.maximum(expected, paid[step])).sum())
-    return lost, cost
+    if actions is None:
+        start = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
+        start[:, :, 1] = problem.levels[-1]
+    else:
+        start = actions.copy()
+        start[:, :, 1] = problem.levels[np.abs(start[:, :, 1, None] - problem.levels).argmin(axis=-1)]
+    for uav, fixed in problem.fixed.items():
+        start[: len(fixed), uav] = fixed
+    return start
 
 
-def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float, float]]]:
-    """By step and UAV: sensor, packets of the link (``None``: it does not hold), joules a packet, the link's chance."""
+def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float]]]:
+    """By step and UAV: sensor, packets of the link (``None``: it does not hold), joules a packet."""
     world = problem.scenario
     flown, sensor = np.cumsum(actions[:, :, 1], axis=0), actions[:, :, 0]
-    chance = np.ones(sensor.shape)
     if problem.links is None:
         columns = []
         for uav in range(problem.uavs):
@@ -312,11 +279,9 @@ def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[
         budget = _chosen(problem.links, flown, sensor)
         holds = budget > 0
         joules = world.transmit_power_w * world.step_s / np.maximum(budget, 1)
-        if problem.chances is not None:
-            chance = _chosen(problem.chances, flown, sensor)
     for step in range(len(actions)):
-        rows = zip(*(a[step].tolist() for a in (sensor, holds, budget, joules, chance)), strict=True)
-        yield [(j, packets if held else None, joule, likely) for j, held, packets, joule, likely in rows]
+        rows = zip(*(a[step].tolist() for a in (sensor, holds, budget, joules)), strict=True)
+        yield [(j, packets if held else None, joule) for j, held, packets, joule in rows]
 
 
 def _chosen(tables: Sequence[NDArray[Any]], flown: IntArray, sensor: IntArray) -> NDArray[Any]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, IntArray
+from shared.channel import FloatArray
 
 Floats = NDArray[np.float32]
 
@@ -31,7 +30,7 @@ class QueueChains:
         arrive: shape ``(H, J, G + 1, G + 1)``, the probabilities of a step's arrivals, from level to level.
         lost: shape ``(H, J, G + 1)``, the packets that a step is expected to lose, by the level before its arrivals.
         after: shape ``(K, J, G + 1)``, those that are expected to be lost after the horizon, by the level then and by
-            the stage of :class:`~shared.fleetplan.afterwards.Afterwards`.
+            the stage.
     """
 
     level: float
@@ -39,14 +38,6 @@ class QueueChains:
     arrive: Floats
     lost: Floats
     after: Floats
-
-    def served(self, odds: Floats, levels: IntArray, chance: Floats) -> Floats:
-        """The odds ``(n, G + 1)`` of each level after transfers of ``levels`` ``(n,)`` over links of ``chance``."""
-        count, rows = odds.shape[1] - 1, np.arange(len(odds))
-        left = np.arange(count + 1) + levels[:, None]
-        moved = np.where(left <= count, odds[rows[:, None], np.minimum(left, count)], np.float32(0.0))
-        moved[:, 0] = np.cumsum(odds, axis=1)[rows, levels]
-        return np.asarray(odds + chance[:, None] * (moved - odds))
 
 
 @dataclass(frozen=True)
@@ -62,8 +53,8 @@ def queue_chains(
     base_variance: FloatArray,
     came: Arriving,
     coming: Arriving,
+    later: Arriving,
     capacity: int,
-    beyond: Sequence[int],
     best_chance: FloatArray,
     weights: FloatArray,
 ) -> QueueChains:
@@ -73,9 +64,10 @@ def queue_chains(
         base: the last known packets, ``(J,)``.
         base_variance: their variance, ``(J,)``, of a uniform distribution.
         came: since then, ``(J,)``.
-        coming: in each step of the horizon and in each later one, ``(H + 1, J)``.
+        coming: in each step of the horizon, ``(H, J)``.
+        later: in all the steps after the horizon whose losses count too, by stage, ``(K, J)``, of which each includes
+            those of the stage before.
         capacity: W, packets.
-        beyond: by stage (K), rising: steps after the plan whose losses count too, at least 0.
         best_chance: the share, ``(J,)``, of the losses beyond the first stage's that count.
         weights: the factor of each sensor's lost packets, ``(J,)``.
     """
@@ -85,14 +77,10 @@ def queue_chains(
     start = _uniform(base / level, np.sqrt(3.0 * base_variance) / level, count)
     start = (start[:, None] @ move)[:, 0]
     move, over = _transitions(coming, capacity, count)
-    lost = over * weights[:, None]
-    value, values = np.zeros_like(start), []
-    for _ in range(max(beyond) + 1):
-        values.append(value)
-        value = lost[-1] + (move[-1] @ value[..., None])[..., 0]
-    first = values[beyond[0]]
-    after = np.array([first + best_chance[:, None] * (values[steps] - first) for steps in beyond])
-    whole = (start, move[:-1], lost[:-1], after)
+    # Nobody visits after the horizon, so that all packets above the capacity are lost, in whichever order they come.
+    _, after = _transitions(later, capacity, count)
+    after = after[0] + best_chance[:, None] * (after - after[0])
+    whole = (start, move, over * weights[:, None], after * weights[:, None])
     return QueueChains(level, *(array.astype(np.float32) for array in whole))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass
 from typing import Any, Self
@@ -12,17 +13,15 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from shared.actions import Action
 from shared.channel import FloatArray, IntArray
-from shared.fleetplan.afterwards import Afterwards, steps_to
+from shared.cores import usable_cores
 from shared.fleetplan.arrivals import Arrivals
 from shared.fleetplan.belief import FAR_M, FleetBelief
-from shared.fleetplan.expected_loss import ExpectedLoss
 from shared.fleetplan.greedy import look_ahead
-from shared.fleetplan.problem import FleetProblem, price
+from shared.fleetplan.problem import FleetProblem, Found, with_fixed
 from shared.fleetplan.queue_chains import Arriving, QueueChains, queue_chains
-from shared.fleetplan.risk import neglect
-from shared.fleetplan.solver import Budget, Plan, plan, with_fixed
-from shared.fleetplan.uav_by_uav import searched
+from shared.fleetplan.ways import steps_to
 from shared.guidance import NO_GUIDANCE, Guidance
 from shared.scenario import Scenario
 
@@ -34,11 +33,6 @@ _BEYOND = (4, 7, 10, 13)
 _GOOD_SHARE = 0.7
 # Between two places of the way after the horizon, as a sum of velocities.
 _STRIDE = 4
-# Deterministic seconds of search for a whole fleet's step: the limit, and the average, so that a hard world does not
-# cost a multiple of an easy one. A mission begins with some saved seconds.
-_MOST_WORK = 0.3
-_WORK = 0.1
-_SAVED_WORK = 1.0
 # Larger fleets plan UAV by UAV, each with the others' present plans, and fewer steps ahead.
 _JOINT_UAVS = 4
 _NEAR_HORIZON = 4
@@ -48,6 +42,12 @@ _NEAR_SENSORS = 16
 # `paper` a third are such. With 0.05 two thirds are, but where arrivals come in bursts the expectation is too low, and
 # such plans lost many packets.
 _NEGLIGIBLE = 0.003
+
+
+# By run of the search: from the better start (0) or the worse one, and its first temperature as a share of their loss.
+_RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
+# Packets: the least first temperature, and the expected loss from which more runs than one are worth it.
+_LEAST_HEAT, _WORTH_RUNS = 0.02, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,6 @@ class Draft:
         kept: shape ``(n,)``, IDs of the sensors in the plan; the problem has one more, which is nowhere.
         problem: to solve.
         before: shape ``(H, I, 2)``, the last plan in the problem's terms.
-        work: deterministic seconds that the search may take.
-        saved: whether enough seconds are saved to start the search from the last plan alone.
     """
 
     step: int
@@ -71,58 +69,55 @@ class Draft:
     kept: IntArray
     problem: FleetProblem
     before: IntArray
-    work: float
-    saved: bool
 
-    def search(self, seconds: float = math.inf) -> Plan:
-        """The best plan found within the work and the wall clock, never worse than the search's start.
+    def search(self, seconds: float = math.inf) -> Found:
+        """The best plan found within the wall clock, never worse than the last plan and the greedy one.
 
         The last plan stays, without a search, where it is expected to lose next to nothing.
 
         Raises:
-            ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
+            ModuleNotFoundError: numba is not installed (extra ``planner``).
         """
-        last = with_fixed(self.problem, self.before)
-        if self.problem.chains is not None:
-            return self._search_uncertain(last, seconds)
-        lost, cost = price(self.problem, last)
-        if cost < _NEGLIGIBLE:
-            return Plan(last, lost, cost, 0.0, "FEASIBLE", 0.0, 0.0)
-        start = last
-        if not self.saved:
-            greedy = look_ahead(self.problem)
-            start = greedy if price(self.problem, greedy)[1] < cost else last
-        return plan(self.problem, Budget(work=self.work, seconds=seconds), "cautious", start)
+        # Numba takes half a second to import, and only planning needs it.
+        from shared.fleetplan.annealing import Annealing
 
-    def _search_uncertain(self, last: IntArray, seconds: float) -> Plan:
-        """The plan over uncertain links, from the better of the last plan and the greedy one."""
-        begun = time.perf_counter()
-        loss = ExpectedLoss(self.problem)
-        actions, cost = last, loss.of(last)
-        if cost >= _NEGLIGIBLE:
-            greedy = with_fixed(self.problem, look_ahead(self.problem))
-            actions, cost = searched(loss, [last, greedy], seconds)
-        lost, _ = price(self.problem, actions)
-        return Plan(actions, lost, cost, 0.0, "FEASIBLE", time.perf_counter() - begun, 0.0)
+        until = time.perf_counter() + seconds
+        annealing = Annealing(self.problem)
+        last = annealing.priced(with_fixed(self.problem, self.before))
+        if last.expected_loss < _NEGLIGIBLE:
+            return last
+        greedy = annealing.priced(with_fixed(self.problem, look_ahead(self.problem)))
+        starts = sorted((last, greedy), key=_loss)
+
+        def run(number: int) -> Found:
+            start, heat = _RUNS[number]
+            hot = max(heat * starts[0].expected_loss, _LEAST_HEAT)
+            return annealing.search(starts[start].actions, hot, number, until)
+
+        best = min(starts[0], run(0), key=_loss)
+        if best.expected_loss < _WORTH_RUNS:
+            return best
+        with ThreadPoolExecutor(usable_cores()) as threads:
+            return min([best, *threads.map(run, range(1, len(_RUNS)))], key=_loss)
+
+
+def _loss(found: Found) -> float:
+    return found.expected_loss
 
 
 class RecedingHorizon:
-    """Plan eight steps ahead for the fleet, fly the first, and plan again: with CP-SAT, or UAV by UAV.
+    """Plan eight steps ahead for the fleet, fly the first, and plan again.
 
     The objective is the expected number of packets lost in those steps and, without further visits, in at least four
-    more: as many as the nearest UAV then needs to the sensor, at full speed; see :func:`shared.fleetplan.risk.neglect`
-    and :class:`shared.fleetplan.afterwards.Afterwards`. A plan covers all UAVs that are present; the decisions already
+    more: as many as the nearest UAV then needs to the sensor, at full speed; see
+    :class:`~shared.fleetplan.queue_chains.QueueChains`. A plan covers all UAVs that are present; the decisions already
     made in this step are fixed. Fleets of more than four UAVs plan UAV by UAV, four steps ahead, and for them the four
     steps count alone.
 
-    Where links are uncertain, :func:`shared.fleetplan.uav_by_uav.searched` finds the plan, and the objective is the
-    exact expectation of :class:`shared.fleetplan.expected_loss.ExpectedLoss`.
-
-    The last plan stays where it is expected to lose less than 0.003 packets.
-
-    The solver's deterministic time limits CP-SAT's search, so that a mission repeats to the bit. Steps that are solved
-    early save time for others. Without saved time a short search starts from the better of the last plan and
-    :func:`shared.fleetplan.look_ahead`, and never ends with a worse plan.
+    Simulated annealing (:class:`~shared.fleetplan.annealing.Annealing`) searches in several runs, from the last plan
+    and from that of :func:`shared.fleetplan.look_ahead`: one where the plan is then expected to lose less than 0.1
+    packets, else six, on as many cores as there are. The last plan stays where it is expected to lose less than 0.003
+    packets. A mission repeats to the bit.
 
     Attributes:
         plans: by UAV, its planned actions ``(n, 2)``, sensor (-1: none) and velocity, from step ``step`` on.
@@ -136,14 +131,12 @@ class RecedingHorizon:
         self.step = -1
         self.plans: dict[int, IntArray] = {}
         self._joint = scenario.uavs <= _JOINT_UAVS
-        self._saved = _SAVED_WORK
 
     def begin(self, step: int) -> None:
         """Go to a later step, to which the belief advances by itself: the plans lose their flown steps."""
         if step <= self.step:
             return
         passed = step - self.step
-        self._saved += _WORK
         self.plans = {uav: actions[passed:] for uav, actions in self.plans.items()}
         self.step = step
 
@@ -190,9 +183,10 @@ class RecedingHorizon:
             places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
             usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
-            chains=self._chains(kept, horizon, ahead) if links else None,
+            chains=self._chains(kept, horizon, ahead),
+            stages=None if ahead is None else self._stages(ahead, horizon),
             **links,
-            **self._outlook(kept, horizon, ahead),
+            **self._outlook(kept, horizon),
             **self._guided(kept, horizon),
         )
         before = np.empty((horizon, len(present), 2), dtype=np.int64)
@@ -200,13 +194,10 @@ class RecedingHorizon:
         for column, u in enumerate(present):
             last = self.plans.get(u, np.empty((0, 2), dtype=np.int64))[:horizon]
             before[: len(last), column] = renamed(last).reshape(-1, 2)
-        long = _MOST_WORK / world.uavs
-        saved = self._joint and self._saved >= long
-        return Draft(step, present, free, kept, problem, before, long if saved else _WORK / world.uavs, saved)
+        return Draft(step, present, free, kept, problem, before)
 
-    def adopt(self, draft: Draft, best: Plan) -> None:
+    def adopt(self, draft: Draft, best: Found) -> None:
         """Fly this plan from now on, unless the fleet is at a later step."""
-        self._saved -= best.work
         if draft.step != self.step:
             return
         names = np.append(draft.kept, -1)
@@ -214,6 +205,21 @@ class RecedingHorizon:
             if uav in draft.free:
                 actions = best.actions[:, column]
                 self.plans[uav] = np.stack((names[actions[:, 0]], actions[:, 1]), axis=-1)
+
+    def action(self, uav: int, reserved: Collection[int] = ()) -> Action | None:
+        """The planned sensor and velocity of a UAV now; where a plan has none in reach, the nearest sensor.
+
+        ``None`` without a plan of this step, or where the sensor is reserved.
+        """
+        last, actions = self._belief.uavs.get(uav), self.plans.get(uav)
+        if last is None or last.step != self.step or actions is None or not len(actions):
+            return None
+        sensor, velocity = actions[0].tolist()
+        if sensor < 0:
+            distance = self._belief.distances(uav, np.array([velocity * self._scenario.step_s]))[0]
+            distance[list(reserved)] = np.inf
+            sensor = int(distance.argmin())
+        return None if sensor in reserved else Action(sensor, velocity)
 
     def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
         """The sensors that these UAVs can reach within the horizon; of too many, the first to fill.
@@ -261,33 +267,20 @@ class RecedingHorizon:
         usable[0, :-1] = ~np.isin(kept, list(taken))
         return usable
 
-    def _outlook(self, kept: IntArray, horizon: int, ahead: list[FloatArray] | None) -> dict[str, Any]:
-        """The expected queues, arrivals and risks of the kept sensors, and of one nowhere without packets."""
+    def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
+        """The expected queues and arrivals of the kept sensors, and of one nowhere without packets."""
         world, belief, step = self._scenario, self._belief, self.step
         queue, rate, burst = belief.queue(step)[kept], belief.arrivals.rate[kept], belief.arrivals.burst(step)[kept]
         steps = np.arange(horizon + 1)[:, None]
         expected = np.rint(queue + steps * rate + burst * Arrivals.burst_over(steps)).astype(np.int64)
-        risk, after = neglect(
-            base=belief.base[kept] + burst,
-            base_variance=belief.base_variance[kept],
-            age=np.maximum(step - belief.since[kept], 0),
-            rate=rate,
-            rate_variance=rate / belief.arrivals.watched[kept],
-            dispersion=belief.arrivals.dispersion,
-            capacity=world.queue_capacity,
-            horizon=horizon,
-            beyond=self._beyond(horizon),
-        )
         return {
             "queue": np.append(np.minimum(expected[0], world.queue_capacity), 0),
             "battery": np.append(belief.battery[kept], 0.0),
             "arrivals": np.pad(np.diff(expected, axis=0), ((0, 0), (0, 1))),
-            "risk": np.pad(risk, ((0, 0), (0, 0), (0, 1))),
-            "afterwards": None if ahead is None else self._afterwards(ahead, horizon, after),
         }
 
-    def _afterwards(self, chances: list[FloatArray], horizon: int, risk: FloatArray) -> Afterwards:
-        """The risk after the horizon by the UAVs' ways to the kept sensors, over links of these chances."""
+    def _stages(self, chances: list[FloatArray], horizon: int) -> list[IntArray]:
+        """The stages after the horizon by the UAVs' ways to the kept sensors, over links of these chances."""
         fastest = self._scenario.max_velocity
         sums = horizon * fastest + 1
         best = np.max(chances, axis=(0, 1))
@@ -295,9 +288,7 @@ class RecedingHorizon:
         for chance in chances:
             steps = steps_to(chance >= _GOOD_SHARE * best, _STRIDE, sums, fastest)
             stages.append(np.pad(np.minimum(np.searchsorted(_BEYOND, steps), len(_BEYOND) - 1), ((0, 0), (0, 1))))
-        # A UAV that comes saves packets by the chance of its link.
-        risk = risk[0] + best * (risk - risk[0])
-        return Afterwards(stages, np.pad(risk, ((0, 0), (0, 0), (0, 1))))
+        return stages
 
     def _chances_ahead(self, present: list[int], kept: IntArray, horizon: int) -> list[FloatArray]:
         """By UAV the chances of its links to the kept sensors, ``(P, n)``, at every stride of the way that counts."""
@@ -314,9 +305,9 @@ class RecedingHorizon:
         rate_variance = rate / arrivals.watched[kept]
         age = np.maximum(step - belief.since[kept], 0)
         came = np.maximum(belief.queue(step)[kept] - base, 0.0) * (age > 0)
-        soon = np.diff(Arrivals.burst_over(np.arange(horizon + 2)), axis=0)
-        soon[-1] = 0.0
+        soon = np.diff(Arrivals.burst_over(np.arange(horizon + 1)), axis=0)
         coming = rate + arrivals.burst(step)[kept] * soon[:, None]
+        beyond = np.array(self._beyond(horizon))[:, None]
         best = np.ones(len(kept)) if ahead is None else np.max(ahead, axis=(0, 1))
         # The error of the rate is the same in all steps: of n steps it adds n times a step's variance to each.
         spread = coming * dispersion + rate_variance * horizon / 2
@@ -325,8 +316,11 @@ class RecedingHorizon:
             base_variance=np.append(belief.base_variance[kept], 0.0),
             came=Arriving(np.append(came, 0.0), np.append(came * dispersion + age**2 * rate_variance, 0.0)),
             coming=Arriving(np.pad(coming, ((0, 0), (0, 1))), np.pad(spread, ((0, 0), (0, 1)))),
+            later=Arriving(
+                np.pad(beyond * rate, ((0, 0), (0, 1))),
+                np.pad(beyond * rate * dispersion + beyond**2 * rate_variance, ((0, 0), (0, 1))),
+            ),
             capacity=world.queue_capacity,
-            beyond=self._beyond(horizon),
             best_chance=np.append(best, 1.0),
             weights=np.append(self.guidance.weights(world.sensors)[kept], 1.0),
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from shared.channel import IntArray
 from shared.fleetplan.greedy import look_ahead
-from shared.fleetplan.problem import FleetProblem, fly, price
+from shared.fleetplan.problem import FleetProblem, fly, with_fixed
 
 # OR-Tools takes a second to import, and only planning needs it.
 if TYPE_CHECKING:
@@ -32,9 +32,6 @@ _CORES: _Strategies = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
 _WORK_FOR_CORES = 0.05
 _INTERRUPTED = "INTERRUPTED"
 _USUAL: _Strategies = (({}, 1.0),)
-# A linear relaxation bounds expected losses badly. Without one, the search for a whole fleet's plan finds better plans
-# in the same work. The search for a single UAV's plan gains from one.
-_EXPECTED: _Strategies = (({"linearization_level": 0}, 1.0),)
 
 
 @dataclass(frozen=True)
@@ -56,9 +53,9 @@ class Budget:
 
 
 class News(NamedTuple):
-    """The progress of a search: the best plan's objective and the proven bound so far, both in lost packets."""
+    """The progress of a search: the best plan's lost packets, as the model counts them, and the proven bound so far."""
 
-    objective: float
+    lost_packets: float
     lower_bound: float
 
 
@@ -70,9 +67,8 @@ class Plan:
         actions: shape ``(H, I, 2)``: sensor, velocity. A UAV with nothing to collect names a sensor that no other
             UAV's transfer needs.
         lost_packets: the packets that the actions lose over the horizon, with the real batteries and links.
-        objective: these and the expected losses above them; without a ``risk``, the same.
-        lower_bound: proven: no actions have a lower objective, with any batteries. With ``cautious`` links it holds
-            only if every link were as weak as those.
+        lower_bound: proven: no actions lose fewer, with any batteries. With ``cautious`` links it holds only if every
+            link were as weak as those.
         status: the solver's, such as OPTIMAL, FEASIBLE or UNKNOWN.
         seconds: wall clock, building included.
         work: deterministic time used.
@@ -80,7 +76,6 @@ class Plan:
 
     actions: IntArray
     lost_packets: int
-    objective: float
     lower_bound: float
     status: str
     seconds: float
@@ -89,7 +84,7 @@ class Plan:
     @property
     def optimal(self) -> bool:
         """Whether the plan is proven to be the best (with ``cautious`` links: if every link were so weak)."""
-        return self.objective <= self.lower_bound + 1e-9
+        return self.lost_packets <= self.lower_bound + 1e-9
 
 
 class Interrupted(KeyboardInterrupt):
@@ -121,19 +116,20 @@ def plan(
         The best plan found; otherwise the hint; without one, all UAVs at full speed.
 
     Raises:
-        ValueError: links are uncertain; :func:`shared.fleetplan.uav_by_uav.searched` plans over such.
-        ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
+        ValueError: the problem has uncertain links or queues, or guidance; only
+            :class:`shared.fleetplan.annealing.Annealing` plans with these.
+        ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
         Interrupted: Ctrl-C came, and the budget limits seconds.
     """
     from shared.fleetplan.formulation import Formulation
 
-    if problem.chances is not None:
-        raise ValueError("chances: CP-SAT plans over certain links")
+    for name in ("chances", "chains", "allowed", "weights", "late"):
+        if getattr(problem, name) is not None:
+            raise ValueError(f"{name}: CP-SAT plans over certain links and arrivals, without guidance")
     begun = time.perf_counter()
-    best = _priced(problem, with_fixed(problem, hint))
+    best = _flown(problem, with_fixed(problem, hint))
     found = _Search(None, 0.0, "UNKNOWN", 0.0)
-    strategies = _strategies(problem, budget)
-    for strategy, share in strategies:
+    for strategy, share in _CORES if budget.workers == 1 and budget.work >= _WORK_FOR_CORES else _USUAL:
         formulation = Formulation(problem, links)
         if hint is not None or best.found:
             formulation.hint(best.actions)
@@ -142,26 +138,20 @@ def plan(
         search = _search(formulation, now, strategy, on_news)
         found = search._replace(lower_bound=max(search.lower_bound, found.lower_bound), work=found.work + search.work)
         if search.actions is not None:
-            best = min(best, _priced(problem, search.actions)._replace(found=True), key=lambda p: p.objective)
+            best = min(best, _flown(problem, search.actions)._replace(found=True), key=lambda p: p.lost_packets)
         if search.status in ("OPTIMAL", _INTERRUPTED):
             break
     seconds = time.perf_counter() - begun
-    whole = Plan(best.actions, best.lost_packets, best.objective, found.lower_bound, found.status, seconds, found.work)
+    whole = Plan(best.actions, best.lost_packets, found.lower_bound, found.status, seconds, found.work)
     if found.status == _INTERRUPTED:
         raise Interrupted(whole)
     return whole
 
 
-def _strategies(problem: FleetProblem, budget: Budget) -> _Strategies:
-    if problem.afterwards is not None:
-        return _EXPECTED
-    return _CORES if budget.workers == 1 and budget.work >= _WORK_FOR_CORES else _USUAL
-
-
 def least_loss(
     problem: FleetProblem, seconds: float, workers: int = 8, on_news: Callable[[News], None] | None = None
 ) -> Plan:
-    """The plan of the least cost and the best bound that can be proven in about ``seconds``.
+    """The plan of the fewest lost packets and the best bound that can be proven in about ``seconds``.
 
     The search starts from a greedy plan. It first searches quickly with uniform links, too strong for the bound and too
     weak for the plan. If bound and plan do not meet, it searches with all ``workers``, and then with exact links.
@@ -170,7 +160,7 @@ def least_loss(
         Interrupted: Ctrl-C came.
     """
     begun = time.perf_counter()
-    start = best = _unproven(_priced(problem, with_fixed(problem, look_ahead(problem))))
+    start = best = _unproven(_flown(problem, with_fixed(problem, look_ahead(problem))))
     try:
         for best in _improved(problem, start, seconds, workers, on_news):
             if best.optimal:
@@ -196,7 +186,7 @@ def _improved(
     for links, budget, share in searches:
         if links == "cautious":
             left = seconds - (time.perf_counter() - begun)
-            near = _unproven(_priced(problem, _receding(problem, left * share)))
+            near = _unproven(_flown(problem, _receding(problem, left * share)))
             best = _better(best, near, links)
             yield best
         left = seconds - (time.perf_counter() - begun)
@@ -212,8 +202,8 @@ def _improved(
         yield best
 
 
-def _unproven(priced: _Priced) -> Plan:
-    return Plan(priced.actions, priced.lost_packets, priced.objective, 0.0, "FEASIBLE", 0.0, 0.0)
+def _unproven(flown: _Flown) -> Plan:
+    return Plan(flown.actions, flown.lost_packets, 0.0, "FEASIBLE", 0.0, 0.0)
 
 
 def _receding(problem: FleetProblem, seconds: float) -> IntArray:
@@ -226,8 +216,6 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
             arrivals=now.arrivals[:_NEAR],
             fixed={},
             usable=None,
-            risk=None,
-            afterwards=None,
             links=now.links_until(_NEAR),
         )
         left = seconds - (time.perf_counter() - begun)
@@ -248,10 +236,10 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
 
 
 def _better(best: Plan, found: Plan, links: Links) -> Plan:
-    """The cheaper plan, with the higher of the bounds that hold in the world."""
+    """The better plan, with the higher of the bounds that hold in the world."""
     proven = 0.0 if links == "cautious" else found.lower_bound
-    cheaper = min(best, found, key=lambda p: p.objective)
-    return replace(cheaper, lower_bound=max(best.lower_bound, proven), work=best.work + found.work)
+    better = min(best, found, key=lambda p: p.lost_packets)
+    return replace(better, lower_bound=max(best.lower_bound, proven), work=best.work + found.work)
 
 
 def _of_all(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
@@ -260,9 +248,9 @@ def _of_all(on_news: Callable[[News], None] | None, best: Plan, links: Links) ->
         return None
 
     def pass_on(news: News) -> None:
-        objective = best.objective if links == "hopeful" else min(best.objective, news.objective)
+        lost = best.lost_packets if links == "hopeful" else min(best.lost_packets, news.lost_packets)
         proven = best.lower_bound if links == "cautious" else max(best.lower_bound, news.lower_bound)
-        on_news(News(objective, proven))
+        on_news(News(lost, proven))
 
     return pass_on
 
@@ -276,25 +264,22 @@ class _Search(NamedTuple):
     work: float
 
 
-class _Priced(NamedTuple):
-    """Actions and their cost; ``found`` is true for the solver's own."""
+class _Flown(NamedTuple):
+    """Actions and what they lose; ``found`` is true for the solver's own."""
 
     actions: IntArray
     lost_packets: int
-    objective: float
     found: bool = False
 
 
-def _priced(problem: FleetProblem, actions: IntArray) -> _Priced:
-    return _Priced(actions, *price(problem, actions))
+def _flown(problem: FleetProblem, actions: IntArray) -> _Flown:
+    return _Flown(actions, int(fly(problem, actions).lost.sum()))
 
 
 def _search(
     formulation: Formulation, budget: Budget, strategy: Mapping[str, Any], on_news: Callable[[News], None] | None
 ) -> _Search:
     from ortools.sat.python import cp_model
-
-    from shared.fleetplan.formulation import SCALE
 
     solver = cp_model.CpSolver()
     solver.parameters.num_workers = budget.workers
@@ -311,7 +296,7 @@ def _search(
     class Listener(cp_model.CpSolverSolutionCallback):
         def on_solution_callback(self) -> None:
             if on_news is not None:
-                on_news(News(self.objective_value / SCALE, self.best_objective_bound / SCALE))
+                on_news(News(self.objective_value, self.best_objective_bound))
 
     # Python handles Ctrl-C, not the solver.
     solver.parameters.catch_sigint_signal = False
@@ -319,8 +304,8 @@ def _search(
     status, stopped = _solved(solver, formulation.model, listener, budget)
     found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
     actions = formulation.actions(solver.value) if found else None
-    # A plan's cost is a whole number of the formulation's units; any fraction is the solver's rounding.
-    bound = max(0, math.ceil(solver.best_objective_bound - 1e-6)) / SCALE
+    # Lost packets are whole numbers; any fraction is the solver's rounding.
+    bound = float(max(0, math.ceil(solver.best_objective_bound - 1e-6)))
     name = _INTERRUPTED if stopped else solver.status_name(status)
     return _Search(actions, bound, name, solver.deterministic_time)
 
@@ -339,19 +324,3 @@ def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any
         except KeyboardInterrupt:
             solver.stop_search()
             return search.result(), True
-
-
-def with_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
-    """The actions, or full speed and sensor 0 for all UAVs, with the problem's fixed ones at the beginning.
-
-    The nearest allowed velocity replaces a forbidden one.
-    """
-    if actions is None:
-        start = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
-        start[:, :, 1] = problem.levels[-1]
-    else:
-        start = actions.copy()
-        start[:, :, 1] = problem.levels[np.abs(start[:, :, 1, None] - problem.levels).argmin(axis=-1)]
-    for uav, fixed in problem.fixed.items():
-        start[: len(fixed), uav] = fixed
-    return start

@@ -93,7 +93,9 @@ def _run(options: BoundOptions, console: Console) -> int:
     with console.status("Searching for the best flight") as status:
 
         def show_news(news: News) -> None:
-            status.update(f"Searching: best so far {news.objective:.0f} lost, proven at least {news.lower_bound:.0f}")
+            status.update(
+                f"Searching: best so far {news.lost_packets:.0f}, proven at least {news.lower_bound:.0f} lost"
+            )
 
         try:
             bound = clairvoyant(site, options.seed, options.time_limit_s, on_news=show_news)

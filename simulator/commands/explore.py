@@ -106,7 +106,7 @@ def main(argv: list[str]) -> int:
         print(f"aicvds explore: {error}", file=sys.stderr)
         return 2
     except ModuleNotFoundError as missing:
-        fix = "pip install 'aic-vds[planner]', or take --missions 0"
+        fix = "pip install 'aic-vds[experiments]', or take --missions 0"
         print(f"aicvds explore: {missing.name} is not installed: {fix}", file=sys.stderr)
         return 2
     print(f"Wrote {args.out}")

@@ -78,7 +78,7 @@ class Simulate:
     every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
-    (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a CP-SAT planner, extra `planner`),
+    (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a planner, extra `planner`),
     mpc_formula (the same without learning), madqn or mappo (trained networks, extra `marl`)."""
     mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None
     """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or

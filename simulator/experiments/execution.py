@@ -114,7 +114,7 @@ def _bound(planned: Planned, seconds: float) -> FlightRecord:
 
         found = clairvoyant(planned.site, planned.seed, seconds)
     except ImportError as error:
-        raise CannotFly(f"{error}; install the extra: pip install 'aic-vds[planner]'") from error
+        raise CannotFly(f"{error}; install the extra: pip install 'aic-vds[experiments]'") from error
     bound = BoundFound.model_validate(found, from_attributes=True)
     flight = Flight(planned.site.scenario, planned.seed, duration_s=found.seconds)
     return _record(planned, flight, model=None).model_copy(update={"bound": bound})

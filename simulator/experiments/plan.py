@@ -105,7 +105,7 @@ class Planned:
 
     @property
     def plans(self) -> bool:
-        """Whether the flight runs OR-Tools, which takes half a second a step."""
+        """Whether the flight plans: that takes some seconds, or OR-Tools is to search in a process of its own."""
         decides = self.scheme.decides
         return isinstance(decides, Clairvoyant | Informed) or (
             isinstance(decides, Local) and decides.policy in PLANNERS

@@ -83,7 +83,7 @@ PLANNERS = (PLANNER, FORMULA_PLANNER)
 _POLICY_LABELS = {
     "madqn": "MADQN",
     "mappo": "MAPPO",
-    PLANNER: "MPC (CP-SAT, horizon 8)",
+    PLANNER: "MPC (horizon 8)",
     FORMULA_PLANNER: "MPC without learning",
     "eof": "EOF",
     "wqcs": "WQCS",

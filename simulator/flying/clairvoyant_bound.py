@@ -67,7 +67,7 @@ def clairvoyant(
 
     Raises:
         RuntimeError: the world lost another number of packets than the plan, so one of the two is wrong.
-        ModuleNotFoundError: OR-Tools is not installed (extra ``planner``).
+        ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
         Interrupted: by Ctrl-C, with the best plan so far.
     """
     from shared.fleetplan import least_loss

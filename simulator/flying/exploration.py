@@ -40,7 +40,8 @@ def explore(
 
     Raises:
         EdgeError: the edge gives no decision.
-        ModuleNotFoundError: there is a teacher and OR-Tools is not installed (extra ``planner``).
+        ModuleNotFoundError: there is a teacher and its planner is not installed: numba (extra ``planner``) or
+            OR-Tools (extra ``experiments``).
     """
     from simulator.client.observation_report import decide_request
     from simulator.flying.teachers import TEACHERS

@@ -38,7 +38,7 @@ class InformedPlanner(RecedingHorizon):
         links = true_links(world, len(world.tally) + horizon, ahead)
         nowhere = ((0, 0), (0, 0), (0, 1))
         told = [np.pad(links[index][:, :, draft.kept], nowhere) for index in draft.uavs]
-        return replace(draft, problem=replace(draft.problem, links=told, chances=None, chains=None))
+        return replace(draft, problem=replace(draft.problem, links=told, chances=None))
 
 
 class InformedPilot(LocalPilot):

@@ -32,5 +32,5 @@ def mission_bound(site: Site, seed: int, steps_flown: int, time_limit_s: float) 
         except Interrupted as stopped:
             bound = confirmed(site, seed, stopped.plan)
     except ModuleNotFoundError:
-        return "OR-Tools is not installed; pip install 'aic-vds[planner]'"
+        return "OR-Tools is not installed; pip install 'aic-vds[experiments]'"
     return LossBound(lower_bound=bound.lower_bound, best_flight=bound.lost_packets, seconds=round(bound.seconds, 3))

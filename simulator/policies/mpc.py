@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from shared.actions import Action
 from shared.fleetplan import Draft, FleetBelief
 from shared.fleetplan import RecedingHorizon as Planner
 from shared.scenario import Scenario
@@ -47,21 +48,19 @@ class RecedingHorizon:
         )
         fresh = observation["last_heard"] == step
         self.belief.measure(uav, ids[fresh], observation["channel_gain"][fresh])
-        sensor, velocity = self._planned(uav, taken)
-        if sensor < 0 or sensor in taken:
-            sensor = longest_silent(observation, taken)
-        self.belief.tell(uav, step, sensor, velocity)
-        return sensor, velocity
+        action = self._planned(uav, taken)
+        if action is None:
+            action = Action(longest_silent(observation, taken), self._scenario.max_velocity)
+        self.belief.tell(uav, step, *action)
+        return action
 
     def learn(self, uav: int, step: int, failed: bool) -> None:
         """Take the outcome of a UAV's decision of a step."""
         self.belief.settle(uav, step, failed)
 
-    def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
-        """The plan's action; off the trajectory, where no plan exists, no sensor (-1) at full speed."""
+    def _planned(self, uav: int, taken: frozenset[int]) -> Action | None:
+        """The plan's action; none off the trajectory, where no plan exists."""
         draft = self.draft(uav, taken)
-        if draft is None:
-            return -1, self._scenario.max_velocity
-        self._planner.adopt(draft, draft.search())
-        sensor, velocity = self._planner.plans[uav][0].tolist()
-        return int(sensor), int(velocity)
+        if draft is not None:
+            self._planner.adopt(draft, draft.search())
+        return self._planner.action(uav, taken)

@@ -30,7 +30,8 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
 @pytest.mark.parametrize(
     "name, missing, extra",
     [
-        ("bound", "ortools.sat", "planner"),
+        ("bound", "ortools.sat", "experiments"),
+        ("simulate", "numba", "planner"),
         ("bound", "pettingzoo", "simulator"),
         ("train", "torchrl", "marl"),
         ("mqtt", "paho", "mqtt"),

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared.channel import FloatArray
-from shared.fleetplan import Budget, FleetProblem, Interrupted, fly, least_loss, look_ahead, neglect, plan, price
-from shared.fleetplan.risk import expected_overflow
+from shared.channel import IntArray
+from shared.fleetplan import Budget, FleetProblem, Interrupted, fly, least_loss, look_ahead, plan
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 
@@ -47,12 +46,17 @@ def changed(problem: FleetProblem, **changes: Any) -> FleetProblem:
     return FleetProblem(**{**vars(problem), **changes})
 
 
-def least_by_trying(problem: FleetProblem) -> float:
-    """The least objective of all action sequences, step by step with equal states merged."""
+def lost(problem: FleetProblem, actions: IntArray) -> int:
+    """The packets that actions lose."""
+    return int(fly(problem, actions).lost.sum())
+
+
+def least_by_trying(problem: FleetProblem) -> int:
+    """The least losses of all action sequences, step by step with equal states merged."""
     world, choices = problem.scenario, range(problem.sensors)
     moves = list(itertools.product(choices, range(world.max_velocity + 1)))
     sequences = itertools.product(itertools.product(moves, repeat=problem.uavs), repeat=problem.horizon)
-    return min(price(problem, np.array(actions))[1] for actions in sequences)
+    return min(lost(problem, np.array(actions)) for actions in sequences)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -158,8 +162,8 @@ def test_a_greedy_plan_keeps_what_is_fixed_and_leaves_it_and_what_is_barred_alon
 @pytest.mark.parametrize("seed", range(4))
 def test_a_search_without_time_ends_no_worse_than_the_greedy_plan(seed: int) -> None:
     problem = tiny(seed, horizon=8)
-    greedy = price(problem, look_ahead(problem))[0]
-    idle = price(problem, np.tile([0, 0], (8, 2, 1)))[0]
+    greedy = lost(problem, look_ahead(problem))
+    idle = lost(problem, np.tile([0, 0], (8, 2, 1)))
     found = least_loss(problem, seconds=1e-6, workers=1)
     assert found.lower_bound <= found.lost_packets <= greedy <= idle
 
@@ -172,7 +176,7 @@ def test_ctrl_c_ends_a_search_with_the_best_so_far(monkeypatch: pytest.MonkeyPat
     problem = tiny(1, horizon=8)
     with pytest.raises(Interrupted) as stopped:
         least_loss(problem, seconds=60, workers=1)
-    assert stopped.value.plan.lost_packets == price(problem, look_ahead(problem))[0]
+    assert stopped.value.plan.lost_packets == lost(problem, look_ahead(problem))
     assert stopped.value.plan.lower_bound == 0
 
 
@@ -210,56 +214,9 @@ def test_more_arrivals_than_a_queue_holds_are_lost_whatever_is_done() -> None:
         ("arrivals", np.full((2, 3), -1)),
         ("places", np.zeros((3, 3))),
         ("fixed", {2: np.array([[0, 0]])}),
-        ("risk", np.zeros((2, 2, 3))),
+        ("late", np.zeros((2, 2, 3))),
     ],
 )
 def test_a_problem_that_makes_no_sense_names_the_field(field: str, value: Any) -> None:
     with pytest.raises(ValueError, match=rf"^{field}"):
         changed(tiny(0), **{field: value})
-
-
-# ---- expected losses
-
-
-def test_expected_overflow_is_that_of_a_normal() -> None:
-    drawn = np.random.default_rng(0).normal(55.0, 8.0, 200_000)
-    assert expected_overflow(55.0, 64.0, 60) == pytest.approx(np.maximum(drawn - 60, 0).mean(), rel=0.02)
-    assert expected_overflow(70.0, 0.0, 60) == pytest.approx(10.0)
-    assert expected_overflow(50.0, 0.0, 60) == pytest.approx(0.0, abs=1e-6)
-
-
-def outlook(horizon: int, beyond: int = 0) -> FloatArray:
-    base, rate = np.array([30.0, 58.0]), np.array([5.0, 4.0])
-    return neglect(base, np.zeros(2), np.array([2, 0]), rate, rate / 3, 60, horizon, [beyond])[0]
-
-
-def test_a_sensor_left_alone_longer_is_expected_to_lose_more() -> None:
-    risk = outlook(8, 3)
-    for step in range(1, 9):
-        assert (np.diff(risk[: step + 1, step], axis=0) <= 1e-12).all()
-    np.testing.assert_allclose(
-        risk[0, :8, 0].sum(),
-        expected_overflow(30.0 + 50, 50 + 100 * 5 / 3, 60) - expected_overflow(40.0, 10 + 20 / 3, 60),
-    )
-
-
-def test_the_risk_afterwards_is_that_of_each_number_of_steps() -> None:
-    base, rate = np.array([30.0, 58.0]), np.array([5.0, 4.0])
-    risk, later = neglect(base, np.zeros(2), np.array([2, 0]), rate, rate / 3, 60, 8, [3, 7])
-    np.testing.assert_array_equal(later[0], outlook(8, 3)[:, 8])
-    np.testing.assert_array_equal(later[1], outlook(8, 7)[:, 8])
-    np.testing.assert_array_equal(risk, outlook(8, 3))
-
-
-def test_expected_losses_are_priced_as_the_solver_does() -> None:
-    problem = tiny(2, horizon=4)
-    rate = np.full(3, 20.0)
-    risk, _ = neglect(
-        problem.queue.astype(np.float64), np.zeros(3), np.zeros(3, dtype=np.int64), rate, rate, 60, 4, [2]
-    )
-    problem = changed(problem, risk=risk)
-    found = plan(problem, ENOUGH, "cautious")
-    assert found.status == "OPTIMAL"
-    assert price(problem, found.actions) == (found.lost_packets, found.objective)
-    # The solver counts in hundredths of a packet.
-    assert found.objective == pytest.approx(found.lower_bound, abs=0.2)

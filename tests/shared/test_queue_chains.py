@@ -13,14 +13,14 @@ def chains(
     base: float, mean: float, variance: float, capacity: int, horizon: int = 3, base_variance: float = 0.0
 ) -> QueueChains:
     """One sensor's."""
-    nothing = np.zeros(1)
+    nothing, later = np.zeros(1), np.array([[2.0], [5.0]])
     return queue_chains(
         base=np.array([base]),
         base_variance=np.array([base_variance]),
         came=Arriving(nothing, nothing),
-        coming=Arriving(np.full((horizon + 1, 1), mean), np.full((horizon + 1, 1), variance)),
+        coming=Arriving(np.full((horizon, 1), mean), np.full((horizon, 1), variance)),
+        later=Arriving(later * mean, later * variance),
         capacity=capacity,
-        beyond=(2, 5),
         best_chance=np.array([0.5]),
         weights=np.ones(1),
     )
@@ -69,10 +69,3 @@ def test_an_unheard_queue_is_spread_around_its_mean() -> None:
     mean = float(made.start[0] @ levels)
     assert mean == pytest.approx(30.0, abs=0.1)
     assert float(made.start[0] @ (levels - mean) ** 2) == pytest.approx(12.0**2, rel=0.3)
-
-
-def test_a_transfer_moves_its_levels_by_its_chance() -> None:
-    made = chains(3.0, 1.0, 1.0, 5)
-    odds = np.array([[0.0, 0.0, 0.5, 0.0, 0.5, 0.0]], dtype=np.float32)
-    after = made.served(odds, np.array([3]), np.array([0.8], dtype=np.float32))
-    np.testing.assert_allclose(after, [[0.4, 0.4, 0.1, 0.0, 0.1, 0.0]], atol=1e-6)

@@ -1,4 +1,4 @@
-"""Plans over links that may fail: what a problem refuses, what a flight is expected to move, and what is preferred."""
+"""Plans over links that may fail: what a problem refuses, and what is preferred."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shared.channel import FloatArray, IntArray
-from shared.fleetplan import Budget, FleetProblem, fly, least_loss, look_ahead, plan, price
+from shared.fleetplan import Budget, FleetProblem, fly, least_loss, look_ahead, plan
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 
@@ -63,15 +63,8 @@ def test_tables_that_make_no_sense_name_their_field(field: str, value: Any) -> N
         problem(**{field: value})
 
 
-def test_an_uncertain_link_moves_its_expected_packets() -> None:
-    course = fly(problem(np.array([0.5, 1.0])), actions((0, 0), (1, 0)))
-    assert course.queue[1].tolist() == [60, 60]
-    assert course.lost.tolist() == [[0, 20], [20, 0]]
-    assert course.link.tolist() == [[40], [40]]
-
-
 def test_a_link_that_moves_nothing_is_a_failure() -> None:
-    course = fly(problem(packets=0), actions((0, 0), (1, 0)))
+    course = fly(problem(packets=0, chances=None), actions((0, 0), (1, 0)))
     assert not course.link.any()
     assert course.lost.sum() == 80
 
@@ -82,8 +75,8 @@ def test_certain_links_of_the_formulas_packets_are_the_formula() -> None:
     tables = problem(links=links, chances=None, places=formula.places)
     for flown in (actions((0, 0), (1, 0)), actions((1, 2), (0, 2))):
         np.testing.assert_array_equal(fly(formula, flown).queue, fly(tables, flown).queue)
-        assert price(formula, flown) == price(tables, flown)
-    assert plan(formula, ENOUGH).objective == plan(tables, ENOUGH).objective
+        assert fly(formula, flown).lost.sum() == fly(tables, flown).lost.sum()
+    assert plan(formula, ENOUGH).lost_packets == plan(tables, ENOUGH).lost_packets
 
 
 @pytest.mark.parametrize("steps", [1, HORIZON])

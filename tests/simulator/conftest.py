@@ -19,9 +19,8 @@ def undrawn() -> Iterator[None]:
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The planner searches for a tenth of its time, where its plans' quality is not the subject."""
-    monkeypatch.setattr("shared.fleetplan.receding._SAVED_WORK", 0.1)
-    monkeypatch.setattr("shared.fleetplan.receding._WORK", 0.01)
+    """The planner searches in one run, where its plans' quality is not the subject."""
+    monkeypatch.setattr("shared.fleetplan.receding._RUNS", [(0, 0.05)])
 
 
 @pytest.fixture(autouse=True)

@@ -8,10 +8,10 @@ from typing import Any
 import httpx
 import pytest
 
-from service.config.cores import usable_cores
 from service.deciding.deliberation import Deliberation, LlmAdvice
 from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation
+from shared.cores import usable_cores
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, wait_for
 from tests.waiting import Clock, Gate, soon

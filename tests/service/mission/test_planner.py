@@ -80,13 +80,13 @@ def test_a_planner_that_fails_is_no_error_of_the_decision(edge: Edge, monkeypatc
     real = builtins.__import__
 
     def broken(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("ortools"):
+        if name.startswith("numba"):
             raise ImportError("broken library")
         return real(name, *args, **kwargs)
 
     client = edge(mode="policy")
     monkeypatch.setattr(builtins, "__import__", broken)
-    monkeypatch.setitem(__import__("sys").modules, "shared.fleetplan.formulation", None)
+    monkeypatch.setitem(__import__("sys").modules, "shared.fleetplan.annealing", None)
     assert len(flown_by_edge(client, SHORT.model_copy(update={"name": "one", "steps": 1}), 0)) == 1
 
 

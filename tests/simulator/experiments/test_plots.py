@@ -16,7 +16,7 @@ SCHEMES = [
     "llm", "llm_all", "value", "edge_policy", "madqn", "mappo", "mpc", "eof", "eof_fast", "wqcs", "wqcs_fast",
     "max_gain", "nearest", "round_robin", "random", "csv_score_6", "json_shuffled_30",
 ]  # fmt: skip
-LABELS = {"llm": "AIC-VDS, mode llm", "lost_packets": "lost packets", "mpc": "MPC (CP-SAT, horizon 8)"}
+LABELS = {"llm": "AIC-VDS, mode llm", "lost_packets": "lost packets", "mpc": "MPC (horizon 8)"}
 
 
 def made(count: int = 16, seeds: int = 30, growth: float = 1.5) -> Result:

@@ -31,4 +31,4 @@ def test_why_there_is_none_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ModuleNotFoundError("No module named 'ortools'", name="ortools")
 
     monkeypatch.setattr("simulator.flying.clairvoyant_bound.clairvoyant", without_ortools)
-    assert "aic-vds[planner]" in str(mission_bound(SHORT, 0, 8, 20.0))
+    assert "aic-vds[experiments]" in str(mission_bound(SHORT, 0, 8, 20.0))

@@ -10,6 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
+from shared.actions import Action
 from shared.readings import ReadingsRequest, ReadingsResponse
 from shared.records import Records, take_readings
 from shared.scenario import scenario_named
@@ -64,8 +65,8 @@ def test_half_of_the_sensors_report_every_third_step(edge: Edge, monkeypatch: py
 class Hearing(RecedingHorizon):
     """Keeps the fleet's belief of what it hears, and flies the same way whatever that is."""
 
-    def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
-        return -1, 7
+    def _planned(self, uav: int, taken: frozenset[int]) -> Action:
+        return Action(uav, 7)
 
 
 class Sink:

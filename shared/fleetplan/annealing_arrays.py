@@ -1,0 +1,178 @@
+"""What :mod:`shared.fleetplan.annealing` computes with: arrays of one problem, of a plan and of a changed plan."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.channel import IntArray
+from shared.fleetplan.problem import FleetProblem
+from shared.fleetplan.queue_chains import Floats
+
+# Levels of a queue are filled up to a multiple of this, as processors add so many numbers at once.
+LANES = 8
+
+
+class Tables(NamedTuple):
+    """One problem of U UAVs, J sensors and H steps; C places are the sums of velocities, Q levels of a queue.
+
+    Attributes:
+        moved: shape ``(U, 1 or H, C, J)``, the levels that a transfer moves.
+        chance: of the same shape, the probability that its link holds.
+        start: shape ``(J, Q)``, the odds of each level before the first step.
+        arrive: shape ``(H, J, Q, Q)``, of a step's arrivals.
+        back: the same, transposed.
+        lost: shape ``(H, J, Q)``, the packets that a step is expected to lose.
+        ends: shape ``(K, J, Q)``, those after the horizon, by stage.
+        stages: shape ``(U, C, J)``; the lowest of all UAVs counts.
+        usable: shape ``(H, J)``.
+        velocities: shape ``(V,)``, those allowed, rising.
+        fixed: shape ``(U,)``, the number of each UAV's first actions that stay.
+        reached: shape ``(U, 1 or H, C, R)``, the sensors in reach, and after them -1.
+        late: shape ``(H + 1, H + 1, J)``, or empty.
+    """
+
+    moved: IntArray
+    chance: Floats
+    start: Floats
+    arrive: Floats
+    back: Floats
+    lost: Floats
+    ends: Floats
+    stages: IntArray
+    usable: NDArray[np.bool_]
+    velocities: IntArray
+    fixed: IntArray
+    reached: IntArray
+    late: Floats
+
+    @classmethod
+    def of(cls, problem: FleetProblem) -> Self:
+        """The tables of a problem with ``chains``."""
+        assert problem.chains is not None
+        chains = problem.chains
+        levels = chains.start.shape[1]
+        spare = (0, -levels % LANES)
+        moved, chance = _links(problem, levels - 1)
+        no_stages = np.zeros((problem.uavs, moved.shape[2], problem.sensors), dtype=np.int64)
+        late = np.empty((0, 0, problem.sensors)) if problem.late is None else problem.late
+        everywhere = np.ones((problem.horizon, problem.sensors), dtype=np.bool_)
+        arrive = np.pad(chains.arrive, ((0, 0), (0, 0), spare, spare))
+        return cls(
+            moved=moved,
+            chance=chance,
+            start=np.pad(chains.start, ((0, 0), spare)),
+            arrive=arrive,
+            back=np.ascontiguousarray(arrive.transpose(0, 1, 3, 2)),
+            lost=np.pad(chains.lost, ((0, 0), (0, 0), spare)),
+            ends=np.pad(chains.after, ((0, 0), (0, 0), spare)),
+            stages=no_stages if problem.stages is None else np.stack(problem.stages),
+            usable=everywhere if problem.usable is None else problem.usable,
+            velocities=problem.levels,
+            fixed=np.array([len(problem.fixed.get(uav, ())) for uav in range(problem.uavs)]),
+            reached=_reached(moved),
+            late=late.astype(np.float32),
+        )
+
+
+class Course(NamedTuple):
+    """A plan's actions, and what is expected of each sensor under them.
+
+    Attributes:
+        sensor: shape ``(H, U)``; J - 1 is nowhere.
+        velocity: shape ``(H, U)``.
+        place: shape ``(H, U)``, the sum of velocities after each step.
+        odds: shape ``(J, H + 1, Q)``, before each step and after the last.
+        paid: shape ``(J, H + 1)``, the losses before each step and before the end.
+        behind: shape ``(J, H, Q)``, the losses to come, after each step's transfers.
+        known, unknown: shape ``(J,)``: ``odds`` and ``paid`` are up to date before the steps up to ``known``, and
+            ``behind`` after those from ``unknown`` on.
+        stage: shape ``(J,)``.
+        cost: shape ``(J,)``, packets.
+    """
+
+    sensor: IntArray
+    velocity: IntArray
+    place: IntArray
+    odds: Floats
+    paid: Floats
+    behind: Floats
+    known: IntArray
+    unknown: IntArray
+    stage: IntArray
+    cost: Floats
+
+    @classmethod
+    def empty(cls, tables: Tables) -> Self:
+        """Room for a problem's plans."""
+        (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
+        return cls(
+            sensor=np.zeros((steps, uavs), dtype=np.int64),
+            velocity=np.zeros((steps, uavs), dtype=np.int64),
+            place=np.zeros((steps, uavs), dtype=np.int64),
+            odds=np.zeros((sensors, steps + 1, width), dtype=np.float32),
+            paid=np.zeros((sensors, steps + 1), dtype=np.float32),
+            behind=np.zeros((sensors, steps, width), dtype=np.float32),
+            known=np.zeros(sensors, dtype=np.int64),
+            unknown=np.zeros(sensors, dtype=np.int64),
+            stage=np.zeros(sensors, dtype=np.int64),
+            cost=np.zeros(sensors, dtype=np.float32),
+        )
+
+
+class Proposal(NamedTuple):
+    """A changed plan, as far as it differs from the course: room that each change writes anew.
+
+    Attributes:
+        sensor, velocity, place: as of :class:`Course`.
+        stage, cost: as of :class:`Course`, of the sensors touched.
+        first, last: shape ``(J,)``, the first and the last changed step of each sensor touched, else H and -1; H is
+            after the horizon.
+        odds: shape ``(2, Q)``, for computing.
+    """
+
+    sensor: IntArray
+    velocity: IntArray
+    place: IntArray
+    stage: IntArray
+    cost: Floats
+    first: IntArray
+    last: IntArray
+    odds: Floats
+
+    @classmethod
+    def empty(cls, tables: Tables) -> Self:
+        """Room for changes of a problem's plans."""
+        (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
+        return cls(
+            sensor=np.zeros((steps, uavs), dtype=np.int64),
+            velocity=np.zeros((steps, uavs), dtype=np.int64),
+            place=np.zeros((steps, uavs), dtype=np.int64),
+            stage=np.zeros(sensors, dtype=np.int64),
+            cost=np.zeros(sensors, dtype=np.float32),
+            first=np.zeros(sensors, dtype=np.int64),
+            last=np.zeros(sensors, dtype=np.int64),
+            odds=np.zeros((2, width), dtype=np.float32),
+        )
+
+
+def _links(problem: FleetProblem, most: int) -> tuple[IntArray, Floats]:
+    """The levels that transfers move, at most so many, and their chances, ``(U, 1 or H, C, J)``."""
+    assert problem.chains is not None
+    sums = np.arange(problem.horizon * problem.scenario.max_velocity + 1)
+    same = problem.links is None or all(len(table) == 1 for table in problem.links)
+    steps = range(1 if same else problem.horizon)
+    packets = np.array([[problem.packets(uav, sums, step) for step in steps] for uav in range(problem.uavs)])
+    chance = np.array([[problem.chance(uav, sums, step) for step in steps] for uav in range(problem.uavs)])
+    moved = np.clip(np.rint(packets / problem.chains.level), packets > 0, most).astype(np.int64)
+    return moved, np.where(packets > 0, chance, 0.0).astype(np.float32)
+
+
+def _reached(moved: IntArray) -> IntArray:
+    """The sensors from which a transfer moves something, as :attr:`Tables.reached`."""
+    within = moved > 0
+    count = within.sum(axis=-1)
+    order = np.argsort(~within, axis=-1, kind="stable")[..., : max(int(count.max()), 1)]
+    return np.where(np.arange(order.shape[-1]) < count[..., None], order, -1)
