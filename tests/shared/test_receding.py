@@ -73,3 +73,26 @@ def test_a_plan_that_loses_packets_is_searched(queue: float, least: float, monke
     searches = Searches(monkeypatch)
     planned(horizon)
     assert searches.count
+
+
+def test_on_any_number_of_cores_the_plan_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+    for cores in (1, 4):
+        monkeypatch.setattr("shared.fleetplan.receding.usable_cores", lambda cores=cores: cores)
+        found.append(planned(heard(queue=60.0)))
+    np.testing.assert_array_equal(found[0].actions, found[1].actions)
+    assert found[0].expected_loss == found[1].expected_loss > 0.1
+
+
+def test_a_uav_with_nothing_in_reach_names_the_nearest_sensor_that_is_free() -> None:
+    horizon = heard(queue=10.0)
+    horizon.plans[0] = np.array([(-1, 5)])
+    away = horizon._belief.distances(0, np.array([5 * PAPER.step_s]))[0]
+    first, second = np.argsort(away)[:2].tolist()
+    assert horizon.action(0) == (first, 5)
+    assert horizon.action(0, {first}) == (second, 5)
+    assert horizon.action(0, set(range(PAPER.sensors))) is None
+    horizon.plans[0] = np.array([(3, 5)])
+    assert horizon.action(0) == (3, 5) and horizon.action(0, {3}) is None
+    horizon.begin(1)
+    assert horizon.action(0) is None
