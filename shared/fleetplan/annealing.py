@@ -32,18 +32,18 @@ from shared.fleetplan.queue_chains import Arriving, queue_chains
 from shared.scenario import Scenario
 from shared.trajectory import trajectories
 
-# Shares of the kinds of changes: another sensor at one step, another velocity at one step, a velocity more at one step
-# and less at another, and an exchange of two sensors.
+# The cumulative shares of the kinds of changes: another sensor at one step; one velocity for several steps; another
+# velocity at one step; the same with the opposite change at a later step; the rest exchange two sensors.
 _SENSOR, _RUN, _ALONE, _SHIFT = 0.4, 0.5, 0.65, 0.9
-# The number of steps of the search at one temperature.
-_SAME_TEMPERATURE = 32
-# The share of sensors that are drawn anew where a velocity changes.
-_ANEW = 0.5
-# A new velocity is any one with this probability, else one of so many next ones.
+# The cumulative shares of new velocities: any one; the highest one, because some sensors are reached only if every
+# velocity is the highest; the rest are one or two levels from the old one.
 _ANY_VELOCITY, _HIGHEST_VELOCITY, _NEAR_VELOCITY = 0.4, 0.6, 2
+# The share of changes of velocity that draw sensors anew which are still in reach, and the share of these sensors.
+_ANEW = 0.5
 # What a collected level of a queue is worth where it saves no loss: enough to choose, packets.
 _PACKET = 1e-4
-_CHANGES, _AT_ONCE, _COLD = 5000, 1000, 0.01
+# Changes of a run, of these at one temperature, and between two looks at the clock; the last temperature, packets.
+_CHANGES, _SAME_TEMPERATURE, _AT_ONCE, _COLD = 5000, 32, 1000, 0.01
 
 
 @inlined
@@ -228,7 +228,7 @@ def _anneal(
 
 @compiled
 def _settle(tables: Tables, course: Course, new: Proposal, best: IntArray) -> float:
-    """Let each step collect the most packets among what saves the same; write the actions and return their cost."""
+    """Let each step collect the most packets of what saves the same; write the sensors and return the plan's cost."""
     steps, uavs = course.sensor.shape
     for step in range(steps):
         for uav in range(uavs):
