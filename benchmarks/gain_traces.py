@@ -27,6 +27,7 @@ from rich.console import Console
 from rich.progress import track
 from trust import edge
 
+from shared.actions import Action
 from shared.channel import FloatArray
 from shared.scenario import Scenario, scenario_named
 from shared.trajectory import trajectories
@@ -115,13 +116,15 @@ class Laps(RecedingHorizon):
         self._start: dict[int, float] = {}
         self.errors: list[tuple[float, float]] = []
 
-    def _planned(self, uav: int, taken: frozenset[int]) -> tuple[int, int]:
+    def _planned(self, uav: int, taken: frozenset[int]) -> Action:
         last, path = self.belief.uavs[uav], self._paths[uav]
         assert last.progress_m is not None
         first = self._start.setdefault(uav, last.progress_m)
         if last.progress_m - first >= path.length_m:
             self._compare(uav, last.progress_m + AHEAD_M)
-        return -1, self._velocity
+        # In turn, so that no two UAVs name the same one.
+        sensor = (last.step * len(self._paths) + uav) % self._site.scenario.sensors
+        return Action(sensor, self._velocity)
 
     def _compare(self, uav: int, progress_m: float) -> None:
         place = self._paths[uav].at(progress_m)
