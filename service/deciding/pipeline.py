@@ -18,7 +18,6 @@ from service.deciding.modes import modes_by_name
 from service.deciding.stopwatch import Deadline
 from service.mission.events import AdviserReport
 from service.mission.mission import Mission
-from service.mission.planner import prepare
 from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
 from shared.actions import Action
@@ -62,8 +61,6 @@ class Pipeline:
         self._planning = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="planner")
         self._evaluating = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="evaluator")
         self._plans: set[asyncio.Task[None]] = set()
-        if settings.planner == "on":
-            self._planning.submit(prepare)
         self._modes = modes_by_name(queries, self._evaluating)
 
     async def decide_one(self, task: DecisionTask) -> Decided:

@@ -25,14 +25,6 @@ def can_plan(scenario: Scenario) -> bool:
     return small and find_spec("numba") is not None
 
 
-def prepare() -> None:
-    """Load the search, so that no UAV waits for it; where none has searched before, this compiles it for seconds."""
-    if find_spec("numba") is not None:
-        from shared.fleetplan.annealing import warm_up
-
-        warm_up()
-
-
 class Planner(RecedingHorizon):
     """One mission's plan, renewed with the reports of the UAVs. Only the event loop uses it; another thread searches.
 

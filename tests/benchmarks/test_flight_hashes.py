@@ -1,7 +1,7 @@
 """Short flights are decision by decision what commit 601e8f2 flew, on board and over a real edge without an LLM.
 
 Mode `value` flies by the shipped weights: its flights are those of the weights trained on nine scenarios.
-Modes `policy` and `guided` fly by plans that count what they leave behind, which changed flights of seed 1.
+Modes `policy` and `guided` fly by simulated annealing, which plans otherwise than CP-SAT did then.
 """
 
 import json
