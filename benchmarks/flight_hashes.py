@@ -8,8 +8,8 @@ It starts `aicvds serve` with no LLM and a store of its own, and flies every sce
 decision's step, UAV, sensor, velocity, source, reason and failure, its cost and its UAV's lost packets, as
 `decisions.jsonl` has them.
 
-A flight repeats to the bit if no wall clock decides. The planner's search has two limits: the solver's deterministic
-time, and AICVDS_PLANNER_MS of wall clock, which has its largest value here; the deadline is a minute. Requests come one
+A flight repeats to the bit if no wall clock decides. The planner's search has one limit of wall clock,
+AICVDS_PLANNER_MS, which has its largest value here; the deadline is a minute. Requests come one
 after another, so the edge learns from each outcome before the next decision. The radio of `lossy_uplink` draws its
 losses from the seed; its jitter only delays requests, and is off here. A flight in which a clock decided nevertheless
 is an error. Another version of numba may plan differently. Another processor rounds differently, which seldom

@@ -197,7 +197,6 @@ def _anneal(
     np.random.seed(seed)
     steps, uavs = course.sensor.shape
     temperature = hot * falls**first
-    cost = total(course.cost)
     for turn in range(first, last):
         if turn % _SAME_TEMPERATURE == 0:
             temperature = hot * falls**turn

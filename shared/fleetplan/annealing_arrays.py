@@ -15,6 +15,14 @@ from shared.fleetplan.queue_chains import Floats
 LANES = 8
 
 
+def _numbers(*shape: int) -> IntArray:
+    return np.zeros(shape, dtype=np.int64)
+
+
+def _floats(*shape: int) -> Floats:
+    return np.zeros(shape, dtype=np.float32)
+
+
 class Tables(NamedTuple):
     """One problem of U UAVs, J sensors and H steps; C places are the sums of velocities, Q levels of a queue.
 
@@ -109,16 +117,16 @@ class Course(NamedTuple):
         """Room for a problem's plans."""
         (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
         return cls(
-            sensor=np.zeros((steps, uavs), dtype=np.int64),
-            velocity=np.zeros((steps, uavs), dtype=np.int64),
-            place=np.zeros((steps, uavs), dtype=np.int64),
-            odds=np.zeros((sensors, steps + 1, width), dtype=np.float32),
-            paid=np.zeros((sensors, steps + 1), dtype=np.float32),
-            behind=np.zeros((sensors, steps, width), dtype=np.float32),
-            known=np.zeros(sensors, dtype=np.int64),
-            unknown=np.zeros(sensors, dtype=np.int64),
-            stage=np.zeros(sensors, dtype=np.int64),
-            cost=np.zeros(sensors, dtype=np.float32),
+            sensor=_numbers(steps, uavs),
+            velocity=_numbers(steps, uavs),
+            place=_numbers(steps, uavs),
+            odds=_floats(sensors, steps + 1, width),
+            paid=_floats(sensors, steps + 1),
+            behind=_floats(sensors, steps, width),
+            known=_numbers(sensors),
+            unknown=_numbers(sensors),
+            stage=_numbers(sensors),
+            cost=_floats(sensors),
         )
 
 
@@ -147,14 +155,14 @@ class Proposal(NamedTuple):
         """Room for changes of a problem's plans."""
         (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
         return cls(
-            sensor=np.zeros((steps, uavs), dtype=np.int64),
-            velocity=np.zeros((steps, uavs), dtype=np.int64),
-            place=np.zeros((steps, uavs), dtype=np.int64),
-            stage=np.zeros(sensors, dtype=np.int64),
-            cost=np.zeros(sensors, dtype=np.float32),
-            first=np.zeros(sensors, dtype=np.int64),
-            last=np.zeros(sensors, dtype=np.int64),
-            odds=np.zeros((2, width), dtype=np.float32),
+            sensor=_numbers(steps, uavs),
+            velocity=_numbers(steps, uavs),
+            place=_numbers(steps, uavs),
+            stage=_numbers(sensors),
+            cost=_floats(sensors),
+            first=_numbers(sensors),
+            last=_numbers(sensors),
+            odds=_floats(2, width),
         )
 
 

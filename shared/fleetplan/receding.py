@@ -78,7 +78,7 @@ class Draft:
         Raises:
             ModuleNotFoundError: numba is not installed (extra ``planner``).
         """
-        # Numba takes half a second to import, and only planning needs it.
+        # Loading the search takes half a second, and only planning needs it.
         from shared.fleetplan.annealing import Annealing
 
         until = time.perf_counter() + seconds

@@ -105,7 +105,7 @@ class Planned:
 
     @property
     def plans(self) -> bool:
-        """Whether the flight plans: that takes some seconds, or OR-Tools is to search in a process of its own."""
+        """Whether a planner flies it, for seconds and, where OR-Tools searches, in a process of its own."""
         decides = self.scheme.decides
         return isinstance(decides, Clairvoyant | Informed) or (
             isinstance(decides, Local) and decides.policy in PLANNERS

@@ -27,7 +27,7 @@ FOLDER = Path(__file__).with_name("store_601e8f2")
 STORE, FLIGHTS = FOLDER / "missions.db", FOLDER / "flights.json"
 Body = dict[str, Any]
 
-# No clock decides: a search for a plan ends by the solver's deterministic time, and the deadline is far.
+# No clock decides: a search for a plan ends after its changes, and the deadline is far.
 SETTINGS = {"AICVDS_PLANNER_MS": "60000", "AICVDS_DEADLINE_MS": "60000", "AICVDS_LOG_LEVEL": "warning"}
 # Between machines whose arithmetic differs in the last bits, and between scores that are rounded to four digits: those
 # of a tie may be in another order.

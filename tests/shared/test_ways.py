@@ -8,7 +8,7 @@ from shared.fleetplan import FleetBelief, RecedingHorizon
 from shared.fleetplan.annealing import Annealing
 from shared.fleetplan.ways import steps_to
 from shared.scenario import Scenario
-from shared.trajectory import trajectories
+from shared.trajectory import Trajectory, trajectories
 
 
 def test_the_way_to_a_sensor_is_counted_in_steps_at_full_speed() -> None:
@@ -20,31 +20,32 @@ def test_the_way_to_a_sensor_is_counted_in_steps_at_full_speed() -> None:
     assert steps[13, 0] > 1000 and steps[:, 1].min() > 1000
 
 
-def test_a_plan_flies_towards_a_full_sensor_beyond_its_horizon() -> None:
-    world = Scenario(name="lap", sensors=1, uavs=1, lap_radius_m=600.0, lap_offset_m=0.0, radio_radius_m=200.0)
+def on_a_lap(sensors: int) -> tuple[RecedingHorizon, FleetBelief, Trajectory]:
+    """A planner at step 0, its belief, and the way of its only UAV, which is at the start."""
+    world = Scenario(name="lap", sensors=sensors, uavs=1, lap_radius_m=600.0, lap_offset_m=0.0, radio_radius_m=200.0)
     (path,) = trajectories(world)
     belief = FleetBelief(world)
+    belief.locate(0, 0, path.at(0.0).tolist(), 0.0)
     planner = RecedingHorizon(world, belief)
     planner.begin(0)
+    return planner, belief, path
+
+
+def test_a_plan_flies_towards_a_full_sensor_beyond_its_horizon() -> None:
+    planner, belief, path = on_a_lap(sensors=1)
     # Of the lap's 3770 m the sensor lies 1885 m ahead; a plan reaches 1120 m, and 200 m by radio.
-    belief.locate(0, 0, path.at(0.0).tolist(), 0.0)
     belief.begin(np.array([0]), np.array([0]), np.array([55.0]), np.array([50.0]))
     belief.places[0] = path.at(path.length_m / 2)
     draft = planner.draft([0])
     assert draft is not None and draft.kept.tolist() == [0]
     found = draft.search()
-    assert found.actions[:, 0, 1].sum() > 0.75 * len(found.actions) * world.max_velocity
+    assert found.actions[:, 0, 1].sum() > 0.75 * len(found.actions) * draft.problem.scenario.max_velocity
     parked = Annealing(draft.problem).priced(np.array([[[0, 0]]] * len(found.actions)))
     assert parked.expected_loss > found.expected_loss + 5
 
 
 def test_sensors_beyond_the_horizon_take_no_ones_place_in_a_plan() -> None:
-    world = Scenario(name="lap", sensors=90, uavs=1, lap_radius_m=600.0, lap_offset_m=0.0, radio_radius_m=200.0)
-    (path,) = trajectories(world)
-    belief = FleetBelief(world)
-    planner = RecedingHorizon(world, belief)
-    planner.begin(0)
-    belief.locate(0, 0, path.at(0.0).tolist(), 0.0)
+    planner, belief, path = on_a_lap(sensors=90)
     # 35 sensors that the plan reaches, 55 half a lap ahead, which are full.
     full = np.arange(90) >= 35
     belief.places[:] = np.where(full[:, None], path.at(path.length_m / 2), path.at(300.0))
