@@ -37,18 +37,22 @@ install: .venv/installed
 	rm -rf aic_vds.egg-info
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	$(BIN)/aicvds model fetch
-	$(BIN)/python -c 'from shared.fleetplan.annealing import warm_up; warm_up()'
+	$(COMPILE)
 	@touch $@
 
 demo: install
 	$(BIN)/aicvds demo --out runs/demo
 
+# In advance, because a test that waits for the compiler may run into a limit of time; a second once it is done.
+COMPILE = $(BIN)/python -c 'from shared.fleetplan.annealing import warm_up; warm_up()'
 PYTEST = $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: install
+	$(COMPILE)
 	$(PYTEST)
 
 test-long: install
+	$(COMPILE)
 	$(PYTEST) -m long
 
 check: install
