@@ -18,7 +18,7 @@ COPY pyproject.toml ./
 # Without the source, this installs an empty aic-vds with all its requirements, and the layer stays valid after every
 # edit of the source. Torch's C++ headers and test programs are a fifth of it, and the image needs none.
 RUN touch README.md LICENSE \
- && pip install --constraint constraints.txt '.[service,planner,mqtt,otel,postgres]' \
+ && pip install --constraint constraints.txt '.[service,mqtt,otel,postgres]' \
  && cd /opt/aicvds/lib/python3.11/site-packages && rm -rf torch/include torch/test
 
 # Only these files, so that an edit elsewhere does not download the model again.
@@ -68,9 +68,11 @@ RUN python -m pip --python /opt/aicvds/bin/python install \
  && rm -r /tmp/wheels
 # A named volume mounted here takes this owner. Without a volume and with a read-only root, missions are not stored.
 RUN install --directory --owner=aicvds --group=aicvds /store
-# The planner's search is compiled here, for any processor: with a read-only root every start would compile it again.
+# The planner's search and the rollout evaluator are compiled here, for any processor: with a read-only root every
+# start would compile them again.
 ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none NUMBA_CPU_NAME=generic
-RUN python -c "from shared.fleetplan.annealing import warm_up; warm_up()"
+RUN python -c "from shared.fleetplan.annealing import warm_up; warm_up()" \
+ && python -c "from service.deciding.rollout_evaluator import warm_up; warm_up()"
 USER 10001:10001
 COPY docker/check_edge.py /opt/aicvds/
 RUN python /opt/aicvds/check_edge.py

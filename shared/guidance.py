@@ -190,34 +190,6 @@ class Guidance(Received):
         return " ".join(said) or "Nothing beyond the mission's own rules."
 
 
-class Waiting:
-    """The waiting times of n sensors in B copies of a world, and their cost: for rollouts.
-
-    Args:
-        guidance: has the visit deadlines.
-        kept: shape ``(n,)``, the sensors' IDs.
-        step: the first simulated step.
-        visits: step of the last visit by sensor ID, ``(J,)``; -1 for never.
-        copies: B.
-    """
-
-    def __init__(
-        self, guidance: Guidance, kept: NDArray[np.int64], step: int, visits: NDArray[np.int64], copies: int
-    ) -> None:
-        self._every = guidance.every(len(visits))[kept]
-        self._waited = np.tile(step - visits[kept], (copies, 1))
-
-    def visit(self, sensor: NDArray[np.int64], where: NDArray[np.bool_]) -> None:
-        """Visit one sensor in this step in each copy where ``where`` holds; both have shape ``(B,)``."""
-        self._waited[where, sensor[where]] = 0
-
-    def end_step(self) -> FloatArray:
-        """End the step; returns the cost of its overdue sensors, packets, ``(B,)``."""
-        late = LATE_PACKETS * (self._waited >= self._every).sum(axis=1)
-        self._waited += 1
-        return np.asarray(late, dtype=np.float64)
-
-
 class Impossible(ValueError):
     """Guidance that this fleet cannot obey; ``field`` is the field at fault."""
 

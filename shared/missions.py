@@ -64,9 +64,7 @@ class MissionStatus(Wire):
     features: Features = "paper"
     belief: Belief = "fleet"
     verify: Literal["on", "off"] = "off"
-    planner: Literal["on", "off"] = Field(
-        "off", description="`on` if it is set, numba is installed, and the fleet is small enough"
-    )
+    planner: Literal["on", "off"] = Field("off", description="`on` if it is set and the fleet is small enough")
     prompt: PromptStyle = PromptStyle()
     init: Init
     seed: int

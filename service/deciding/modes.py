@@ -13,6 +13,7 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.deliberation import Deliberation, candidates_of, template_of
 from service.deciding.llm_query import LlmQueries
+from service.deciding.rollout_evaluator import Evaluation
 from service.deciding.verifier import verify
 from service.llm.answers import Completion, NoDecision, check_answer
 from service.prompting.candidates import CandidateSet
@@ -187,7 +188,7 @@ class Guided(Policy):
             await asyncio.wait(waiting, timeout=task.evaluation_deadline.left())
             # The query ends with its own deadline, which is no later than the evaluation's.
             advice = advice or await asking
-            evaluation = result.result() if result.done() else None
+            evaluation = _evaluation_of(result)
         finally:
             # An evaluation that still waits for a thread does not begin.
             for unfinished in waiting:
@@ -205,6 +206,17 @@ class Guided(Policy):
         # Other UAVs may have every sensor that the LLM named by now.
         missing = advice.reason or ("answer_reserved" if llm is None else None)
         return Choice(verdict.action, missing, advice.completion, advice.model, verdict.report, verdict.advice)
+
+
+def _evaluation_of(result: asyncio.Future[Evaluation]) -> Evaluation | None:
+    """The evaluation; None where it is late or failed."""
+    if not result.done():
+        return None
+    try:
+        return result.result()
+    except Exception:
+        log.exception("the rollout evaluator failed; decisions go on without it")
+        return None
 
 
 def modes_by_name(queries: LlmQueries, evaluating: Executor) -> dict[tuple[ModeName, bool], Mode]:

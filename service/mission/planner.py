@@ -6,7 +6,6 @@ import asyncio
 import logging
 from collections.abc import Collection
 from concurrent.futures import Executor
-from importlib.util import find_spec
 
 from shared.fleetplan import Draft, FleetBelief, Found, RecedingHorizon
 from shared.guidance import Guidance
@@ -20,9 +19,8 @@ MAX_UAVS = 20
 
 
 def can_plan(scenario: Scenario) -> bool:
-    """Whether numba is installed (extra ``planner``) and the fleet is small enough to plan for."""
-    small = scenario.sensors <= MAX_SENSORS and scenario.uavs <= MAX_UAVS
-    return small and find_spec("numba") is not None
+    """Whether the fleet is small enough to plan for."""
+    return scenario.sensors <= MAX_SENSORS and scenario.uavs <= MAX_UAVS
 
 
 class Planner(RecedingHorizon):

@@ -78,7 +78,7 @@ class Metrics:
         )
         self.critic_timeouts = Counter(
             "aicvds_critic_timeouts",
-            "Decisions of mode guided that could not wait for the rollout evaluator",
+            "Decisions of mode guided whose rollout evaluator was late or failed",
             registry=r,
         )
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from shared.fleetplan import FleetBelief, FleetProblem, RecedingHorizon, look_ahead
 from shared.fleetplan.problem import with_fixed
-from shared.guidance import LATE_PACKETS, NO_GUIDANCE, Guidance, GuidanceAnswer, Impossible, SensorWish, Waiting
+from shared.guidance import LATE_PACKETS, NO_GUIDANCE, Guidance, GuidanceAnswer, Impossible, SensorWish
 from shared.scenario import SCENARIOS
 from tests.shared.test_fleetplan import changed, tiny
 
@@ -95,19 +95,6 @@ def test_lateness_is_paid_for_each_late_step_and_less_after_a_later_visit() -> N
     for now in range(5):
         assert (np.diff(late[: now + 1, now, 4]) <= 0).all()
     assert not np.delete(late, 4, axis=2).any()
-
-
-def test_copies_that_visit_wait_anew_and_pay_as_a_plan_does() -> None:
-    visits = np.full(10, 7)
-    waiting = Waiting(LEAK, np.array([1, 4]), 8, visits, copies=2)
-    paid = []
-    for step in range(4):
-        # The second copy visits sensor 4 in the second step, the first never does.
-        waiting.visit(np.array([1, 1]), np.array([False, step == 1]))
-        paid.append(waiting.end_step().tolist())
-    late = LEAK.lateness(8, visits, horizon=4, beyond=0)[:, :4, 4]
-    assert [first for first, _ in paid] == late[0].tolist()
-    assert [second for _, second in paid] == [*late[0, :1], 0, *late[2, 2:]]
 
 
 def test_it_is_read_back_from_the_structure() -> None:

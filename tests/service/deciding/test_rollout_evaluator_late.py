@@ -61,6 +61,21 @@ def test_the_policy_decides_for_a_late_critic(
         assert again["guided"]["candidates"]
 
 
+def test_a_critic_that_fails_is_no_error_of_the_decision(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(_: Deliberation) -> Evaluation:
+        raise ImportError("numba is broken")
+
+    monkeypatch.setattr(Deliberation, "evaluate", broken)
+    with serving(StubLlm("A").app) as url:
+        client = edge(mode="guided", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        answer = client.post("/decide", json=report()).json()
+    assert (answer["source"], answer["reason"]) == ("policy", "critic_timeout")
+    assert "numba is broken" in caplog.text
+
+
 def test_what_nobody_waits_for_any_more_is_not_judged(
     edge: Edge, report: Report, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
 ) -> None:

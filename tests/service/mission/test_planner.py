@@ -69,13 +69,6 @@ def test_without_the_planner_the_policy_looks_one_step_ahead(edge: Edge) -> None
     assert flown_by_edge(client, SHORT, 1000) != flown_by_planner(SHORT, 1000)
 
 
-def test_where_the_planner_is_not_installed_decisions_go_on(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner, "find_spec", lambda name: None)
-    client = edge(mode="policy")
-    assert client.put("/missions/test", json={}).json()["planner"] == "off"
-    assert len(flown_by_edge(client, SCENARIOS["paper"].model_copy(update={"steps": 1}), 0)) == 1
-
-
 def test_a_planner_that_fails_is_no_error_of_the_decision(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
