@@ -13,7 +13,7 @@ import numpy as np
 
 from shared.channel import IntArray
 from shared.compiled import compiled, inlined
-from shared.fleetplan.annealing_arrays import Course, Proposal, Tables
+from shared.fleetplan.annealing_arrays import LEVELS, Course, Proposal, Tables
 from shared.fleetplan.annealing_costs import (
     accept,
     begin,
@@ -83,9 +83,10 @@ def _redraw(
             continue
         know_odds(tables, course, new, j, step)
         know_behind(tables, course, new, j, step)
-        idle = dot(course.odds[j, step], course.behind[j, step])
+        odds, behind = course.odds[j, step, LEVELS:], course.behind[j, step]
+        idle = dot(odds, behind[LEVELS:], new.terms)
         levels, chance = tables.moved[uav, at, place, j], tables.chance[uav, at, place, j]
-        served = visited(course.odds[j, step], course.behind[j, step], levels, chance)
+        served = visited(new, odds, behind, idle, levels, chance)
         saved = float(idle - served)
         if len(tables.late):
             new.sensor[step, uav] = nowhere
@@ -93,7 +94,7 @@ def _redraw(
             new.sensor[step, uav] = j
             saved -= float(lateness(tables, new.sensor, new.place, j))
         if packet > 0.0:
-            saved += packet * moving(course.odds[j, step], levels, chance)
+            saved += packet * moving(odds, levels, chance)
         value = saved / temperature - np.log(-np.log(np.random.random()))
         if value > highest:
             drawn, highest = j, value

@@ -11,8 +11,10 @@ from shared.channel import IntArray
 from shared.fleetplan.problem import FleetProblem
 from shared.fleetplan.queue_chains import Floats
 
-# Levels of a queue are filled up to a multiple of this, as processors add so many numbers at once.
-LANES = 8
+# Levels of a queue, filled up with levels that no queue has: processors add 4, 8 or 16 numbers at once.
+LEVELS = 32
+# Arrivals of a lower probability are left out.
+_NEXT_TO_NOTHING = 1e-7
 
 
 def _numbers(*shape: int) -> IntArray:
@@ -24,14 +26,16 @@ def _floats(*shape: int) -> Floats:
 
 
 class Tables(NamedTuple):
-    """One problem of U UAVs, J sensors and H steps; C places are the sums of velocities, Q levels of a queue.
+    """One problem of U UAVs, J sensors and H steps; C places are the sums of velocities, Q = 32 levels of a queue.
 
     Attributes:
         moved: shape ``(U, 1 or H, C, J)``, the levels that a transfer moves.
         chance: of the same shape, the probability that its link holds.
         start: shape ``(J, Q)``, the odds of each level before the first step.
-        arrive: shape ``(H, J, Q, Q)``, of a step's arrivals.
-        back: the same, transposed.
+        arrive: shape ``(H, J, Q)``, of a step's arrivals, in levels.
+        terms: shape ``(H, J)``, how many of these are more than next to nothing.
+        fills: shape ``(H, J, Q)``, the probability that a step's arrivals fill the queue, by the level before them.
+        top: shape ``()``, the level of a full queue.
         lost: shape ``(H, J, Q)``, the packets that a step is expected to lose.
         ends: shape ``(K, J, Q)``, those after the horizon, by stage.
         stages: shape ``(U, C, J)``; the lowest of all UAVs counts.
@@ -40,13 +44,16 @@ class Tables(NamedTuple):
         fixed: shape ``(U,)``, the number of each UAV's first actions that stay.
         reached: shape ``(U, 1 or H, C, R)``, the sensors in reach, and after them -1.
         late: shape ``(H + 1, H + 1, J)``, or empty.
+        emptied: shape ``(Q, Q)``, 1 for the levels that a transfer of so many levels empties, which are not empty.
     """
 
     moved: IntArray
     chance: Floats
     start: Floats
     arrive: Floats
-    back: Floats
+    terms: IntArray
+    fills: Floats
+    top: IntArray
     lost: Floats
     ends: Floats
     stages: IntArray
@@ -55,6 +62,7 @@ class Tables(NamedTuple):
     fixed: IntArray
     reached: IntArray
     late: Floats
+    emptied: Floats
 
     @classmethod
     def of(cls, problem: FleetProblem) -> Self:
@@ -62,18 +70,22 @@ class Tables(NamedTuple):
         assert problem.chains is not None
         chains = problem.chains
         levels = chains.start.shape[1]
-        spare = (0, -levels % LANES)
+        spare = (0, LEVELS - levels)
         moved, chance = _links(problem, levels - 1)
         no_stages = np.zeros((problem.uavs, moved.shape[2], problem.sensors), dtype=np.int64)
         late = np.empty((0, 0, problem.sensors)) if problem.late is None else problem.late
         everywhere = np.ones((problem.horizon, problem.sensors), dtype=np.bool_)
-        arrive = np.pad(chains.arrive, ((0, 0), (0, 0), spare, spare))
+        # P(at least so many levels), and from the level before the arrivals the levels left.
+        at_least = chains.arrive[..., ::-1].cumsum(axis=-1, dtype=np.float64)
+        terms = np.count_nonzero(at_least > _NEXT_TO_NOTHING, axis=-1)
         return cls(
             moved=moved,
             chance=chance,
             start=np.pad(chains.start, ((0, 0), spare)),
-            arrive=arrive,
-            back=np.ascontiguousarray(arrive.transpose(0, 1, 3, 2)),
+            arrive=np.pad(chains.arrive, ((0, 0), (0, 0), spare)),
+            terms=terms,
+            fills=np.pad(at_least.astype(np.float32), ((0, 0), (0, 0), spare)),
+            top=np.asarray(levels - 1),
             lost=np.pad(chains.lost, ((0, 0), (0, 0), spare)),
             ends=np.pad(chains.after, ((0, 0), (0, 0), spare)),
             stages=no_stages if problem.stages is None else np.stack(problem.stages),
@@ -82,6 +94,7 @@ class Tables(NamedTuple):
             fixed=np.array([len(problem.fixed.get(uav, ())) for uav in range(problem.uavs)]),
             reached=_reached(moved),
             late=late.astype(np.float32),
+            emptied=np.tri(LEVELS, dtype=np.float32) - np.eye(1, LEVELS, dtype=np.float32),
         )
 
 
@@ -92,9 +105,10 @@ class Course(NamedTuple):
         sensor: shape ``(H, U)``; J - 1 is nowhere.
         velocity: shape ``(H, U)``.
         place: shape ``(H, U)``, the sum of velocities after each step.
-        odds: shape ``(J, H + 1, Q)``, before each step and after the last.
+        odds: shape ``(J, H + 1, 3 Q)``, before each step and after the last; before and after the levels zeros.
         paid: shape ``(J, H + 1)``, the losses before each step and before the end.
-        behind: shape ``(J, H, Q)``, the losses to come, after each step's transfers.
+        behind: shape ``(J, H, 2 Q)``, the losses to come, after each step's transfers; before the levels those of an
+            empty queue.
         known, unknown: shape ``(J,)``: ``odds`` and ``paid`` are up to date before the steps up to ``known``, and
             ``behind`` after those from ``unknown`` on.
         stage: shape ``(J,)``.
@@ -120,9 +134,9 @@ class Course(NamedTuple):
             sensor=_numbers(steps, uavs),
             velocity=_numbers(steps, uavs),
             place=_numbers(steps, uavs),
-            odds=_floats(sensors, steps + 1, width),
+            odds=_floats(sensors, steps + 1, 3 * width),
             paid=_floats(sensors, steps + 1),
-            behind=_floats(sensors, steps, width),
+            behind=_floats(sensors, steps, 2 * width),
             known=_numbers(sensors),
             unknown=_numbers(sensors),
             stage=_numbers(sensors),
@@ -138,7 +152,9 @@ class Proposal(NamedTuple):
         stage, cost: as of :class:`Course`, of the sensors touched.
         first, last: shape ``(J,)``, the first and the last changed step of each sensor touched, else H and -1; H is
             after the horizon.
-        odds: shape ``(2, Q)``, for computing.
+        odds: shape ``(2, 3 Q)``, for computing; before and after the levels zeros.
+        value: shape ``(2 Q,)``, for computing.
+        terms: shape ``(Q,)``, for computing.
     """
 
     sensor: IntArray
@@ -149,6 +165,8 @@ class Proposal(NamedTuple):
     first: IntArray
     last: IntArray
     odds: Floats
+    value: Floats
+    terms: Floats
 
     @classmethod
     def empty(cls, tables: Tables) -> Self:
@@ -162,7 +180,9 @@ class Proposal(NamedTuple):
             cost=_floats(sensors),
             first=_numbers(sensors),
             last=_numbers(sensors),
-            odds=_floats(2, width),
+            odds=_floats(2, 3 * width),
+            value=_floats(2 * width),
+            terms=_floats(width),
         )
 
 

@@ -10,31 +10,30 @@ import numpy as np
 
 from shared.channel import IntArray
 from shared.compiled import compiled, inlined
-from shared.fleetplan.annealing_arrays import LANES, Course, Proposal, Tables
+from shared.fleetplan.annealing_arrays import LEVELS, Course, Proposal, Tables
 from shared.fleetplan.queue_chains import Floats
 
 
 @inlined
 def _set(one: Floats, other: Floats) -> None:
-    """Write an array ``(Q,)`` over another."""
+    """Write an array over another."""
     for q in range(len(one)):
         one[q] = other[q]
 
 
 @inlined
-def dot(one: Floats, other: Floats) -> np.float32:
-    """The product of two arrays ``(Q,)``, summed in the same order on every machine."""
-    a = b = c = d = e = f = g = h = np.float32(0.0)
-    for i in range(0, len(one), LANES):
-        a += one[i] * other[i]
-        b += one[i + 1] * other[i + 1]
-        c += one[i + 2] * other[i + 2]
-        d += one[i + 3] * other[i + 3]
-        e += one[i + 4] * other[i + 4]
-        f += one[i + 5] * other[i + 5]
-        g += one[i + 6] * other[i + 6]
-        h += one[i + 7] * other[i + 7]
-    return ((a + e) + (c + g)) + ((b + f) + (d + h))
+def dot(one: Floats, other: Floats, terms: Floats) -> np.float32:
+    """The product of two arrays ``(Q,)``, summed in the same order on every machine.
+
+    Only loops over whole arrays become vector instructions, so the terms ``(Q,)`` are written before they are summed.
+    """
+    for q in range(len(terms)):
+        terms[q] = one[q] * other[q]
+    part = len(terms) // 4
+    for q in range(part):
+        terms[q] = (terms[q] + terms[q + part]) + (terms[q + 2 * part] + terms[q + 3 * part])
+    even, odd = (terms[0] + terms[4]) + (terms[2] + terms[6]), (terms[1] + terms[5]) + (terms[3] + terms[7])
+    return np.float32(even + odd)
 
 
 @inlined
@@ -46,50 +45,71 @@ def total(cost: Floats) -> float:
 
 
 @inlined
-def _serve(odds: Floats, levels: int, chance: np.float32) -> None:
-    """Change the odds by a transfer of so many levels over a link of this chance."""
-    emptied = np.float32(0.0)
-    for q in range(1, levels + 1):
-        emptied += odds[q]
-    odds[0] += chance * emptied
-    for q in range(1, len(odds) - levels):
-        odds[q] += chance * (odds[q + levels] - odds[q])
-    for q in range(max(1, len(odds) - levels), len(odds)):
-        odds[q] -= chance * odds[q]
+def _serve(tables: Tables, new: Proposal, odds: Floats, levels: int, chance: np.float32) -> None:
+    """Change the odds ``(3 Q,)`` by a transfer of so many levels over a link of this chance."""
+    before, ahead = odds[LEVELS:], odds[LEVELS + levels :]
+    emptied = dot(before, tables.emptied[levels], new.terms)
+    for q in range(len(new.terms)):
+        new.terms[q] = before[q] + chance * (ahead[q] - before[q])
+    new.terms[0] = before[0] + chance * emptied
+    for q in range(len(new.terms)):
+        before[q] = new.terms[q]
 
 
 @inlined
-def visited(odds: Floats, behind: Floats, levels: int, chance: np.float32) -> np.float32:
-    """The losses to come after a transfer, from the odds before it."""
-    emptied = np.float32(0.0)
-    for q in range(levels):
-        emptied += odds[q]
-    moved = emptied * behind[0]
-    for q in range(levels, len(odds)):
-        moved += odds[q] * behind[q - levels]
-    stayed = dot(odds, behind)
-    return np.float32(stayed + chance * (moved - stayed))
+def visited(
+    new: Proposal, odds: Floats, behind: Floats, idle: np.float32, levels: int, chance: np.float32
+) -> np.float32:
+    """The losses to come after a transfer, from the odds before it; ``idle`` are those without it."""
+    moved = dot(odds, behind[LEVELS - levels :], new.terms)
+    return np.float32(idle + chance * (moved - idle))
 
 
 @inlined
 def moving(odds: Floats, levels: int, chance: np.float32) -> float:
     """The levels that a transfer is expected to move."""
     moved = 0.0
-    for q in range(len(odds)):
+    for q in range(LEVELS):
         moved += odds[q] * min(q, levels)
     return float(moved * chance)
 
 
 @inlined
-def _arrive(odds: Floats, arrive: Floats, after: Floats) -> None:
-    """Write the odds after a step's arrivals ``(Q, Q)``."""
-    for q in range(len(odds)):
-        after[q] = 0.0
-    for q in range(len(odds)):
-        likely = odds[q]
-        if likely != 0.0:
-            for more in range(len(odds)):
-                after[more] += likely * arrive[q, more]
+def _arrive(tables: Tables, new: Proposal, step: int, j: int, odds: Floats, after: Floats) -> None:
+    """Write the odds ``(3 Q,)`` after a step's arrivals."""
+    arrive, top, then = tables.arrive[step, j], tables.top[()], after[LEVELS:]
+    for q in range(len(arrive)):
+        then[q] = 0.0
+    # Four terms at a time, so that the sums are read and written less often.
+    for a in range(0, tables.terms[step, j], 4):
+        none, one, two, three = (
+            odds[LEVELS - a :],
+            odds[LEVELS - a - 1 :],
+            odds[LEVELS - a - 2 :],
+            odds[LEVELS - a - 3 :],
+        )
+        p, r, s, t = arrive[a], arrive[a + 1], arrive[a + 2], arrive[a + 3]
+        for q in range(len(arrive)):
+            then[q] += (p * none[q] + r * one[q]) + (s * two[q] + t * three[q])
+    full = dot(odds[LEVELS:], tables.fills[step, j], new.terms)
+    for q in range(top, len(arrive)):
+        then[q] = 0.0
+    then[top] = full
+
+
+@inlined
+def _before_arrivals(tables: Tables, step: int, j: int, value: Floats, before: Floats) -> None:
+    """Write what the levels ``(Q,)`` before a step's arrivals are worth, and loses in it, from those after them."""
+    arrive, lost, top = tables.arrive[step, j], tables.lost[step, j], tables.top[()]
+    for q in range(top, len(value)):
+        value[q] = value[top]
+    for q in range(len(arrive)):
+        before[q] = lost[q]
+    for a in range(0, tables.terms[step, j], 4):
+        none, one, two, three = value[a:], value[a + 1 :], value[a + 2 :], value[a + 3 :]
+        p, r, s, t = arrive[a], arrive[a + 1], arrive[a + 2], arrive[a + 3]
+        for q in range(len(arrive)):
+            before[q] += (p * none[q] + r * one[q]) + (s * two[q] + t * three[q])
 
 
 @inlined
@@ -132,15 +152,17 @@ def _cost(tables: Tables, course: Course, new: Proposal, j: int) -> np.float32:
     for step in range(first, steps):
         levels, chance = _visitor(tables, new.sensor, new.place, step, j)
         if step == last:
+            behind = course.behind[j, step]
+            idle = dot(odds[LEVELS:], behind[LEVELS:], new.terms)
             if levels:
-                return np.float32(late + paid + visited(odds, course.behind[j, step], levels, chance))
-            return np.float32(late + paid + dot(odds, course.behind[j, step]))
+                idle = visited(new, odds[LEVELS:], behind, idle, levels, chance)
+            return np.float32(late + paid + idle)
         if levels:
-            _serve(odds, levels, chance)
-        paid += dot(odds, tables.lost[step, j])
-        _arrive(odds, tables.arrive[step, j], after)
+            _serve(tables, new, odds, levels, chance)
+        paid += dot(odds[LEVELS:], tables.lost[step, j], new.terms)
+        _arrive(tables, new, step, j, odds, after)
         odds, after = after, odds
-    return np.float32(late + paid + dot(odds, tables.ends[new.stage[j], j]))
+    return np.float32(late + paid + dot(odds[LEVELS:], tables.ends[new.stage[j], j], new.terms))
 
 
 @inlined
@@ -151,28 +173,30 @@ def know_odds(tables: Tables, course: Course, new: Proposal, j: int, until: int)
         _set(odds, course.odds[j, step])
         levels, chance = _visitor(tables, course.sensor, course.place, step, j)
         if levels:
-            _serve(odds, levels, chance)
-        course.paid[j, step + 1] = course.paid[j, step] + dot(odds, tables.lost[step, j])
-        _arrive(odds, tables.arrive[step, j], course.odds[j, step + 1])
+            _serve(tables, new, odds, levels, chance)
+        course.paid[j, step + 1] = course.paid[j, step] + dot(odds[LEVELS:], tables.lost[step, j], new.terms)
+        _arrive(tables, new, step, j, odds, course.odds[j, step + 1])
     course.known[j] = max(course.known[j], until)
 
 
 @inlined
 def know_behind(tables: Tables, course: Course, new: Proposal, j: int, first: int) -> None:
     """Compute a sensor's losses to come after each step from this one on, where they are not known."""
-    steps, value = len(tables.lost), new.odds[0]
+    steps, value = len(tables.lost), new.value
     for step in range(course.unknown[j] - 1, first - 1, -1):
         if step == steps - 1:
-            _set(value, tables.ends[course.stage[j], j])
+            ends = tables.ends[course.stage[j], j]
+            for q in range(len(ends)):
+                value[q] = ends[q]
         else:
             levels, chance = _visitor(tables, course.sensor, course.place, step + 1, j)
-            for q in range(len(value)):
-                stays = course.behind[j, step + 1, q]
-                value[q] = stays + chance * (course.behind[j, step + 1, max(q - levels, 0)] - stays)
-        behind = course.behind[j, step]
-        _arrive(value, tables.back[step, j], behind)
-        for q in range(len(value)):
-            behind[q] += tables.lost[step, j, q]
+            stays, moves = course.behind[j, step + 1, LEVELS:], course.behind[j, step + 1, LEVELS - levels :]
+            for q in range(len(stays)):
+                value[q] = stays[q] + chance * (moves[q] - stays[q])
+        behind, empty = course.behind[j, step, LEVELS:], course.behind[j, step, :LEVELS]
+        _before_arrivals(tables, step, j, value, behind)
+        for q in range(len(empty)):
+            empty[q] = behind[0]
     course.unknown[j] = min(course.unknown[j], first)
 
 
@@ -189,9 +213,11 @@ def begin(tables: Tables, course: Course, new: Proposal) -> None:
         course.stage[j] = _stage(tables, course.place, j)
         course.known[j], course.unknown[j] = 0, steps
         course.paid[j, 0] = 0.0
-        _set(course.odds[j, 0], tables.start[j])
+        _set(course.odds[j, 0, LEVELS : 2 * LEVELS], tables.start[j])
         know_odds(tables, course, new, j, steps)
-        course.cost[j] = course.paid[j, steps] + dot(course.odds[j, steps], tables.ends[course.stage[j], j])
+        course.cost[j] = course.paid[j, steps] + dot(
+            course.odds[j, steps, LEVELS:], tables.ends[course.stage[j], j], new.terms
+        )
         if len(tables.late):
             course.cost[j] += lateness(tables, course.sensor, course.place, j)
 

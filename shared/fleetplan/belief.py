@@ -263,15 +263,17 @@ class FleetBelief:
     def links(self, uav: int, metres: ArrayLike) -> ExpectedLinks:
         """The links to the UAV after it has flown ``metres`` ``(n,)`` on, ``(n, J)``."""
         ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
-        return self.channel.links(ahead, self.distances(uav, metres))
+        return self.channel.links(ahead, self._distances_from(ahead))
 
     def distances(self, uav: int, metres: ArrayLike, which: Which = slice(None)) -> FloatArray:
         """Horizontal distances, metres, ``(n, J)``, after the UAV has flown ``metres`` ``(n,)`` on.
 
         ``which`` selects the sensors, by default all. A sensor of unknown position is far away.
         """
-        ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
-        offset = ahead[:, None, :] - self.places[which]
+        return self._distances_from(self.uavs[uav].ahead(self._paths[uav], self.drift, metres), which)
+
+    def _distances_from(self, places: FloatArray, which: Which = slice(None)) -> FloatArray:
+        offset = places[:, None, :] - self.places[which]
         metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
         metres_off[np.isnan(metres_off)] = FAR_M
         return metres_off

@@ -27,7 +27,7 @@ class QueueChains:
     Attributes:
         level: packets of a level.
         start: shape ``(J, G + 1)``, the probability of each level before the first step.
-        arrive: shape ``(H, J, G + 1, G + 1)``, the probabilities of a step's arrivals, from level to level.
+        arrive: shape ``(H, J, G + 1)``, the probabilities of a step's arrivals, in levels; the last one of G or more.
         lost: shape ``(H, J, G + 1)``, the packets that a step is expected to lose, by the level before its arrivals.
         after: shape ``(K, J, G + 1)``, those that are expected to be lost after the horizon, by the level then and by
             the stage.
@@ -73,34 +73,42 @@ def queue_chains(
     """
     count = min(capacity, _MOST_LEVELS)
     level = capacity / count
-    move, over = _transitions(came, capacity, count)
-    start = _uniform(base / level, np.sqrt(3.0 * base_variance) / level, count)
-    start = (start[:, None] @ move)[:, 0]
-    move, over = _transitions(coming, capacity, count)
+    came_by, _ = _by_level(came, capacity, count)
+    start = _after(_uniform(base / level, np.sqrt(3.0 * base_variance) / level, count), came_by)
+    arrive, over = _by_level(coming, capacity, count)
     # Nobody visits after the horizon, so that all packets above the capacity are lost, in whichever order they come.
-    _, after = _transitions(later, capacity, count)
+    _, after = _by_level(later, capacity, count)
     after = after[0] + best_chance[:, None] * (after - after[0])
-    whole = (start, move, over * weights[:, None], after * weights[:, None])
+    whole = (start, arrive, over * weights[:, None], after * weights[:, None])
     return QueueChains(level, *(array.astype(np.float32) for array in whole))
 
 
-def _transitions(arriving: Arriving, capacity: int, count: int) -> tuple[FloatArray, FloatArray]:
-    """The probabilities from level to level ``(..., J, G + 1, G + 1)``, and the packets lost ``(..., J, G + 1)``."""
+def _by_level(arriving: Arriving, capacity: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """The probabilities of arrivals in levels, the last of all that are more, and the packets lost ``(..., J, G + 1)``.
+
+    What is lost is by the level before the arrivals.
+    """
     level = capacity / count
     odds = _negative_binomial(arriving.mean, arriving.variance, capacity)
     if level != 1.0:
         # A number of packets between two levels counts as the nearer one the more, so that the mean stays.
         away = np.abs(np.arange(capacity + 1)[:, None] / level - np.arange(count + 1))
         odds = odds @ np.maximum(0.0, 1.0 - away)
-    q = np.arange(count + 1)
-    more = q - q[:, None]
-    move = np.where(more >= 0, odds[..., np.maximum(more, 0)], 0.0)
-    move[..., -1] = np.maximum(1.0 - move[..., :-1].sum(axis=-1), 0.0)
     # E[(a - room)+] = E[a] - sum_{k < room} P(a > k)
     exceed = np.maximum(1.0 - np.cumsum(odds, axis=-1), 0.0)
     held = np.concatenate((np.zeros((*odds.shape[:-1], 1)), np.cumsum(exceed, axis=-1)[..., :-1]), axis=-1)
     lost = np.maximum(arriving.mean[..., None] - level * held[..., ::-1], 0.0)
-    return move, lost
+    odds[..., -1] = np.maximum(1.0 - odds[..., :-1].sum(axis=-1), 0.0)
+    return odds, lost
+
+
+def _after(odds: FloatArray, arrive: FloatArray) -> FloatArray:
+    """The odds of each level after arrivals, ``(J, G + 1)`` each; a full queue stays full."""
+    levels = np.arange(odds.shape[1])
+    more = levels - levels[:, None]
+    after = (odds[:, None] @ np.where(more >= 0, arrive[:, np.maximum(more, 0)], 0.0))[:, 0]
+    after[:, -1] = np.maximum(1.0 - after[:, :-1].sum(axis=1), 0.0)
+    return after
 
 
 def _negative_binomial(mean: FloatArray, variance: FloatArray, most: int) -> FloatArray:

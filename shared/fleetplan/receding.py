@@ -46,8 +46,9 @@ _NEGLIGIBLE = 0.003
 
 # By run of the search: from the better start (0) or the worse one, and its first temperature as a share of their loss.
 _RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
-# Packets: the least first temperature, and the expected loss from which more runs than one are worth it.
-_LEAST_HEAT, _WORTH_RUNS = 0.02, 0.1
+# Packets: the least first temperature, the expected loss after the first run from which more runs are worth it, and the
+# one before it from which they do not wait for it.
+_LEAST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.1, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +95,13 @@ class Draft:
             hot = max(heat * starts[0].expected_loss, _LEAST_HEAT)
             return annealing.search(starts[start].actions, hot, number, until)
 
-        best = min(starts[0], run(0), key=_loss)
-        if best.expected_loss < _WORTH_RUNS:
-            return best
+        best, left = starts[0], range(len(_RUNS))
+        if best.expected_loss < _WORTH_AT_ONCE:
+            best, left = min(best, run(0), key=_loss), left[1:]
+            if best.expected_loss < _WORTH_RUNS:
+                return best
         with ThreadPoolExecutor(usable_cores()) as threads:
-            return min([best, *threads.map(run, range(1, len(_RUNS)))], key=_loss)
+            return min([best, *threads.map(run, left)], key=_loss)
 
 
 def _loss(found: Found) -> float:
@@ -115,9 +118,9 @@ class RecedingHorizon:
     steps count alone.
 
     Simulated annealing (:class:`~shared.fleetplan.annealing.Annealing`) searches in several runs, from the last plan
-    and from that of :func:`shared.fleetplan.look_ahead`: one where the plan is then expected to lose less than 0.1
-    packets, else six, on as many cores as there are. The last plan stays where it is expected to lose less than 0.003
-    packets. A mission repeats to the bit.
+    and from that of :func:`shared.fleetplan.look_ahead`, on as many cores as there are: one where the plan is then
+    expected to lose less than 0.1 packets, else six; at once where both plans are expected to lose a packet. The last
+    plan stays where it is expected to lose less than 0.003 packets. A mission repeats to the bit.
 
     Attributes:
         plans: by UAV, its planned actions ``(n, 2)``, sensor (-1: none) and velocity, from step ``step`` on.

@@ -112,8 +112,8 @@ def drawn_loss(whole: FleetProblem, actions: IntArray, draws: int = 20_000) -> f
                 chance = whole.chance(uav, flown[step, uav], step)[sensor]
                 level = np.where(random.uniform(size=draws) < chance, np.maximum(level - 20, 0), level)
             total += chains.lost[step, sensor][level]
-            odds = np.cumsum(chains.arrive[step, sensor], axis=1)
-            level = (random.uniform(size=draws)[:, None] > odds[level]).sum(axis=1).clip(max=places[-1])
+            come = chains.arrive[step, sensor]
+            level = np.minimum(level + random.choice(places, draws, p=come / come.sum()), places[-1])
         if whole.stages is not None:
             stage = min(int(whole.stages[u][flown[-1, u], sensor]) for u in range(whole.uavs))
         total += chains.after[stage, sensor][level]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shared.channel import FloatArray
-from shared.fleetplan.queue_chains import Arriving, QueueChains, queue_chains
+from shared.fleetplan.queue_chains import Arriving, Floats, QueueChains, queue_chains
 
 
 def chains(
@@ -26,12 +26,20 @@ def chains(
     )
 
 
+def transitions(arrive: Floats) -> FloatArray:
+    """The probabilities from level to level ``(G + 1, G + 1)`` by those of the levels that come ``(G + 1,)``."""
+    move = np.zeros((len(arrive), len(arrive)))
+    for level, more in np.ndindex(move.shape):
+        move[level, min(level + more, len(arrive) - 1)] += arrive[more]
+    return move
+
+
 @pytest.mark.parametrize("capacity", [7, 30, 60, 250])
 @pytest.mark.parametrize(("mean", "variance"), [(0.0, 0.0), (3.0, 1.0), (5.0, 5.0), (5.0, 40.0), (90.0, 200.0)])
 def test_packets_that_come_stay_or_are_lost(capacity: int, mean: float, variance: float) -> None:
     made = chains(0.0, mean, variance, capacity)
     levels = np.arange(made.start.shape[1]) * made.level
-    after = made.arrive[0, 0] @ levels + made.lost[0, 0]
+    after = transitions(made.arrive[0, 0]) @ levels + made.lost[0, 0]
     np.testing.assert_allclose(after, levels + mean, rtol=2e-3, atol=0.02 * made.level)
     np.testing.assert_allclose(made.arrive.sum(axis=-1), 1.0, rtol=1e-5)
 
@@ -55,7 +63,7 @@ def test_the_losses_are_those_of_simulated_queues(capacity: int, spread: float) 
     odds, lost = made.start[0], []
     for step in range(3):
         lost.append(float(odds @ made.lost[step, 0]))
-        odds = odds @ made.arrive[step, 0]
+        odds = odds @ transitions(made.arrive[step, 0])
     expected = simulated(base, rate, spread, capacity, 8)
     np.testing.assert_allclose(lost, expected[:3], rtol=0.05, atol=0.03)
     first, second = (float(odds @ made.after[stage, 0]) for stage in (0, 1))
