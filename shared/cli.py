@@ -36,7 +36,7 @@ _SUMMARIES = {
 
 # The extra of each command that needs another one than its package's.
 _EXTRAS = {"mqtt": "mqtt", "train": "marl", "fly": "mavlink"}
-# Modules that only some options of a command import, and their extras.
+# Modules that only some options of the simulator's commands import, and their extras.
 _EXTRA_OF_MODULE = {"numba": "planner", "ortools": "experiments"}
 # The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
@@ -122,8 +122,9 @@ def _run() -> int:
         # A module missing inside an installed package is a bug too, not a missing extra.
         if module not in _OF_EXTRAS or find_spec(module) is not None:
             raise
-        package = "service" if found[0].value.startswith("service") else "simulator"
-        extra = _EXTRA_OF_MODULE.get(module, _EXTRAS.get(name, package))
+        extra = _EXTRAS.get(name, "service")
+        if not found[0].value.startswith("service"):
+            extra = _EXTRA_OF_MODULE.get(module, _EXTRAS.get(name, "simulator"))
         print(
             f"aicvds {name}: {missing.name} is not installed. Install the extra: pip install 'aic-vds[{extra}]'",
             file=sys.stderr,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -19,6 +20,8 @@ _njit: Any = numba.njit
 _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # Where compiled functions are kept: beside their module, else in the user's folder of caches.
 _PLACES = f"{__name__}.BesideModule,UserWideCacheLocator"
+# Two threads may each import a module of compiled functions at a time, and numba's setting is one for all.
+_placing = threading.Lock()
 
 
 class BesideModule(InTreeCacheLocator):
@@ -44,14 +47,15 @@ class BesideModule(InTreeCacheLocator):
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """A function that Python calls; it is kept, so that later processes need not compile it."""
     config: Any = numba.config
-    before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, _PLACES
-    try:
-        made: Callable[_P, _R] = _njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:
-        # No folder can be written.
-        made = _njit(**_OPTIONS)(function)
-    finally:
-        config.CACHE_LOCATOR_CLASSES = before
+    with _placing:
+        before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, _PLACES
+        try:
+            made: Callable[_P, _R] = _njit(cache=True, **_OPTIONS)(function)
+        except RuntimeError:
+            # No folder can be written.
+            made = _njit(**_OPTIONS)(function)
+        finally:
+            config.CACHE_LOCATOR_CLASSES = before
     return made
 
 

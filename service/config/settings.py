@@ -85,7 +85,7 @@ class Settings(BaseSettings):
     # The default mode: `guided` (the LLM among other advisers), `llm` (the paper's method), `value` (the learned
     # modules) or `policy` (the planner). The last two start no LLM.
     mode: Mode = "guided"
-    # Whether the policy without LLM plans (extra `planner`) or looks one step ahead.
+    # Whether the policy without LLM plans or looks one step ahead.
     planner: Literal["on", "off"] = "on"
     # Milliseconds for one search for a plan; the best plan found by then counts.
     planner_ms: int = Field(500, ge=10, le=60_000)

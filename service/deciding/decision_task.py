@@ -50,7 +50,7 @@ class Choice:
     Attributes:
         report: of mode ``guided``: the response's part about trust and candidates.
         advice: of mode ``guided``: what trust learns from.
-        evaluated_late: the rollout evaluator missed its deadline.
+        unevaluated: the rollout evaluator was late or failed.
     """
 
     action: Action
@@ -59,7 +59,7 @@ class Choice:
     model: str | None = None
     report: Guided | None = None
     advice: Advice | None = None
-    evaluated_late: bool = False
+    unevaluated: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +69,8 @@ class Fallback:
     reason: Reason
     completion: Completion | None = None
     model: str | None = None
-    evaluated_late: bool = False
+    unevaluated: bool = False
 
     def to(self, action: Action) -> Choice:
         """The LLM-free policy's action, for this reason."""
-        return Choice(action, self.reason, self.completion, self.model, evaluated_late=self.evaluated_late)
+        return Choice(action, self.reason, self.completion, self.model, unevaluated=self.unevaluated)

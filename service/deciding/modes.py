@@ -196,7 +196,7 @@ class Guided(Policy):
         task.watch.ended.append(("judge", perf_counter()))
         if evaluation is None:
             reason = advice.reason or "critic_timeout"
-            return Fallback(reason, advice.completion, advice.model, evaluated_late=True)
+            return Fallback(reason, advice.completion, advice.model, unevaluated=True)
         reserved = mission.reservations.of_others(state.step, state.uav_id)
         llm = advice.over(deliberation.candidates.actions)
         trust = mission.trust[advice.model or ""]
@@ -210,7 +210,7 @@ class Guided(Policy):
 
 def _evaluation_of(result: asyncio.Future[Evaluation]) -> Evaluation | None:
     """The evaluation; None where it is late or failed."""
-    if not result.done():
+    if not result.done() or result.cancelled():
         return None
     try:
         return result.result()

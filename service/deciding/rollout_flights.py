@@ -29,9 +29,10 @@ class FlownWorld(NamedTuple):
         bonus: shape ``(V,)``, the worth of each velocity; minus infinity for a forbidden one.
         weights: shape ``(n,)``, factors of the packets lost.
         every: shape ``(n,)``, steps within which each sensor is to be visited; empty without a wish.
-        late: shape ``(n,)``, what each step costs in which a sensor is overdue, packets.
+        late: shape ``(n,)``, what each step costs in which a sensor is overdue, packets: an argument, because a
+            compiled function that is kept would not see a change of the constant.
         waited: shape ``(n,)``, steps since the last visit.
-        reserved: shape ``(n,)``.
+        reserved: shape ``(n,)``, the sensors that other UAVs have in this step.
         decided: shape ``(U,)``, each UAV's velocity in this step, -1 where it has no decision yet.
     """
 
@@ -90,7 +91,11 @@ def _offered(packets: FloatArray) -> NDArray[np.int64]:
 
 
 class _Flight(NamedTuple):
-    """One flight's state: queues, sensors served in this step, reach of the candidate ``(n,)``; by UAV, its way."""
+    """One flight's state.
+
+    ``queue``, packets, ``served`` in this step, ``in_reach`` of the candidate and ``waited``, steps, have shape
+    ``(n,)``; ``flown``, the sums of the UAVs' velocities, ``(U,)``.
+    """
 
     queue: FloatArray
     served: NDArray[np.bool_]
@@ -107,6 +112,8 @@ def fly_candidates(
     plans: dict[int, NDArray[np.int64]],
 ) -> tuple[FloatArray, FloatArray]:
     """Fly each of K candidates through each of M futures.
+
+    Nothing checks that the velocities of candidates, plans and decisions are at most V - 1.
 
     Args:
         own: the place in the world's arrays of the UAV whose candidates they are.

@@ -282,7 +282,7 @@ class Engine:
         self._metrics.overflow_risk.observe(decided.state.state.overflow_risk)
         if task.mission.mode == "llm" and choice.reason != "no_candidate":
             self._metrics.llm_requests.labels(choice.reason or "ok").inc()
-        if choice.evaluated_late:
+        if choice.unevaluated:
             self._metrics.critic_timeouts.inc()
         if choice.report is not None:
             self._metrics.llm_trust.observe(choice.report.trust[LLM])

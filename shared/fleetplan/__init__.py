@@ -1,4 +1,7 @@
-"""The fleet's planner: the actions of all UAVs over a horizon that lose the fewest packets (extra ``planner``)."""
+"""The fleet's planner: the actions of all UAVs over a horizon that lose the fewest packets.
+
+It needs the extra ``service`` or ``planner``.
+"""
 
 from __future__ import annotations
 

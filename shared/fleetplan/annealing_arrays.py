@@ -11,7 +11,8 @@ from shared.channel import IntArray
 from shared.fleetplan.problem import FleetProblem
 from shared.fleetplan.queue_chains import Floats
 
-# Levels of a queue, filled up with levels that no queue has: processors add 4, 8 or 16 numbers at once.
+# Levels of a queue, more than those of queue_chains.py, filled up with levels that no queue has: processors add 4, 8 or
+# 16 numbers at once.
 LEVELS = 32
 # Arrivals of a lower probability are left out.
 _NEXT_TO_NOTHING = 1e-7
@@ -33,7 +34,7 @@ class Tables(NamedTuple):
         chance: of the same shape, the probability that its link holds.
         start: shape ``(J, Q)``, the odds of each level before the first step.
         arrive: shape ``(H, J, Q)``, of a step's arrivals, in levels.
-        terms: shape ``(H, J)``, how many of these are more than next to nothing.
+        counted: shape ``(H, J)``, how many of these are more than next to nothing.
         fills: shape ``(H, J, Q)``, the probability that a step's arrivals fill the queue, by the level before them.
         top: shape ``()``, the level of a full queue.
         lost: shape ``(H, J, Q)``, the packets that a step is expected to lose.
@@ -51,7 +52,7 @@ class Tables(NamedTuple):
     chance: Floats
     start: Floats
     arrive: Floats
-    terms: IntArray
+    counted: IntArray
     fills: Floats
     top: IntArray
     lost: Floats
@@ -77,13 +78,13 @@ class Tables(NamedTuple):
         everywhere = np.ones((problem.horizon, problem.sensors), dtype=np.bool_)
         # P(at least so many levels), and from the level before the arrivals the levels left.
         at_least = chains.arrive[..., ::-1].cumsum(axis=-1, dtype=np.float64)
-        terms = np.count_nonzero(at_least > _NEXT_TO_NOTHING, axis=-1)
+        counted = np.count_nonzero(at_least > _NEXT_TO_NOTHING, axis=-1)
         return cls(
             moved=moved,
             chance=chance,
             start=np.pad(chains.start, ((0, 0), spare)),
             arrive=np.pad(chains.arrive, ((0, 0), (0, 0), spare)),
-            terms=terms,
+            counted=counted,
             fills=np.pad(at_least.astype(np.float32), ((0, 0), (0, 0), spare)),
             top=np.asarray(levels - 1),
             lost=np.pad(chains.lost, ((0, 0), (0, 0), spare)),

@@ -81,7 +81,7 @@ def _arrive(tables: Tables, new: Proposal, step: int, j: int, odds: Floats, afte
     for q in range(len(arrive)):
         then[q] = 0.0
     # Four terms at a time, so that the sums are read and written less often.
-    for a in range(0, tables.terms[step, j], 4):
+    for a in range(0, tables.counted[step, j], 4):
         none, one, two, three = (
             odds[LEVELS - a :],
             odds[LEVELS - a - 1 :],
@@ -105,7 +105,7 @@ def _before_arrivals(tables: Tables, step: int, j: int, value: Floats, before: F
         value[q] = value[top]
     for q in range(len(arrive)):
         before[q] = lost[q]
-    for a in range(0, tables.terms[step, j], 4):
+    for a in range(0, tables.counted[step, j], 4):
         none, one, two, three = value[a:], value[a + 1 :], value[a + 2 :], value[a + 3 :]
         p, r, s, t = arrive[a], arrive[a + 1], arrive[a + 2], arrive[a + 3]
         for q in range(len(arrive)):

@@ -11,8 +11,9 @@ from shared.channel import FloatArray
 
 Floats = NDArray[np.float32]
 
-# A queue has at most this many levels beside the empty one; of a larger capacity a level is several packets. With 60
-# levels, one a packet, missions in six development worlds of `shadowed` and `faulty` lost the same packets.
+# A queue has at most this many levels beside the empty one, fewer than annealing_arrays.py has room for; of a larger
+# capacity a level is several packets. With 60 levels, one a packet, missions in six development worlds of `shadowed`
+# and `faulty` lost the same packets.
 _MOST_LEVELS = 30
 # A negative binomial of so many successes is a Poisson.
 _POISSON = 1e9

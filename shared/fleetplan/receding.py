@@ -46,8 +46,8 @@ _NEGLIGIBLE = 0.003
 
 # By run of the search: from the better start (0) or the worse one, and its first temperature as a share of their loss.
 _RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
-# Packets: the least first temperature, the expected loss after the first run from which more runs are worth it, and the
-# one before it from which they do not wait for it.
+# Packets: the least first temperature; the expected loss after the first run from which more runs are worth it; and the
+# better start's expected loss from which all runs begin at once.
 _LEAST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.1, 1.0
 
 
@@ -77,7 +77,7 @@ class Draft:
         The last plan stays, without a search, where it is expected to lose next to nothing.
 
         Raises:
-            ModuleNotFoundError: numba is not installed (extra ``planner``).
+            ModuleNotFoundError: numba is not installed (extra ``service`` or ``planner``).
         """
         # Loading the search takes half a second, and only planning needs it.
         from shared.fleetplan.annealing import Annealing
@@ -118,8 +118,8 @@ class RecedingHorizon:
     steps count alone.
 
     Simulated annealing (:class:`~shared.fleetplan.annealing.Annealing`) searches in several runs, from the last plan
-    and from that of :func:`shared.fleetplan.look_ahead`, on as many cores as there are: one where the plan is then
-    expected to lose less than 0.1 packets, else six; at once where both plans are expected to lose a packet. The last
+    and from that of :func:`shared.fleetplan.look_ahead`, on as many cores as there are. Where both are expected to lose
+    a packet, six begin at once; else one does, and five follow where its plan is expected to lose 0.1 packets. The last
     plan stays where it is expected to lose less than 0.003 packets. A mission repeats to the bit.
 
     Attributes:

@@ -20,7 +20,8 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
     def load() -> object:
         raise ModuleNotFoundError(f"No module named {missing!r}", name=missing)
 
-    command = SimpleNamespace(name=name, value="simulator.commands.bound:main", load=load)
+    package = "service" if name == "serve" else "simulator"
+    command = SimpleNamespace(name=name, value=f"{package}.commands.bound:main", load=load)
     monkeypatch.setattr(cli, "entry_points", lambda group: [command])
     monkeypatch.setattr(cli, "find_spec", lambda module: object() if module == "matplotlib" else None)
     monkeypatch.setattr(sys, "argv", ["aicvds", name, "--seed", "0"])
@@ -32,6 +33,7 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
     [
         ("bound", "ortools.sat", "experiments"),
         ("simulate", "numba", "planner"),
+        ("serve", "numba", "service"),
         ("bound", "pettingzoo", "simulator"),
         ("train", "torchrl", "marl"),
         ("mqtt", "paho", "mqtt"),

@@ -10,6 +10,7 @@ import pytest
 
 from service.deciding.deliberation import Deliberation, LlmAdvice
 from service.deciding.llm_query import LlmQueries
+from service.deciding.modes import _evaluation_of
 from service.deciding.rollout_evaluator import Evaluation
 from shared.cores import usable_cores
 from tests.running import serving
@@ -74,6 +75,12 @@ def test_a_critic_that_fails_is_no_error_of_the_decision(
         answer = client.post("/decide", json=report()).json()
     assert (answer["source"], answer["reason"]) == ("policy", "critic_timeout")
     assert "numba is broken" in caplog.text
+
+
+async def test_an_evaluation_that_the_ending_service_cancels_counts_as_late() -> None:
+    cancelled: asyncio.Future[Evaluation] = asyncio.get_running_loop().create_future()
+    cancelled.cancel()
+    assert _evaluation_of(cancelled) is None
 
 
 def test_what_nobody_waits_for_any_more_is_not_judged(
