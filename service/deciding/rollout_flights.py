@@ -13,6 +13,7 @@ from service.deciding.sampled_futures import SampledFutures
 from shared.channel import FloatArray
 from shared.compiled import compiled, inlined
 from shared.features import VELOCITY_BONUS, urgency
+from shared.fleetplan.annealing_arrays import listed
 from shared.guidance import LATE_PACKETS
 
 
@@ -23,14 +24,15 @@ class FlownWorld(NamedTuple):
         packets: shape ``(U, n, C)``, that a transfer can move over a link that holds.
         margins: of the same shape, the links' margins, as :class:`RolloutState` has them; C = 0: every link holds.
         holds: the same for the probabilities that the links hold.
-        offered: shape ``(U, n)``, what look-ahead chooses from: the sensors that the UAV may reach within the horizon
-            and one that it may not, if there is one; then -1.
+        offered: shape ``(U, n or fewer)``, what look-ahead chooses from: the sensors that the UAV may reach within the
+            horizon and one that it may not, if there is one; then -1.
         urgency: shape ``(W + 1, n)``, by the packets in the queue, weighted by the guidance.
         bonus: shape ``(V,)``, the worth of each velocity; minus infinity for a forbidden one.
+        highest_bonus: shape ``()``.
         weights: shape ``(n,)``, factors of the packets lost.
-        every: shape ``(n,)``, steps within which each sensor is to be visited; empty without a wish.
-        late: shape ``(n,)``, what each step costs in which a sensor is overdue, packets: an argument, because a
-            compiled function that is kept would not see a change of the constant.
+        every: shape ``(n,)``, steps within which each sensor is to be visited; infinite without an order.
+        late: shape ``()``, what each step costs in which a sensor is overdue, packets: an argument, because a compiled
+            function that is kept would not see a change of the constant.
         waited: shape ``(n,)``, steps since the last visit.
         reserved: shape ``(n,)``, the sensors that other UAVs have in this step.
         decided: shape ``(U,)``, each UAV's velocity in this step, -1 where it has no decision yet.
@@ -42,6 +44,7 @@ class FlownWorld(NamedTuple):
     offered: NDArray[np.int64]
     urgency: FloatArray
     bonus: FloatArray
+    highest_bonus: FloatArray
     weights: FloatArray
     every: FloatArray
     late: FloatArray
@@ -57,17 +60,18 @@ class FlownWorld(NamedTuple):
         weights = guidance.weights(scenario.sensors)[state.sensors]
         levels = np.arange(scenario.queue_capacity + 1, dtype=np.float64)[:, None]
         packets, margins, holds = (_stacked(tables) for tables in (state.links, state.margins, state.holds))
-        every = guidance.every(scenario.sensors)[state.sensors]
+        bonus = np.where(guidance.allowed(len(fast)), VELOCITY_BONUS * fast, -np.inf)
         return cls(
             packets=packets,
             margins=margins,
             holds=holds,
             offered=_offered(packets),
             urgency=np.ascontiguousarray(urgency(levels, state.rates, scenario) * weights),
-            bonus=np.where(guidance.allowed(len(fast)), VELOCITY_BONUS * fast, -np.inf),
+            bonus=bonus,
+            highest_bonus=np.asarray(bonus.max()),
             weights=weights,
-            every=every if guidance.wishes else every[:0],
-            late=np.full(len(every), LATE_PACKETS),
+            every=guidance.every(scenario.sensors)[state.sensors],
+            late=np.asarray(LATE_PACKETS),
             waited=state.step - state.visited[state.sensors],
             reserved=state.reserved,
             decided=np.array([state.decided.get(uav, -1) for uav in uavs]),
@@ -85,9 +89,7 @@ def _offered(packets: FloatArray) -> NDArray[np.int64]:
     near = np.asarray((packets > 0).any(axis=2))
     # All sensors out of reach are alike, and of equal ones the first is chosen.
     near[np.arange(len(near)), (~near).argmax(axis=1)] = True
-    # The places of those that are near, in their order, then the others'.
-    order = np.argsort(~near, axis=1, kind="stable")
-    return np.where(np.take_along_axis(near, order, axis=1), order, -1)
+    return listed(near)
 
 
 class _Flight(NamedTuple):
@@ -218,9 +220,6 @@ def _continue(
 def _look_ahead(world: FlownWorld, flight: _Flight, uav: int) -> tuple[int, int]:
     """One step of look-ahead, as in :func:`service.deciding.advisers.look_ahead`; of equal choices the first."""
     best, best_sensor, best_velocity = -math.inf, world.offered[uav, 0], 0
-    fastest = -math.inf
-    for velocity in range(world.bonus.shape[0]):
-        fastest = max(fastest, world.bonus[velocity])
     for place in range(world.offered.shape[1]):
         j = world.offered[uav, place]
         if j < 0:
@@ -228,7 +227,7 @@ def _look_ahead(world: FlownWorld, flight: _Flight, uav: int) -> tuple[int, int]
         urgent = world.urgency[int(flight.queue[j]), j]
         queue = 0.0 if flight.served[j] else flight.queue[j]
         # No velocity moves more packets than wait, or is worth more than the best one.
-        if queue * urgent + fastest <= best:
+        if queue * urgent + world.highest_bonus[()] <= best:
             continue
         for velocity in range(world.bonus.shape[0]):
             at = flight.flown[uav] + velocity
@@ -278,9 +277,8 @@ def _arrive(world: FlownWorld, flight: _Flight, arrivals: FloatArray, step: int,
         lost += over * world.weights[j]
         if flight.in_reach[j]:
             in_reach += over
-        flight.served[j] = False
-    for j in range(world.every.shape[0]):
         if flight.waited[j] >= world.every[j]:
-            lost += world.late[j]
+            lost += world.late[()]
         flight.waited[j] += 1
+        flight.served[j] = False
     return lost, in_reach

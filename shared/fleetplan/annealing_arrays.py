@@ -16,6 +16,8 @@ from shared.fleetplan.queue_chains import Floats
 LEVELS = 32
 # Arrivals of a lower probability are left out.
 _NEXT_TO_NOTHING = 1e-7
+# As :attr:`Tables.emptied`.
+_EMPTIED = np.tri(LEVELS, dtype=np.float32) - np.eye(1, LEVELS, dtype=np.float32)
 
 
 def _numbers(*shape: int) -> IntArray:
@@ -93,9 +95,9 @@ class Tables(NamedTuple):
             usable=everywhere if problem.usable is None else problem.usable,
             velocities=problem.levels,
             fixed=np.array([len(problem.fixed.get(uav, ())) for uav in range(problem.uavs)]),
-            reached=_reached(moved),
+            reached=listed(moved > 0),
             late=late.astype(np.float32),
-            emptied=np.tri(LEVELS, dtype=np.float32) - np.eye(1, LEVELS, dtype=np.float32),
+            emptied=_EMPTIED,
         )
 
 
@@ -199,9 +201,8 @@ def _links(problem: FleetProblem, most: int) -> tuple[IntArray, Floats]:
     return moved, np.where(packets > 0, chance, 0.0).astype(np.float32)
 
 
-def _reached(moved: IntArray) -> IntArray:
-    """The sensors from which a transfer moves something, as :attr:`Tables.reached`."""
-    within = moved > 0
+def listed(within: NDArray[np.bool_]) -> IntArray:
+    """The places of the true entries on the last axis, in their order, and after them -1; as many as the most have."""
     count = within.sum(axis=-1)
     order = np.argsort(~within, axis=-1, kind="stable")[..., : max(int(count.max()), 1)]
     return np.where(np.arange(order.shape[-1]) < count[..., None], order, -1)

@@ -52,8 +52,7 @@ def _serve(tables: Tables, new: Proposal, odds: Floats, levels: int, chance: np.
     for q in range(len(new.terms)):
         new.terms[q] = before[q] + chance * (ahead[q] - before[q])
     new.terms[0] = before[0] + chance * emptied
-    for q in range(len(new.terms)):
-        before[q] = new.terms[q]
+    _set(before[:LEVELS], new.terms)
 
 
 @inlined
@@ -103,8 +102,7 @@ def _before_arrivals(tables: Tables, step: int, j: int, value: Floats, before: F
     arrive, lost, top = tables.arrive[step, j], tables.lost[step, j], tables.top[()]
     for q in range(top, len(value)):
         value[q] = value[top]
-    for q in range(len(arrive)):
-        before[q] = lost[q]
+    _set(before[:LEVELS], lost)
     for a in range(0, tables.counted[step, j], 4):
         none, one, two, three = value[a:], value[a + 1 :], value[a + 2 :], value[a + 3 :]
         p, r, s, t = arrive[a], arrive[a + 1], arrive[a + 2], arrive[a + 3]
@@ -185,9 +183,7 @@ def know_behind(tables: Tables, course: Course, new: Proposal, j: int, first: in
     steps, value = len(tables.lost), new.value
     for step in range(course.unknown[j] - 1, first - 1, -1):
         if step == steps - 1:
-            ends = tables.ends[course.stage[j], j]
-            for q in range(len(ends)):
-                value[q] = ends[q]
+            _set(value[:LEVELS], tables.ends[course.stage[j], j])
         else:
             levels, chance = _visitor(tables, course.sensor, course.place, step + 1, j)
             stays, moves = course.behind[j, step + 1, LEVELS:], course.behind[j, step + 1, LEVELS - levels :]

@@ -23,7 +23,7 @@ const REASONS = {
   answer_sensor: "the LLM named a sensor that was not offered",
   answer_velocity: "the LLM named a velocity that is not allowed",
   answer_reserved: "another UAV had taken the sensor meanwhile",
-  critic_timeout: "there was no time to weigh the candidates",
+  critic_timeout: "the candidates could not be weighed",
   rule_reach: "the LLM's sensor would have been out of reach",
   rule_battery: "the LLM's sensor has a flat battery",
 };
