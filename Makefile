@@ -44,8 +44,7 @@ demo: install
 	$(BIN)/aicvds demo --out runs/demo
 
 # In advance, because a test that waits for the compiler may run into a limit of time; a second once it is done.
-COMPILE = $(BIN)/python -c 'from shared.fleetplan import annealing; from service.deciding import rollout_evaluator; \
-	annealing.warm_up(); rollout_evaluator.warm_up()'
+COMPILE = $(BIN)/python -c 'from service.edge.compilation import compile_all; compile_all()'
 PYTEST = $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: install

@@ -68,11 +68,9 @@ RUN python -m pip --python /opt/aicvds/bin/python install \
  && rm -r /tmp/wheels
 # A named volume mounted here takes this owner. Without a volume and with a read-only root, missions are not stored.
 RUN install --directory --owner=aicvds --group=aicvds /store
-# The planner's search and the rollout evaluator are compiled here, for any processor: with a read-only root every
-# start would compile them again.
+# Numba's functions are compiled here, for any processor: with a read-only root every start would compile them again.
 ENV PATH=/opt/aicvds/bin:$PATH PYTHONUNBUFFERED=1 AICVDS_CACHE_DIR=/opt/model AICVDS_STORE=none NUMBA_CPU_NAME=generic
-RUN python -c "from shared.fleetplan import annealing; from service.deciding import rollout_evaluator; \
-annealing.warm_up(); rollout_evaluator.warm_up()"
+RUN python -c "from service.edge.compilation import compile_all; compile_all()"
 USER 10001:10001
 COPY docker/check_edge.py /opt/aicvds/
 RUN python /opt/aicvds/check_edge.py

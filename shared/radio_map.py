@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from shared.channel import FloatArray, IntArray
-from shared.shadowing import KINDS, OFFSET_WEIGHT, PRIOR_DB, PRIOR_WEIGHT, likelihoods
+from shared.radio_map_arrays import (
+    EAST,
+    EXCESS,
+    MEASURED,
+    NOISE,
+    NUMBERS,
+    ONES,
+    TAKEN,
+    LinkStatistics,
+    Measurements,
+)
+from shared.shadowing import KINDS, PRIOR_DB
 
 # Measurements that a map keeps, of all sensors together and of one.
 _MOST_KEPT, _MOST_OF_ONE = 4096, 36
 # A measurement counts as at most this much, dB: it bounds how far a wrong report moves the map.
 LARGEST_EXCESS_DB = 40.0
-# A measurement this many standard deviations off its prediction counts less, as in Huber's estimator.
-_HUBER = 3.0
-_HUBER_LEAST_DB = 1.0
 # Measurements that agree with the formula this closely are no sign of an excess loss, dB.
 _EXACT_DB = 0.05
 # The map compares its kinds of shadowing again when this factor more measurements came.
@@ -25,25 +32,8 @@ _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
 # After so many measurements of all sensors, those of the sensors at hand are inverted anew.
 _REFRESH = 500
-# Measurements of a sensor within this distance are of the same place, metres; so many of one place are kept.
-_SAME_PLACE_M, _MOST_OF_PLACE = 10.0, 2
-
-
-# A measurement's numbers: the UAV's place, the excess loss, the noise and when it was taken (``heard`` then), and its
-# entries of K^-1 r and K^-1 1. One array has them all, because indexing costs more than the sums of a few sensors.
-_PLACE, _EXCESS, _NOISE, _TAKEN, _MEASURED, _ONES, _NUMBERS = slice(0, 2), 2, 3, 4, 5, 6, 7
-# A packed symmetric matrix has its upper triangle column by column, in half the memory, so that a leading block of it
-# comes first. By row and column, the place in it.
-_ROWS, _COLUMNS = np.tril_indices(_MOST_OF_ONE)[::-1]
-_PLACE_IN_PACKED = np.zeros((_MOST_OF_ONE, _MOST_OF_ONE), dtype=np.int64)
-_PLACE_IN_PACKED[_ROWS, _COLUMNS] = _PLACE_IN_PACKED[_COLUMNS, _ROWS] = np.arange(len(_ROWS))
-
-
-@cache
-def _packing(kept: int) -> tuple[IntArray, IntArray]:
-    """Places of a square matrix's entries in the packed one, ``(kept * kept,)``, and of the packed ones in it."""
-    few = kept * (kept + 1) // 2
-    return _PLACE_IN_PACKED[:kept, :kept].ravel(), _ROWS[:few] * kept + _COLUMNS[:few]
+# The numbers of a measurement's place.
+_PLACE = slice(EAST, EXCESS)
 
 
 class RadioMap:
@@ -72,7 +62,7 @@ class RadioMap:
 
     def __init__(self, sensors: int) -> None:
         kept = int(np.clip(_MOST_KEPT // sensors, 1, _MOST_OF_ONE))
-        self._kept: FloatArray = np.zeros((sensors, kept, _NUMBERS))
+        self._kept: FloatArray = np.zeros((sensors, kept, NUMBERS))
         self.noise[:] = 1.0
         self.count: IntArray = np.zeros(sensors, dtype=np.int64)
         self.heard = 0
@@ -80,9 +70,9 @@ class RadioMap:
         self._compared = _COMPARE_FIRST
         self.exact = True
         self.offset_db, self.deviation_db = 0.0, PRIOR_DB
-        # K^-1 of each sensor, packed, with zeros where it has no measurement. None until a gain differs from the
-        # formula.
-        self._inverse: FloatArray | None = None
+        # K^-1 of each sensor, packed; empty until a gain differs from the formula.
+        self._inverse: FloatArray = np.zeros((0, 0))
+        self._work: FloatArray = np.zeros((3, kept))
 
     @property
     def places(self) -> FloatArray:
@@ -92,12 +82,12 @@ class RadioMap:
     @property
     def excess(self) -> FloatArray:
         """Shape ``(J, N)``, dB, measured."""
-        return np.asarray(self._kept[..., _EXCESS])
+        return np.asarray(self._kept[..., EXCESS])
 
     @property
     def noise(self) -> FloatArray:
         """Shape ``(J, N)``, the factor of the fading's variance of each measurement, at least 1."""
-        return np.asarray(self._kept[..., _NOISE])
+        return np.asarray(self._kept[..., NOISE])
 
     def measured_db(self) -> dict[int, float]:
         """The mean excess loss of each measured sensor, dB, over the measurements kept; empty if all are exact."""
@@ -126,204 +116,102 @@ class RadioMap:
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        count = self.count.take(ids)
-        # One more than a sensor has, for a new one.
-        size = min(int(count.max()) + 1, self._kept.shape[1])
-        kept = self._kept.take(ids, 0)[:, :size]
-        new = np.empty((len(ids), _NUMBERS))
-        new[:, _PLACE], new[:, _EXCESS], new[:, _NOISE], new[:, _TAKEN] = place, excess, 1.0, self.heard
-        east, north = kept[:, :, 0] - new[:, :1], kept[:, :, 1] - new[:, 1:2]
-        apart = east * east + north * north
-        slot, dropped = _slots(kept, count, apart, self._kept.shape[1], self.heard)
-        inverse = None if self.exact else self._replace(kept, new, slot, dropped, self._inverses(ids, size), apart)
-        kept[np.arange(len(ids)), slot] = new
-        self.count[ids] += ~dropped
-        due = not self.exact and (self.heard >= self._compared or self.heard % _REFRESH < len(ids))
-        if inverse is not None and not due:
-            kept[:, :, _MEASURED:] = _solved(inverse, kept)
-        self._kept[ids, :size] = kept
-        self._learn(ids, inverse, due)
-        return excess
+        # Loading numba takes a fifth of a second, and only what learns the channel needs this.
+        from shared.kriging import take_measurements
 
-    def _learn(self, ids: IntArray, inverse: FloatArray | None, due: bool) -> None:
-        """Estimate what all links have in common, after new measurements of these sensors with this ``K^-1``."""
-        if inverse is None:
+        due = not self.exact and (self.heard >= self._compared or self.heard % _REFRESH < len(ids))
+        east, north = np.asarray(place, dtype=np.float64).tolist()
+        # A copy, because numba would compile the function again for an array that is read-only.
+        take_measurements(self._measurements(), self._links(), np.array(ids), east, north, excess, not due)
+        if self.exact:
             self.deviation_db = 0.0
         elif not due:
-            self._pack(ids, inverse)
             self._estimate()
         elif self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
             self._compare()
         else:
             self._factor(ids)
+        return excess
 
-    def _replace(
-        self,
-        kept: FloatArray,
-        new: FloatArray,
-        slot: IntArray,
-        dropped: NDArray[np.bool_],
-        inverse: FloatArray,
-        apart: FloatArray,
-    ) -> FloatArray:
-        """``K^-1`` with new measurements ``(n, 7)`` in these slots, whose noise is set by the prediction before them.
+    def _measurements(self) -> Measurements:
+        return Measurements(self._kept, self.count, self._inverse, self._work)
 
-        Args:
-            apart: shape ``(n, size)``, squared distances of the kept measurements from the new ones, square metres.
-        """
-        rows, fading = np.arange(len(kept)), self.kind.fading
-        covariance = self.kind.covariance(np.sqrt(apart))
-        left = kept[:, :, _MEASURED] - self.offset_db * kept[:, :, _ONES]
-        known = (covariance[:, None] @ inverse)[:, 0]
-        share = np.maximum(1.0 - (known * covariance).sum(axis=1), fading)
-        deviation = np.maximum(self.deviation_db * np.sqrt(share), _HUBER_LEAST_DB)
-        off = np.abs(new[:, _EXCESS] - self.offset_db - (covariance * left).sum(axis=1)) / deviation
-        noise = new[:, _NOISE] = np.square(np.maximum(off / _HUBER, 1.0))
-        if dropped.any():
-            # Without the measurements that leave their slots.
-            own = inverse[rows, slot]
-            weight = own[rows, slot]
-            own /= np.sqrt(np.where(weight > 0, weight, 1.0))[:, None]
-            inverse -= own[:, :, None] * own[:, None, :]
-            inverse[rows, slot], inverse[rows, :, slot] = 0.0, 0.0
-            known = (covariance[:, None] @ inverse)[:, 0]
-        # With the new ones: with w = k K^-1 and -1 in the slot, whose row and column are zeros, w w^T is added.
-        free = 1.0 + fading * (noise - 1.0) - (known * covariance).sum(axis=1)
-        known[rows, slot] = -1.0
-        inverse += known[:, :, None] * (known / free[:, None])[:, None, :]
-        return inverse
+    def _links(self) -> LinkStatistics:
+        kind = self.kind
+        return LinkStatistics(
+            kind.sensor, kind.place, kind.range_m, kind.fading, self.offset_db, self.deviation_db, self.heard
+        )
 
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
         shape = (len(places), len(which))
-        if self._inverse is None:
+        if not self._inverse.size:
             return np.zeros(shape), np.full(shape, self.deviation_db)
-        kept = int(self.count.take(which).max(initial=0))
-        offset, deviation = self.offset_db, self.deviation_db
-        if not kept:
-            return np.full(shape, offset), np.full(shape, deviation)
-        known_at = self._kept.take(which, 0)[:, :kept]
-        east, north = (places[None, :, None, axis] - known_at[:, None, :, axis] for axis in (0, 1))
-        # (n, P, kept)
-        covariance = self.kind.covariance(np.sqrt(east * east + north * north))
-        left = known_at[:, :, _MEASURED] - offset * known_at[:, :, _ONES]
-        mean = offset + np.matmul(covariance, left[..., None])[..., 0]
-        known = (covariance @ self._inverses(which, kept) * covariance).sum(axis=2)
-        # The fading is part of a link's variance, since it differs in the next step.
-        share = np.maximum(1.0 - known, self.kind.fading)
-        return mean.T, deviation * np.sqrt(share).T
+        from shared.kriging import predict
 
-    def _inverses(self, ids: IntArray, kept: int) -> FloatArray:
-        """``K^-1`` of these sensors, ``(n, kept, kept)``, with zeros where a sensor has no measurement."""
-        assert self._inverse is not None
-        return self._inverse.take(ids, 0).take(_packing(kept)[0], 1).reshape(len(ids), kept, kept)
-
-    def _pack(self, ids: IntArray, inverse: FloatArray) -> None:
-        """Keep ``K^-1`` of these sensors, ``(n, kept, kept)``."""
-        assert self._inverse is not None
-        places = _packing(inverse.shape[1])[1]
-        self._inverse[ids, : len(places)] = inverse.reshape(len(ids), -1).take(places, 1)
+        mean, deviation = np.empty((2, *shape[::-1]))
+        work = np.empty((self._kept.shape[1] + 1, len(places)))
+        east_north = np.ascontiguousarray(places.T, dtype=np.float64)
+        predict(self._measurements(), self._links(), np.array(which), east_north, work, mean, deviation)
+        return mean.T, deviation.T
 
     def _factor(self, ids: IntArray) -> None:
         """Invert the covariances of these sensors' measurements, and estimate what all links have in common."""
-        if self._inverse is None:
+        from shared.kriging import invert
+
+        if not self._inverse.size:
             most = self._kept.shape[1]
             self._inverse = np.zeros((len(self._kept), most * (most + 1) // 2))
-        if size := int(self.count[ids].max(initial=0)):
-            used = np.arange(size) < self.count[ids, None]
-            apart = _distances(self.places[ids, :size])
-            covariances = self.kind.covariances(apart, used, self.noise[ids, :size])
-            inverse: FloatArray = np.linalg.inv(covariances).astype(np.float64, copy=False)
-            self._pack(ids, inverse * (used[:, :, None] & used[:, None, :]))
-            self._kept[ids, :size, _MEASURED:] = _solved(self._inverses(ids, size), self._kept[ids, :size])
+        invert(self._measurements(), self._links(), ids)
         self._estimate()
 
     def _estimate(self) -> None:
         """The offset and the deviation of all links."""
-        excess, measured, ones = (self._kept[..., number] for number in (_EXCESS, _MEASURED, _ONES))
-        offset = self.offset_db = float(measured.sum() / (ones.sum() + OFFSET_WEIGHT))
-        squares = (excess - offset) * (measured - offset * ones)
-        weight = PRIOR_WEIGHT + int(self.count.sum())
-        self.deviation_db = float(np.sqrt((PRIOR_WEIGHT * PRIOR_DB**2 + max(float(squares.sum()), 0.0)) / weight))
+        from shared.kriging import estimated
+
+        self.offset_db, self.deviation_db = estimated(self._kept, self.count)
 
     def _compare(self) -> None:
         """Choose the kind of shadowing with the highest marginal likelihood, the variance at its estimate."""
-        every = np.flatnonzero(self.count)
-        kept = int(self.count.max())
-        used = np.arange(kept) < self.count[every, None]
-        excess, noise = self.excess[every, :kept] * used, self.noise[every, :kept]
-        self.kind = KINDS[int(np.argmax(likelihoods(_distances(self.places[every, :kept]), used, excess, noise)))]
-        self._factor(every)
+        from shared.shadowing_likelihoods import likelihoods
+
+        self.kind = KINDS[int(np.argmax(likelihoods(self._kept, self.count)))]
+        self._factor(np.flatnonzero(self.count))
 
     def state_dict(self) -> dict[str, Any]:
         """The measurements and what was solved of them, as copies."""
         arrays = {name: getattr(self, name).copy() for name in ("places", "excess", "noise", "count")}
-        measured, ones = self._kept[..., _MEASURED].copy(), self._kept[..., _ONES].copy()
+        measured, ones = self._kept[..., MEASURED].copy(), self._kept[..., ONES].copy()
         return {
             **arrays,
-            "taken": self._kept[..., _TAKEN].astype(np.int64),
+            "taken": self._kept[..., TAKEN].astype(np.int64),
             "heard": self.heard,
             "kind": KINDS.index(self.kind),
             "compared": self._compared,
             "exact": self.exact,
-            "solved": None if self._inverse is None else [self._inverse.copy(), measured, ones],
+            "solved": None if not self._inverse.size else [self._inverse.copy(), measured, ones],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a map, to the bit. One of an earlier version is without what was solved."""
         numbers: list[tuple[slice | int, str]] = [
             (_PLACE, "places"),
-            (_EXCESS, "excess"),
-            (_NOISE, "noise"),
-            (_TAKEN, "taken"),
+            (EXCESS, "excess"),
+            (NOISE, "noise"),
+            (TAKEN, "taken"),
         ]
-        self._kept = np.zeros((*state["excess"].shape, _NUMBERS))
+        self._kept = np.zeros((*state["excess"].shape, NUMBERS))
+        self._work = np.zeros((3, self._kept.shape[1]))
         for number, name in numbers:
             self._kept[..., number] = state[name]
         self.count = state["count"]
         self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
         self.exact = state["exact"]
         if state.get("solved") is not None:
-            self._inverse, self._kept[..., _MEASURED], self._kept[..., _ONES] = state["solved"]
+            self._inverse, self._kept[..., MEASURED], self._kept[..., ONES] = state["solved"]
             self._estimate()
         elif not self.exact:
             self._factor(np.arange(len(self.count)))
         elif self.heard:
             self.deviation_db = 0.0
-
-
-def _solved(inverse: FloatArray, kept: FloatArray) -> FloatArray:
-    """``K^-1 r`` and ``K^-1 1``, ``(n, size, 2)``, of sensors' measurements ``(n, size, 7)``."""
-    both = np.ones((*kept.shape[:2], 2))
-    both[..., 0] = kept[:, :, _EXCESS]
-    return np.asarray(inverse @ both)
-
-
-def _slots(
-    kept: FloatArray, count: IntArray, apart: FloatArray, most: int, heard: int
-) -> tuple[IntArray, NDArray[np.bool_]]:
-    """The slot of each sensor that takes a new measurement, and whether it drops another for it.
-
-    Two measurements of the same place are kept. A third drops the oldest, so that no wrong one stays. A full record
-    without any of the place drops the nearest one, which tells the most of what the new one tells.
-
-    Args:
-        kept: shape ``(n, size, 7)``, the sensors' measurements.
-        count: shape ``(n,)``, how many of them there are.
-        apart: shape ``(n, size)``, their squared distances from the new ones, square metres.
-        most: measurements that a full record has.
-        heard: measurements so far, of all sensors.
-    """
-    apart = np.where(np.arange(kept.shape[1]) < count[:, None], apart, np.inf)
-    same = apart <= _SAME_PLACE_M**2
-    full = count == most
-    repeated = same.sum(axis=1) >= np.where(full, 1, _MOST_OF_PLACE)
-    oldest = np.where(same, kept[:, :, _TAKEN], heard).argmin(axis=1)
-    return np.where(repeated, oldest, np.where(full, apart.argmin(axis=1), count)), repeated | full
-
-
-def _distances(places: FloatArray) -> FloatArray:
-    """Distances between the places of each sensor's measurements, ``(n, kept, 2)``: ``(n, kept, kept)``, metres."""
-    east, north = (places[:, :, None, axis] - places[:, None, :, axis] for axis in (0, 1))
-    return np.asarray(np.sqrt(east * east + north * north))

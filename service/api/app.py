@@ -21,6 +21,7 @@ from service.api.openapi import schema_of
 from service.api.routes import decisions, router
 from service.config.process_member import Member
 from service.config.settings import Settings
+from service.edge.compilation import load_for_event_loop
 from service.edge.engine import Engine
 from service.llm.embedded import Embed, embedded
 from service.llm.server_pool import ServerPool
@@ -61,6 +62,7 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
         embed = embedded if member is None else _shared_llm(member)
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc, embed)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
+        await asyncio.to_thread(load_for_event_loop)
         engine = Engine(settings, llm, counter, metrics, traces, store, member)
         app.state.engine = engine
         llm.start()

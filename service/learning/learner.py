@@ -1,21 +1,18 @@
 """Online value regression: each outcome trains both modules on its realised cost, by one step of Adam.
 
 A mission stores only numbers, its weights and Adam's moments: an edge serves thousands of missions, and torch modules
-take more memory than their parameters. The gradient is written out in numpy: about thirty products of small arrays take
-a tenth of the time of torch's autograd.
+take more memory than their parameters.
 """
 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from service.learning.modules import Array, Layout, Parameters, Sample, Weights
-
-_BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-8
+from service.learning.training_step import Moments, adam_step, descend
 
 
 class Learner:
@@ -48,8 +45,6 @@ class Learner:
         gradient, into = _gradient_of(weights.layout)
         gradient.fill(0)
         loss = descend(weights.parameters, sample, -cost, into=into)
-        if not np.isfinite(gradient).all():
-            raise FloatingPointError("the gradient of a training sample is not finite")
         if self._moments is None:
             self._moments = Moments(np.zeros_like(gradient), np.zeros_like(gradient))
         self.weights = Weights(weights.layout, adam_step(weights.flat, self._moments, gradient, self._learning_rate))
@@ -84,85 +79,6 @@ class Learner:
             mean, square = flat([one["exp_avg"] for one in adam]), flat([one["exp_avg_sq"] for one in adam])
             self._moments = Moments(mean, square, int(adam[0]["step"]))
         self.updates, self.last_loss = state["updates"], state["last_loss"]
-
-
-@dataclass(slots=True)
-class Moments:
-    """Adam's running means of the gradient and of its square, ``(n,)`` each, after some steps."""
-
-    mean: Array
-    square: Array
-    steps: int = 0
-
-
-def adam_step(weights: Array, moments: Moments, gradient: Array, learning_rate: float) -> Array:
-    """The weights ``(n,)`` after one more step of Adam (Kingma and Ba 2015) down the gradient ``(n,)``.
-
-    The result equals that of ``torch.optim.Adam`` but for the last bits. That class imports torch's compiler at its
-    first use, during which nothing else of the process runs for seconds, and takes its steps parameter by parameter.
-    This function changes the moments, and overwrites the gradient.
-    """
-    moments.steps += 1
-    mean, square = moments.mean, moments.square
-    work = gradient - mean
-    work *= np.float32(1 - _BETA1)
-    mean += work
-    gradient *= gradient
-    gradient *= np.float32(1 - _BETA2)
-    square *= np.float32(_BETA2)
-    square += gradient
-    np.sqrt(square, out=gradient)
-    gradient /= np.float32((1 - _BETA2**moments.steps) ** 0.5)
-    gradient += np.float32(_EPS)
-    np.divide(mean, gradient, out=work)
-    work *= np.float32(learning_rate / (1 - _BETA1**moments.steps))
-    return weights - work
-
-
-# A BLAS kernel may raise the flag although its input is finite; the caller checks the gradient.
-@np.errstate(invalid="ignore")
-def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters) -> float:
-    """The loss ``(s_j - r)^2 + (u_v - r)^2`` of :meth:`Modules.loss`, and its gradient.
-
-    Of all sensors' scores the loss reads one, that of the chosen sensor. So the work grows with the number of sensors,
-    whereas the backward pass of the whole attention grows with its square.
-
-    Args:
-        into: the gradient is written here; zeros before.
-    """
-    x, own = sample.features, sample.features[sample.chosen]
-    scale = np.float32(len(weights.query) ** -0.5)
-    # Forward, the chosen sensor's row: s = w z + b with z = W_v sum_i p_i x_i, p = softmax(q K^T / sqrt(d')).
-    q = weights.query @ own
-    p = x @ (scale * (q @ weights.key))
-    p -= p.max()
-    np.exp(p, out=p)
-    p /= p.sum()
-    attended = p @ x
-    z = weights.value @ attended
-    # Preset `paper` has one approach for all levels and an output for each level; preset `reach` the other way round.
-    shared_approach = sample.approach.ndim == 1
-    row, approach = (sample.velocity, sample.approach) if shared_approach else (0, sample.approach[sample.velocity])
-    velocity_input = np.concatenate((z, approach))
-    h = np.maximum(weights.hidden @ velocity_input + weights.hidden_bias, 0)
-    off_score = weights.score[0] @ z + weights.bias[0] - np.float32(reward)
-    off_value = weights.out[row] @ h + weights.out_bias[row] - np.float32(reward)
-    # Backward.
-    ds, du = 2 * off_score, 2 * off_value
-    into.score[0], into.bias[0] = ds * z, ds
-    into.out[row], into.out_bias[row] = du * h, du
-    dh = np.where(h > 0, du * weights.out[row], np.float32(0))
-    # np.outer takes several times as long for a few numbers.
-    np.multiply(dh[:, None], velocity_input, out=into.hidden)
-    into.hidden_bias[:] = dh
-    dz = ds * weights.score[0] + (dh @ weights.hidden)[: len(z)]
-    np.multiply(dz[:, None], attended, out=into.value)
-    dp = x @ (dz @ weights.value)
-    da = p * (dp - p @ dp)
-    mixed = scale * (da @ x)
-    np.multiply((weights.key @ mixed)[:, None], own, out=into.query)
-    np.multiply(q[:, None], mixed, out=into.key)
-    return float(off_score * off_score + off_value * off_value)
 
 
 def _gradient_of(layout: Layout) -> tuple[Array, Parameters]:

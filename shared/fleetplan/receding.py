@@ -79,9 +79,11 @@ class Draft:
         Raises:
             ModuleNotFoundError: numba is not installed (extra ``service`` or ``planner``).
         """
-        # Loading the search takes half a second, and only planning needs it.
+        # Loading the search takes half a second, and only planning needs it. Without numba it would take minutes.
+        from shared.compiled import require_numba
         from shared.fleetplan.annealing import Annealing
 
+        require_numba()
         until = time.perf_counter() + seconds
         annealing = Annealing(self.problem)
         last = annealing.priced(with_fixed(self.problem, self.before))

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from service.learning.initial_weights import initial_weights
-from service.learning.learner import Learner, descend
+from service.learning.learner import Learner
 from service.learning.modules import Modules, Sample
+from service.learning.training_step import descend
 from shared.features import FEATURES, LEVEL_FEATURES
 from shared.schemas import Features
 

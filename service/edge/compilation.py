@@ -1,0 +1,35 @@
+"""The functions that numba compiles: a decision waits neither for the compiler nor for what it made before."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.deciding import rollout_evaluator
+from service.learning.initial_weights import initial_weights
+from service.learning.learner import Learner
+from service.learning.modules import Sample
+from shared.features import FEATURES
+from shared.fleetplan import annealing
+from shared.radio_map import RadioMap
+
+
+def load_for_event_loop() -> None:
+    """Load what the event loop calls, in half a second; the first time on a machine it takes some seconds to compile.
+
+    The edge does so before it is ready. Threads load what plans and evaluates when a mission needs it.
+    """
+    learner = Learner(initial_weights("random", "paper", 1, 0), learning_rate=1e-3)
+    features, approach = np.zeros((1, FEATURES["paper"]), dtype=np.float32), np.zeros(1, dtype=np.float32)
+    learner.update(Sample(features=features, chosen=0, approach=approach, velocity=0), cost=1.0)
+    radio_map, place = RadioMap(1), np.zeros((1, 2))
+    # The eighth measurement compares the kinds of shadowing.
+    for excess_db in range(8):
+        radio_map.measure(np.zeros(1, dtype=np.int64), place[0], np.array([float(excess_db)]))
+    radio_map.predict(place, np.zeros(1, dtype=np.int64))
+
+
+def compile_all() -> None:
+    """Compile every function, or load it: installations do so in advance."""
+    load_for_event_loop()
+    annealing.warm_up()
+    rollout_evaluator.warm_up()
