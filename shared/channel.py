@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,32 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+class LinkBudget(NamedTuple):
+    """A scenario's numbers that its links depend on, under the same names, for compiled functions."""
+
+    altitude_m: float
+    radio_radius_m: float
+    step_s: float
+    transmit_power_w: float
+    los_a: float
+    los_kappa: float
+    los_excess_db: float
+    nlos_excess_db: float
+    carrier_mhz: float
+    path_loss_limit_db: float
+    bandwidth_hz: float
+    noise_dbm_hz: float
+    noise_figure_db: float
+    spectral_cap: float
+    packet_bits: float
+    link_share: float
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        """The numbers of a scenario."""
+        return cls(*(float(getattr(scenario, name)) for name in cls._fields))
+
+
 def path_loss_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     """Mean path loss at a horizontal distance, dB; same shape as the distance.
 
@@ -24,12 +50,25 @@ def path_loss_db(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
     ``d3 = sqrt(d^2 + H^2)``, the elevation angle in degrees and
     ``P_los = 1 / (1 + a exp(-kappa (angle - a)))``. Finite at d = 0.
     """
-    d = np.asarray(distance_m, dtype=np.float64)
-    slant = np.hypot(d, scenario.altitude_m)
-    angle = np.degrees(np.arctan2(scenario.altitude_m, d))
-    free_space = 20.0 * np.log10(4.0 * np.pi * slant * scenario.carrier_mhz * 1e6 / _SPEED_OF_LIGHT)
-    p_los = 1.0 / (1.0 + scenario.los_a * np.exp(-scenario.los_kappa * (angle - scenario.los_a)))
-    return np.asarray(free_space + p_los * scenario.los_excess_db + (1.0 - p_los) * scenario.nlos_excess_db)
+    return np.asarray(mean_loss_db(np.asarray(distance_m, dtype=np.float64), scenario))
+
+
+def mean_loss_db(d: Any, world: Scenario | LinkBudget) -> Any:
+    """As :func:`path_loss_db`, of a float64 array, or of one number where it is part of a compiled function."""
+    slant = np.hypot(d, world.altitude_m)
+    angle = np.degrees(np.arctan2(world.altitude_m, d))
+    free_space = 20.0 * np.log10(4.0 * np.pi * slant * world.carrier_mhz * 1e6 / _SPEED_OF_LIGHT)
+    p_los = 1.0 / (1.0 + world.los_a * np.exp(-world.los_kappa * (angle - world.los_a)))
+    return free_space + p_los * world.los_excess_db + (1.0 - p_los) * world.nlos_excess_db
+
+
+def whole_rate_bps(loss_db: Any, world: Scenario | LinkBudget) -> Any:
+    """The rate of links with all of the scenario's share, bit/s; arguments as of :func:`mean_loss_db`."""
+    power_dbm = 10.0 * np.log10(world.transmit_power_w * 1e3)
+    noise_dbm = world.noise_dbm_hz + 10.0 * np.log10(world.bandwidth_hz) + world.noise_figure_db
+    snr = 10.0 ** ((power_dbm - loss_db - noise_dbm) / 10.0)
+    efficiency = np.minimum(np.log2(1.0 + snr), world.spectral_cap)
+    return world.link_share * world.bandwidth_hz * efficiency
 
 
 @dataclass(frozen=True)
@@ -74,12 +113,7 @@ class Links:
     @cached_property
     def rate_bps(self) -> FloatArray:
         """As :func:`rate_bps`."""
-        world = self.scenario
-        power_dbm = 10.0 * np.log10(world.transmit_power_w * 1e3)
-        noise_dbm = world.noise_dbm_hz + 10.0 * np.log10(world.bandwidth_hz) + world.noise_figure_db
-        snr = 10.0 ** ((power_dbm - self.loss_db - noise_dbm) / 10.0)
-        efficiency = np.minimum(np.log2(1.0 + snr), world.spectral_cap)
-        return np.asarray(world.link_share * world.bandwidth_hz * efficiency * self.share)
+        return np.asarray(whole_rate_bps(self.loss_db, self.scenario) * self.share)
 
     @property
     def packet_j(self) -> FloatArray:

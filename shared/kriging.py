@@ -166,31 +166,34 @@ def predict(
 
     Args:
         places: shape ``(2, P)``, metres.
-        work: shape ``(N + 1, P)``, any numbers.
-        mean, deviation: the predictions are written here, ``(n, P)``, dB.
+        work: shape ``(N + 3, P)``, any numbers.
+        mean, deviation: the predictions are written here, ``(P, n)``, dB.
     """
+    most = of.kept.shape[1]
+    # Of the sums over entries of K^-1, those of one row.
+    means, explained, row = work[most], work[most + 1], work[most + 2]
     for number in range(which.shape[0]):
         sensor = which[number]
-        kept, inverse = of.kept[sensor], of.inverse[sensor]
-        explained, sums = deviation[number], work[kept.shape[0]]
+        kept = of.kept[sensor]
         for p in range(places.shape[1]):
-            mean[number, p], explained[p] = links.offset_db, 0.0
-        for n in range(of.counts[sensor]):
-            covariance, start = work[n], n * (n + 1) // 2
+            means[p], explained[p] = links.offset_db, 0.0
+        for n in range(of.counts[sensor] if of.inverse.shape[0] > 0 else 0):
+            covariance, start, inverse = work[n], n * (n + 1) // 2, of.inverse[sensor]
             left = kept[n, MEASURED] - links.offset_db * kept[n, ONES]
             for p in range(places.shape[1]):
                 covariance[p] = _covariance(kept, n, places[0, p], places[1, p], links)
             for p in range(places.shape[1]):
-                mean[number, p] += covariance[p] * left
-                sums[p] = 0.5 * inverse[start + n] * covariance[p]
+                means[p] += covariance[p] * left
+                row[p] = 0.5 * inverse[start + n] * covariance[p]
             for r in range(n):
                 for p in range(places.shape[1]):
-                    sums[p] += inverse[start + r] * work[r, p]
+                    row[p] += inverse[start + r] * work[r, p]
             for p in range(places.shape[1]):
-                explained[p] += 2.0 * sums[p] * covariance[p]
+                explained[p] += 2.0 * row[p] * covariance[p]
         for p in range(places.shape[1]):
+            mean[p, number] = means[p]
             # The fading is part of a link's variance, since it differs in the next step.
-            explained[p] = links.deviation_db * math.sqrt(max(1.0 - explained[p], links.fading))
+            deviation[p, number] = links.deviation_db * math.sqrt(max(1.0 - explained[p], links.fading))
 
 
 @inlined

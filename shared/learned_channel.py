@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from shared.channel import FloatArray, IntArray, Links, path_loss_db
+from shared.channel import FloatArray, IntArray, LinkBudget, Links, path_loss_db
 from shared.radio_map import RadioMap
 from shared.scenario import Point, Scenario
 
@@ -113,7 +113,7 @@ class LearnedChannel:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
+        self._scenario, self._budget = scenario, LinkBudget.of(scenario)
         self.radio_map = RadioMap(scenario.sensors)
         self.failures = RadioFailures(scenario.sensors)
         self._shares = [1.0] * _SHARE_VISITS
@@ -130,7 +130,11 @@ class LearnedChannel:
         Returns:
             their excess losses over the formula, dB.
         """
-        return self.radio_map.measure(ids, place, -gain_db - path_loss_db(distance, self._scenario))
+        from shared.link_expectations import measured_excess
+
+        excess_db = np.empty(len(ids))
+        measured_excess(self._budget, np.array(distance), np.array(gain_db), excess_db)
+        return self.radio_map.measure(ids, place, excess_db)
 
     def links(self, places: FloatArray, distance: FloatArray, ids: IntArray | None = None) -> ExpectedLinks:
         """The links from a UAV's places ``(P, 2)`` to sensors at distances ``(P, n)``, all or those named."""
@@ -148,16 +152,13 @@ class LearnedChannel:
 
     def _transfers(self, places: FloatArray, metres: FloatArray, which: IntArray) -> tuple[IntArray, FloatArray]:
         """Packets and margins of links, as :class:`ExpectedLinks` has them, ``(P, n)`` each, to sensors ``(n,)``."""
-        world = self._scenario
+        # Loading numba takes a fifth of a second, and only what learns the channel needs this.
+        from shared.link_expectations import expected_transfers
+
         mean, deviation = self.radio_map.predict(places, which)
-        loss = path_loss_db(metres, world) + mean
-        with np.errstate(divide="ignore", invalid="ignore"):
-            spare = (world.path_loss_limit_db - loss) / deviation
-        margin = np.where((metres <= world.radio_radius_m) & ~np.isnan(spare), spare, -np.inf)
-        # If a link holds that is expected to fail, its loss is just below the threshold.
-        held = Links(metres, np.minimum(loss, world.path_loss_limit_db - 1e-9), world)
-        moved = np.floor(held.packets * self.share + 1e-9).astype(np.int64)
-        return np.where(margin > -3.0, moved, 0), margin
+        packets, margin = np.empty(metres.shape, dtype=np.int64), np.empty(metres.shape)
+        expected_transfers(self._budget, self.share, np.ascontiguousarray(metres), mean, deviation, packets, margin)
+        return packets, margin
 
     def packets(self, position: Point, place: FloatArray, sensor: int, *, held: bool) -> int:
         """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.

@@ -145,16 +145,13 @@ class RadioMap:
 
     def predict(self, places: FloatArray, which: IntArray) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation, dB, of the excess loss at places ``(P, 2)`` of sensors ``(n,)``: ``(P, n)``."""
-        shape = (len(places), len(which))
-        if not self._inverse.size:
-            return np.zeros(shape), np.full(shape, self.deviation_db)
         from shared.kriging import predict
 
-        mean, deviation = np.empty((2, *shape[::-1]))
-        work = np.empty((self._kept.shape[1] + 1, len(places)))
+        mean, deviation = np.empty((2, len(places), len(which)))
+        work = np.empty((self._kept.shape[1] + 3, len(places)))
         east_north = np.ascontiguousarray(places.T, dtype=np.float64)
         predict(self._measurements(), self._links(), np.array(which), east_north, work, mean, deviation)
-        return mean.T, deviation.T
+        return mean, deviation
 
     def _factor(self, ids: IntArray) -> None:
         """Invert the covariances of these sensors' measurements, and estimate what all links have in common."""

@@ -10,7 +10,8 @@ from service.learning.learner import Learner
 from service.learning.modules import Sample
 from shared.features import FEATURES
 from shared.fleetplan import annealing
-from shared.radio_map import RadioMap
+from shared.learned_channel import LearnedChannel
+from shared.scenario import SCENARIOS
 
 
 def load_for_event_loop() -> None:
@@ -21,11 +22,11 @@ def load_for_event_loop() -> None:
     learner = Learner(initial_weights("random", "paper", 1, 0), learning_rate=1e-3)
     features, approach = np.zeros((1, FEATURES["paper"]), dtype=np.float32), np.zeros(1, dtype=np.float32)
     learner.update(Sample(features=features, chosen=0, approach=approach, velocity=0), cost=1.0)
-    radio_map, place = RadioMap(1), np.zeros((1, 2))
+    channel, sensor = LearnedChannel(SCENARIOS["paper"]), np.zeros(1, dtype=np.int64)
     # The eighth measurement compares the kinds of shadowing.
     for excess_db in range(8):
-        radio_map.measure(np.zeros(1, dtype=np.int64), place[0], np.array([float(excess_db)]))
-    radio_map.predict(place, np.zeros(1, dtype=np.int64))
+        channel.measure(sensor, np.zeros(2), np.zeros(1), np.array([-100.0 - excess_db]))
+    channel.links(np.zeros((1, 2)), np.zeros((1, 1)), sensor)
 
 
 def compile_all() -> None:

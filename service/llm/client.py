@@ -15,6 +15,7 @@ from urllib.request import getproxies, proxy_bypass
 import aiohttp
 import httpx
 from aiohttp.client_proto import ResponseHandler
+from pydantic_core import to_json
 from yarl import URL
 
 from service.llm.answers import Completion, NoDecision, NotUnderstood, TokenPosition, Unreachable
@@ -123,7 +124,7 @@ class LLMClient:
         session: str | None = None,
     ) -> Any:
         content, options = bytearray(), self._proxy
-        sent = None if body is None else json.dumps(body, ensure_ascii=False, separators=(",", ":")).encode()
+        sent = None if body is None else to_json(body)
         if session is not None and self._session_header is not None:
             options = {**options, "headers": {**options.get("headers", {}), self._session_header: session}}
         try:

@@ -1,0 +1,56 @@
+"""What a UAV expects of its links, by the formula and a radio map, compiled as :mod:`shared.kriging` is."""
+
+from __future__ import annotations
+
+import math
+
+from shared.channel import FloatArray, IntArray, LinkBudget, mean_loss_db, whole_rate_bps
+from shared.compiled import compiled, inlined
+
+# A link below this margin hardly ever holds.
+_LEAST_MARGIN = -3.0
+
+_mean_loss_db, _whole_rate_bps = inlined(mean_loss_db), inlined(whole_rate_bps)
+
+
+@compiled
+def measured_excess(world: LinkBudget, distance: FloatArray, gain_db: FloatArray, excess_db: FloatArray) -> None:
+    """The excess losses over the formula of n links, dB, from their distances, metres, and their measured gains."""
+    for n in range(distance.shape[0]):
+        excess_db[n] = -gain_db[n] - _mean_loss_db(distance[n], world)
+
+
+@compiled
+def expected_transfers(
+    world: LinkBudget,
+    share: float,
+    metres: FloatArray,
+    mean_db: FloatArray,
+    deviation_db: FloatArray,
+    packets: IntArray,
+    margin: FloatArray,
+) -> None:
+    """Packets and margins of links ``(P, n)``, as :class:`shared.learned_channel.ExpectedLinks` has them.
+
+    Args:
+        share: the rate that transfers get, as a share of the formula's.
+        metres: horizontal distances.
+        mean_db, deviation_db: of the excess losses.
+        packets, margin: are written.
+    """
+    for p in range(metres.shape[0]):
+        for n in range(metres.shape[1]):
+            packets[p, n], margin[p, n] = 0, -math.inf
+            if not metres[p, n] <= world.radio_radius_m:
+                continue
+            loss = _mean_loss_db(metres[p, n], world) + mean_db[p, n]
+            spare = world.path_loss_limit_db - loss
+            if deviation_db[p, n] > 0.0:
+                margin[p, n] = spare / deviation_db[p, n]
+            elif spare != 0.0:
+                margin[p, n] = math.copysign(math.inf, spare)
+            if margin[p, n] > _LEAST_MARGIN:
+                # If a link holds that is expected to fail, its loss is just below the threshold.
+                rate = _whole_rate_bps(min(loss, world.path_loss_limit_db - 1e-9), world)
+                moved = math.floor(rate * world.step_s / world.packet_bits + 1e-9)
+                packets[p, n] = int(math.floor(moved * share + 1e-9))
