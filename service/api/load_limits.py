@@ -94,8 +94,9 @@ class RequestLimits:
         except (_TooLarge, TimeoutError, _Damaged) as fault:
             await self._refusal(fault)(scope, receive, send)
             return None
-        scope["headers"] = [(n, v) for n, v in scope["headers"] if n.lower() not in _REWRITTEN]
-        scope["headers"].append((b"content-length", str(len(body)).encode()))
+        if encoding in _DECODERS or b"content-length" not in headers:
+            scope["headers"] = [(n, v) for n, v in scope["headers"] if n.lower() not in _REWRITTEN]
+            scope["headers"].append((b"content-length", str(len(body)).encode()))
         return body
 
     def _refusal(self, fault: Exception) -> Response:

@@ -135,7 +135,7 @@ def _threads(count: int) -> ThreadPoolExecutor:
 
 def top_k(scores: Array, k: int) -> list[int]:
     """Indices of the k best scores, best first; of all where there are fewer. Of equals, the first."""
-    best: list[int] = np.argsort(-scores, kind="stable")[:k].tolist()
+    best: list[int] = (-scores).argsort(kind="stable")[:k].tolist()
     return best
 
 

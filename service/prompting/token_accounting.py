@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 # The tokenizer makes a token of every three digits, from the left.
 _DIGITS_A_TOKEN = 3
-_MOST_DIGITS = 18
+# The least numbers of one token more, in ascending order.
+_LONGER = 10 ** np.arange(_DIGITS_A_TOKEN, 18, _DIGITS_A_TOKEN)
 # The placeholder for a number while the text around it is counted: one token, and not zero, which has no sign.
 _PLACEHOLDER = "5"
 
@@ -115,18 +116,14 @@ class UnprunedState:
     def tokens(self, count: Callable[[str], int]) -> int:
         """``count(text)``, for a tokenizer that splits digits and lines as o200k_base does."""
         names, numbers, unknown = self._numbers()
-        digits = np.where(unknown, 0, 1)
-        for more in range(_DIGITS_A_TOKEN, _MOST_DIGITS, _DIGITS_A_TOKEN):
-            longer = np.abs(numbers) >= 10**more
-            if not longer.any():
-                break
-            digits += longer & ~unknown
+        sizes = np.abs(numbers[~unknown])
+        digits = len(sizes) + int(np.add.reduce(_LONGER.searchsorted(sizes, side="right")))
         kinds = np.where(unknown, 2, numbers < 0) @ _columns(names)[1]
         total = count(self.head) if self.head else 0
         for kind, often in Counter(kinds.tolist()).items():
             text, known = _example_row(self.write, names, kind)
             total += often * (count(text) - known)
-        return total + int(digits.sum())
+        return total + digits
 
     def _numbers(self) -> tuple[tuple[str, ...], NDArray[np.int64], NDArray[np.bool_]]:
         """The columns' names, their whole numbers ``(J, C)``, and which of these are unknown for want of a beacon."""
