@@ -152,7 +152,6 @@ class LearnedChannel:
 
     def _transfers(self, places: FloatArray, metres: FloatArray, which: IntArray) -> tuple[IntArray, FloatArray]:
         """Packets and margins of links, as :class:`ExpectedLinks` has them, ``(P, n)`` each, to sensors ``(n,)``."""
-        # Loading numba takes a fifth of a second, and only what learns the channel needs this.
         from shared.link_expectations import expected_transfers
 
         mean, deviation = self.radio_map.predict(places, which)

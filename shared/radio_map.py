@@ -116,7 +116,7 @@ class RadioMap:
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        # Loading numba takes a fifth of a second, and only what learns the channel needs this.
+        # Loading numba takes a fifth of a second, which commands that learn no channel save.
         from shared.kriging import take_measurements
 
         due = not self.exact and (self.heard >= self._compared or self.heard % _REFRESH < len(ids))

@@ -48,7 +48,7 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     scenario, sensors, count = state.scenario, len(state.sensors), len(candidates)
     if not sensors:
         return Evaluation(np.zeros(count), np.ones(count))
-    # Loading numba takes a fifth of a second, and only mode ``guided`` needs this.
+    # Only mode ``guided`` needs the compiled flights.
     from service.deciding.rollout_flights import FlownWorld, fly_candidates
 
     uavs = list(state.links)

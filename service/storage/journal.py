@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 # Events between two checkpoints of a mission: replaying so many takes a fraction of a second. A decision about many
 # sensors takes longer to replay, and counts for one more event every hundred sensors.
-_EVENTS = 256
+_EVENTS = 512
 _SENSORS = 100
 # From so many sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
