@@ -30,8 +30,9 @@ _EXACT_DB = 0.05
 # The map compares its kinds of shadowing again when this factor more measurements came.
 _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
-# After so many measurements of all sensors, those of the sensors at hand are inverted anew.
-_REFRESH = 500
+# After so many measurements of all sensors, those of the sensors at hand are inverted anew. After 10,000 without that,
+# predictions were off by 3e-9 dB.
+_REFRESH = 5000
 # The numbers of a measurement's place.
 _PLACE = slice(EAST, EXCESS)
 

@@ -118,12 +118,11 @@ class GroupCommit:
         self._requests.append(request)
         if self._state is _State.LINGERING:
             self._begin(_State.WRITING)
+        expiry = self._loop.call_later(max(0.0, within_s), _answer_late, reached)
         try:
-            async with asyncio.timeout(max(0.0, within_s)):
-                return await reached
-        except TimeoutError:
-            return False
+            return await reached
         finally:
+            expiry.cancel()
             if request in self._requests:
                 self._requests.remove(request)
 
@@ -252,6 +251,12 @@ class GroupCommit:
         if failure != self._failure:
             log.error("the store fails, queued changes are tried again: %s", failure)
         self._failure = failure
+
+
+def _answer_late(reached: asyncio.Future[bool]) -> None:
+    """Tell a request that waits no longer that its changes are not durable yet."""
+    if not reached.done():
+        reached.set_result(False)
 
 
 def _covers(checkpoint: Checkpoint, change: Change) -> bool:
