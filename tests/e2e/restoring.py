@@ -18,7 +18,11 @@ from fastapi.responses import Response
 
 from service.api.app import create_app
 from service.config.settings import Settings
+from service.learning.initial_weights import initial_weights
+from service.learning.learner import Learner
+from service.learning.modules import Sample
 from service.storage.store import Store
+from shared.radio_map import RadioMap
 from tests.running import serving
 from tests.service.stub_llm import StubLlm, said, wait_for
 from tests.waiting import PATIENCE_S
@@ -122,14 +126,26 @@ def digest(body: Body) -> str:
 
 
 def arithmetic() -> str:
-    """What numpy and torch make of some numbers here: where that is as recorded, so is every bit that follows."""
-    numbers = np.random.default_rng(0).normal(size=(16, 16)).astype(np.float32)
+    """What numpy, torch and numba make of some numbers here: where that is as recorded, so is every bit that follows.
+
+    Numba's functions call the C library's exponentials.
+    """
+    random = np.random.default_rng(0)
+    numbers = random.normal(size=(16, 16)).astype(np.float32)
     tensor = torch.from_numpy(numbers)
     made = [numbers @ numbers[0], numbers @ numbers, np.exp(numbers), np.tanh(numbers), np.log(numbers**2)]
     made += [
         numbers.sum(axis=1),
         *(t.numpy() for t in (tensor @ tensor[0], tensor @ tensor, tensor.softmax(-1), tensor.sum(-1))),
     ]
+    radio_map = RadioMap(4)
+    for place in random.uniform(0, 1000, (30, 2)):
+        radio_map.measure(np.arange(4), place, random.normal(0, 8, 4))
+    made += radio_map.predict(random.uniform(0, 1000, (5, 2)), np.arange(4))
+    learner = Learner(initial_weights("pretrained", "paper", 15, 0), learning_rate=1e-2)
+    for rows in numbers:
+        learner.update(Sample(rows[:15].reshape(3, 5), 1, rows[15:], 7), cost=0.5)
+    made.append(learner.weights.flat)
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in made)).hexdigest()[:16]
 
 
