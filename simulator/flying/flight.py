@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from pydantic_core import PydanticSerializationError
 
 from shared.scenario import Scenario
 from shared.schemas import Uplink
@@ -132,7 +133,10 @@ def fly(
             if on_step is not None:
                 on_step(flight)
         pilot.land()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, PydanticSerializationError) as error:
+        # pydantic makes its own error of an interrupt that comes while it writes a model.
+        if isinstance(error, PydanticSerializationError) and "KeyboardInterrupt" not in str(error):
+            raise
         flight.interrupted = True
         flight.decisions = [decision for decision in flight.decisions if decision.step < flight.steps_flown]
         if log is not None:

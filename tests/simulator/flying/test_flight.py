@@ -1,10 +1,12 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel, model_serializer
+from pydantic_core import PydanticSerializationError
 
 from shared.scenario import SCENARIOS, Scenario
 from simulator.client import EdgeClient
@@ -54,10 +56,31 @@ def test_a_local_policy_flies_as_in_rollout() -> None:
     assert {d.reason for d in flight.decisions} == {"policy_wqcs"}
 
 
-def test_an_interrupt_keeps_the_whole_steps(stub: EdgeStub, client: EdgeClient, tmp_path: Path) -> None:
+class Interrupted(BaseModel):
+    """An interrupt comes while pydantic writes the model."""
+
+    cause: type[BaseException]
+
+    @model_serializer
+    def written(self) -> str:
+        raise self.cause
+
+
+def within_pydantic() -> None:
+    Interrupted(cause=KeyboardInterrupt).model_dump_json()
+
+
+def between_two_instructions() -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("interrupted", [between_two_instructions, within_pydantic])
+def test_an_interrupt_keeps_the_whole_steps(
+    stub: EdgeStub, client: EdgeClient, tmp_path: Path, interrupted: Callable[[], None]
+) -> None:
     def interrupt(choice: Choice) -> None:
         if stub.request_count == 8:
-            raise KeyboardInterrupt
+            interrupted()
 
     with DecisionLog(tmp_path / "d.jsonl") as log:
         flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), 0, log, on_decision=interrupt)
@@ -65,6 +88,14 @@ def test_an_interrupt_keeps_the_whole_steps(stub: EdgeStub, client: EdgeClient, 
     assert read_decisions(tmp_path / "d.jsonl") == flight.decisions and len(flight.decisions) == 6
     others = baselines(Site(SHORT), 0, flight.steps_flown)
     assert {name: len(tally) for name, tally in others.items()} == {"eof": 2, "wqcs": 2}
+
+
+def test_a_model_that_cannot_be_written_is_no_interrupt(client: EdgeClient) -> None:
+    def fail(choice: Choice) -> None:
+        Interrupted(cause=ValueError).model_dump_json()
+
+    with pytest.raises(PydanticSerializationError, match="ValueError"):
+        fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), 0, on_decision=fail)
 
 
 def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient, monkeypatch: pytest.MonkeyPatch) -> None:
