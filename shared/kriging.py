@@ -1,4 +1,6 @@
-"""Simple kriging on a radio map's arrays: numba compiles it, and without numba it takes milliseconds of plain Python.
+"""Simple kriging on a radio map's arrays, compiled by numba.
+
+Without numba it is plain Python: a measurement takes 2 ms, the comparison of the kinds of shadowing up to 0.4 s.
 
 Symmetric matrices are packed, as :class:`~shared.radio_map_arrays.Measurements` has them.
 """
@@ -27,14 +29,12 @@ def take_measurements(
     east: float,
     north: float,
     excess: FloatArray,
-    solve: bool,
 ) -> None:
     """Take one UAV's measurements of n sensors at its place, as :meth:`shared.radio_map.RadioMap.measure` does.
 
     Args:
         ids: shape ``(n,)``, each sensor once.
         excess: shape ``(n,)``, dB.
-        solve: whether to solve ``K^-1 r`` and ``K^-1 1`` too.
     """
     for number in range(ids.shape[0]):
         sensor = ids[number]
@@ -48,7 +48,7 @@ def take_measurements(
         if not dropped:
             many += 1
             of.counts[sensor] = many
-        if solve and of.inverse.shape[0] > 0:
+        if of.inverse.shape[0] > 0:
             _solve(of.inverse[sensor], kept, many, of.work)
 
 

@@ -73,7 +73,6 @@ class RadioMap:
         self.offset_db, self.deviation_db = 0.0, PRIOR_DB
         # K^-1 of each sensor, packed; empty until a gain differs from the formula.
         self._inverse: FloatArray = np.zeros((0, 0))
-        self._work: FloatArray = np.zeros((3, kept))
 
     @property
     def places(self) -> FloatArray:
@@ -120,23 +119,22 @@ class RadioMap:
         # Loading numba takes a fifth of a second, which commands that learn no channel save.
         from shared.kriging import take_measurements
 
-        due = not self.exact and (self.heard >= self._compared or self.heard % _REFRESH < len(ids))
         east, north = np.asarray(place, dtype=np.float64).tolist()
         # A copy, because numba would compile the function again for an array that is read-only.
-        take_measurements(self._measurements(), self._links(), np.array(ids), east, north, excess, not due)
+        take_measurements(self._measurements(), self._links(), np.array(ids), east, north, excess)
         if self.exact:
             self.deviation_db = 0.0
-        elif not due:
-            self._estimate()
         elif self.heard >= self._compared:
             self._compared = int(np.ceil(self.heard * _COMPARE_GROWTH))
             self._compare()
-        else:
+        elif self.heard % _REFRESH < len(ids):
             self._factor(ids)
+        else:
+            self._estimate()
         return excess
 
     def _measurements(self) -> Measurements:
-        return Measurements(self._kept, self.count, self._inverse, self._work)
+        return Measurements(self._kept, self.count, self._inverse, np.empty((3, self._kept.shape[1])))
 
     def _links(self) -> LinkStatistics:
         kind = self.kind
@@ -200,7 +198,6 @@ class RadioMap:
             (TAKEN, "taken"),
         ]
         self._kept = np.zeros((*state["excess"].shape, NUMBERS))
-        self._work = np.zeros((3, self._kept.shape[1]))
         for number, name in numbers:
             self._kept[..., number] = state[name]
         self.count = state["count"]

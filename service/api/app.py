@@ -62,11 +62,12 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
         embed = embedded if member is None else _shared_llm(member)
         llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc, embed)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
-        await asyncio.to_thread(load_for_event_loop)
         engine = Engine(settings, llm, counter, metrics, traces, store, member)
         app.state.engine = engine
         llm.start()
         try:
+            # Beside the LLM, which loads meanwhile.
+            await asyncio.to_thread(load_for_event_loop)
             yield {"engine": engine, "llm": llm, "metrics": metrics}
         finally:
             may_close = await engine.close()
