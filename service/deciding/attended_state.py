@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from time import perf_counter
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.deciding.prompt_view import PromptView
 from service.deciding.stopwatch import Stopwatch
 from service.guidance.step_guidance import StepGuidance
-from service.learning.modules import Sample, top_k
+from service.learning.modules import Attended, Sample, top_k
 from service.mission.decisions import Pending
 from service.mission.mission import Mission
 from service.prompting.row_formats import cells
@@ -34,7 +34,7 @@ class AttendedState:
         prompt_view: what the prompt shows, which may have orders that are not confirmed yet.
         admissible: rows of the state that may be chosen, n of them.
         features: shape ``(n, d)``, the attention module's input.
-        contexts: shape ``(n, d')``, its output ``z_j``.
+        contexts: its output ``z_j`` of some of the n, ``(m, d')``.
         rows: rows of the state that attention keeps, best first; without attention all that are admissible.
         candidates: the same sensors with their scores ``s_j``.
     """
@@ -48,7 +48,7 @@ class AttendedState:
     prompt_view: PromptView
     admissible: list[int]
     features: NDArray[np.float32]
-    contexts: NDArray[np.float32]
+    contexts: Callable[[list[int]], NDArray[np.float32]]
     rows: list[int]
     candidates: list[Candidate]
     _velocity_values: dict[int, NDArray[np.float32]] = field(default_factory=dict)
@@ -84,11 +84,11 @@ class AttendedState:
         watch.ended.append(("augment", perf_counter()))
         admissible: list[int] = np.flatnonzero(state.admissible).tolist()
         features = state.features(scenario)
-        kept, scores, contexts = _attend(mission, features, admissible, view.added)
+        kept, attended = _attend(mission, features, None if view.added is None else view.added[admissible])
         rows = [admissible[i] for i in kept]
         candidates = [
-            Candidate(sensor_id=sensor, score=round(scores[i], 6))
-            for sensor, i in zip(state.ids[rows].tolist(), kept, strict=True)
+            Candidate(sensor_id=sensor, score=round(score, 6))
+            for sensor, score in zip(state.ids[rows].tolist(), attended.scores[kept].tolist(), strict=True)
         ]
         watch.ended.append(("attend", perf_counter()))
         return cls(
@@ -101,7 +101,7 @@ class AttendedState:
             prompt_view=view,
             admissible=admissible,
             features=features,
-            contexts=contexts,
+            contexts=attended.contexts,
             rows=rows,
             candidates=candidates,
         )
@@ -164,22 +164,21 @@ class AttendedState:
     def values_of_velocities(self, rows: Sequence[int]) -> list[NDArray[np.float32]]:
         """The learned ``u_jv`` of the sensors in these rows at each velocity level v, ``(V,)`` each."""
         if missing := [row for row in rows if row not in self._velocity_values]:
-            contexts = self.contexts[[self.admissible.index(row) for row in missing]]
+            contexts = self.contexts([self.admissible.index(row) for row in missing])
             approaches = self.state.approaches(missing, self.mission.scenario)
             values = self.mission.learner.weights.velocities(contexts, approaches)
             self._velocity_values.update(zip(missing, values, strict=True))
         return [self._velocity_values[row] for row in rows]
 
 
-def _attend(
-    mission: Mission, features: NDArray[np.float32], admissible: list[int], added: FloatArray | None
-) -> tuple[list[int], list[float], NDArray[np.float32]]:
-    """Places in ``admissible`` of the sensors to keep, best first, the scores of all ``(n,)``, and their contexts."""
-    if not admissible:
-        return [], [], np.empty(0, dtype=np.float32)
-    scores, contexts = mission.learner.weights.score(features)
+def _attend(mission: Mission, features: NDArray[np.float32], added: FloatArray | None) -> tuple[list[int], Attended]:
+    """Places among the n sensors of those to keep, best first, and the attention of all, with ``added`` packets."""
+    if not len(features):
+        return [], Attended(np.empty(0, dtype=np.float32), features.__getitem__)
+    attended = mission.learner.weights.attend(features)
     if added is not None:
         # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
-        scores = scores + (added[admissible] / mission.scenario.queue_capacity).astype(np.float32)
-    kept = top_k(scores, mission.top_k) if mission.uses_attention else list(range(len(admissible)))
-    return kept, scores.tolist(), contexts
+        more = (added / mission.scenario.queue_capacity).astype(np.float32)
+        attended = attended._replace(scores=attended.scores + more)
+    kept = top_k(attended.scores, mission.top_k) if mission.uses_attention else list(range(len(features)))
+    return kept, attended

@@ -8,6 +8,7 @@ from service.deciding import rollout_evaluator
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
+from service.learning.softmax_means import softmax_means
 from shared.features import FEATURES
 from shared.fleetplan import annealing
 from shared.learned_channel import LearnedChannel
@@ -19,6 +20,8 @@ def load_for_event_loop() -> None:
 
     The edge does so before it is ready. Threads load what plans and evaluates when a mission needs it.
     """
+    one = np.zeros((1, 1), dtype=np.float32)
+    softmax_means(one, one, one[0])
     learner = Learner(initial_weights("random", "paper", 1, 0), learning_rate=1e-3)
     features, approach = np.zeros((1, FEATURES["paper"]), dtype=np.float32), np.zeros(1, dtype=np.float32)
     learner.update(Sample(features=features, chosen=0, approach=approach, velocity=0), cost=1.0)

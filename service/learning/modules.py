@@ -6,9 +6,8 @@ as torch modules, for training offline.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,19 +16,15 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from shared.cores import usable_cores
+from service.learning.softmax_means import softmax_means
 from shared.features import FEATURES, LEVEL_FEATURES
 from shared.schemas import Features
 
 Array = NDArray[np.float32]
 
 WIDTH = 32
-# From so many sensors on, torch's kernel is faster than numpy; from so many, its time is that of the heads' products.
-_FOR_TORCH, _NARROW = 64, 512
-# The kernel is fastest where a head's dimension is a multiple of this.
-_LANES = 16
-# Queries that one core computes at a time. The share does not depend on the number of cores, so neither do the results.
-_SHARE = 256
+# Fewer sensors are scored in numpy, with an n x n array.
+_MANY = 64
 
 
 class Sample(NamedTuple):
@@ -102,35 +97,19 @@ def attend(weights: AttentionWeights, x: Tensor, admissible: Tensor | None = Non
     return functional.linear(z, weights.score, weights.bias)[..., 0], z
 
 
-@torch.inference_mode()
-def attend_narrow(weights: AttentionWeights, x: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`attend` of many sensors ``(n, d)``, with heads as wide as their features.
+class Attended(NamedTuple):
+    """The attention of n sensors: their scores ``(n,)``, and the contexts ``(m, d')`` of the sensors in some rows."""
 
-    ``q_i k_j = x_i (W_q^T W_k) x_j`` and ``sum_j a_ij v_j = W_v sum_j a_ij x_j``: the kernel's products have the d
-    features, filled up with zeros, in place of d' dimensions.
-    """
-    n, d = x.shape
-    wide = torch.zeros(2, 1, 1, n, -(-d // _LANES) * _LANES)
-    queries, keys = wide
-    keys[..., :d] = x
-    queries[..., :d] = x @ (weights.query.T @ weights.key)
-    shares = [(share, keys, len(weights.query) ** -0.5) for share in torch.split(queries, _SHARE, dim=2)]
-    cores = usable_cores()
-    attended = _threads(cores).map(_means_of, shares) if cores > 1 else map(_means_of, shares)
-    z = functional.linear(torch.cat([*attended], dim=2)[0, 0, :, :d], weights.value)
-    return functional.linear(z, weights.score, weights.bias)[:, 0], z
+    scores: Array
+    contexts: Callable[[list[int]], Array]
 
 
-@torch.inference_mode()
-def _means_of(share: tuple[Tensor, Tensor, float]) -> Tensor:
-    """The means of the keys as some queries weigh them, from the queries, the keys and the products' scale."""
-    queries, keys, scale = share
-    return functional.scaled_dot_product_attention(queries, keys, keys, scale=scale)
-
-
-@cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="attention")
+def _softmax(logits: Array) -> Array:
+    """The softmax of each row; ``logits`` are overwritten."""
+    logits -= logits.max(axis=1, keepdims=True)
+    np.exp(logits, out=logits)
+    logits /= logits.sum(axis=1, keepdims=True)
+    return logits
 
 
 def top_k(scores: Array, k: int) -> list[int]:
@@ -158,8 +137,6 @@ def _values(weights: VelocityWeights, x: Tensor) -> Tensor:
 class Weights:
     """The parameters that decisions compute with: a finished copy that nothing changes.
 
-    Few sensors are scored in numpy, many by torch's kernel: for ten sensors torch's calls take longer than the sums.
-
     Attributes:
         layout: positions of the parameters in ``flat``.
         flat: all parameters, ``(size,)``.
@@ -177,22 +154,27 @@ class Weights:
         """The attention module's parameters by name."""
         return {name: getattr(self.parameters, name) for name in AttentionWeights._fields}
 
-    def score(self, features: Array) -> tuple[Array, Array]:
-        """Scores ``(n,)`` and contexts ``(n, d')`` of n sensors' features ``(n, d)``, as :func:`attend`."""
-        if len(features) >= _FOR_TORCH:
-            with torch.inference_mode():
-                attention = AttentionWeights(*map(torch.from_numpy, self.attention.values()))
-                kernel = attend_narrow if len(features) >= _NARROW else attend
-                scores, contexts = kernel(attention, torch.from_numpy(features))
-                return scores.numpy(), contexts.numpy()
+    def attend(self, features: Array) -> Attended:
+        """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`."""
         own = self.parameters
-        similar = (features @ own.query.T) @ (features @ own.key.T).T
+        if len(features) >= _MANY:
+            # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
+            queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)
+            scores = softmax_means(queries, features, features @ (own.score[0] @ own.value)) + own.bias[0]
+            return Attended(scores, partial(self._contexts, features, queries))
+        similar: Array = (features @ own.query.T) @ (features @ own.key.T).T
         similar *= np.float32(len(own.query) ** -0.5)
-        similar -= similar.max(axis=1, keepdims=True)
-        np.exp(similar, out=similar)
-        similar /= similar.sum(axis=1, keepdims=True)
-        z = similar @ (features @ own.value.T)
-        return z @ own.score[0] + own.bias[0], z
+        z = _softmax(similar) @ (features @ own.value.T)
+        return Attended(z @ own.score[0] + own.bias[0], z.__getitem__)
+
+    def _contexts(self, features: Array, queries: Array, rows: list[int]) -> Array:
+        """The contexts of some rows ``(m, d')``, from all features and queries ``(n, d)``."""
+        contexts = np.empty((len(rows), len(self.parameters.value)), dtype=np.float32)
+        # One after another, as in `velocities`.
+        for place, row in enumerate(rows):
+            weights = _softmax((features @ queries[row])[None])
+            contexts[place] = self.parameters.value @ (weights @ features)[0]
+        return contexts
 
     def velocities(self, contexts: Array, approaches: Array) -> list[Array]:
         """Values ``(levels,)`` of the velocities for each of n sensors, from their contexts ``(n, d')``."""

@@ -86,7 +86,7 @@ def solved(spec: MissionSpec, features: Features, scenario: Scenario, weights: W
         state = demonstration.state(pool.scenario, features)
         rows = np.flatnonzero(state.admissible)
         if k is not None:
-            rows = rows[top_k(weights.score(state.features(pool.scenario))[0], k)]
+            rows = rows[top_k(weights.attend(state.features(pool.scenario)).scores, k)]
         if spec.prompt.order == "shuffled":
             rows = np.random.default_rng([spec.seed, number]).permutation(rows)
         if demonstration.sensor_id in state.ids[rows] and demonstration.velocity <= scenario.max_velocity:

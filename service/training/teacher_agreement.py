@@ -22,7 +22,7 @@ def references(examples: Sequence[Example]) -> dict[str, list[TeacherDecision]]:
 def recall(weights: Weights, references: Sequence[TeacherDecision], k: int) -> float:
     """The share of decisions with the teacher's sensor among the k best, of those with more than k candidates."""
     hits = [
-        taught.sample.chosen in top_k(weights.score(taught.sample.features)[0], k)
+        taught.sample.chosen in top_k(weights.attend(taught.sample.features).scores, k)
         for taught in references
         if len(taught.sample.features) > k
     ]
@@ -41,5 +41,5 @@ def velocity_agreement(weights: Weights, references: Sequence[TeacherDecision]) 
 
 def _best_velocity(weights: Weights, taught: TeacherDecision) -> int:
     sample = taught.sample
-    _, z = weights.score(sample.features)
-    return int(weights.velocities(z[sample.chosen, None], sample.approach[None])[0].argmax())
+    contexts = weights.attend(sample.features).contexts([sample.chosen])
+    return int(weights.velocities(contexts, sample.approach[None])[0].argmax())

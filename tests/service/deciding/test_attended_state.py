@@ -45,7 +45,7 @@ def test_a_sensor_with_a_flat_battery_never_reaches_the_softmax() -> None:
 def test_top_k_is_the_missions() -> None:
     view = attended(mission(top_k=2), uav())
     assert len(view.rows) == 2
-    scores, _ = mission().learner.weights.score(view.state.features(PAPER))
+    scores = mission().learner.weights.attend(view.state.features(PAPER)).scores
     assert view.kept_ids == np.argsort(-scores)[:2].tolist()
 
 

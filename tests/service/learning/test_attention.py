@@ -4,7 +4,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from service.learning.modules import Attention, AttentionWeights, attend_narrow, top_k
+from service.learning.modules import Attention, Modules, top_k
 
 
 def reference(
@@ -52,38 +52,22 @@ def test_torchs_kernel_that_keeps_no_square_of_the_sensors_takes_it() -> None:
     assert (scores.shape, z.shape) == ((10,), (10, 32))
 
 
-def weights_of(attention: Attention) -> AttentionWeights:
-    query, key, value, score = attention.query, attention.key, attention.value, attention.score
-    tensors = query.weight, key.weight, value.weight, score.weight, score.bias
-    return AttentionWeights(*(tensor.detach() for tensor in tensors))
-
-
-@pytest.mark.parametrize("sensors", [512, 2047, 2048, 4097])
-def test_many_sensors_are_shared_among_cores_and_give_the_same_to_the_bit(
-    sensors: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    torch.manual_seed(1)
-    weights, x = weights_of(Attention(12)), torch.rand(sensors, 12)
-    monkeypatch.setattr("service.learning.modules.usable_cores", lambda: 1)
-    at_once = attend_narrow(weights, x)
-    for cores in (2, 3, 16):
-        monkeypatch.setattr("service.learning.modules.usable_cores", lambda cores=cores: cores)
-        shared = attend_narrow(weights, x)
-        assert torch.equal(shared[0], at_once[0])
-        assert torch.equal(shared[1], at_once[1])
-
-
-@pytest.mark.parametrize(("sensors", "features"), [(1, 5), (600, 5), (600, 12), (3000, 12), (600, 17)])
-def test_heads_as_wide_as_the_features_give_the_same_scores(sensors: int, features: int) -> None:
+@pytest.mark.parametrize("features", [5, 12, 17])
+@pytest.mark.parametrize("sensors", [63, 64, 600, 3000])
+def test_decisions_score_many_sensors_as_the_reference(sensors: int, features: int) -> None:
     torch.manual_seed(2)
-    attention = Attention(features)
+    modules = Modules("paper", 15, seed=0)
+    modules.attention = Attention(features)
     # Learned weights tell sensors apart more sharply than random ones.
     with torch.no_grad():
-        attention.query.weight *= 4
-    x = torch.rand(sensors, features)
-    expected = reference(x.numpy().astype(np.float64), np.ones(sensors, dtype=np.bool_), attention)
-    for found, wanted in zip(attend_narrow(weights_of(attention), x), expected, strict=True):
-        np.testing.assert_allclose(found.numpy(), wanted, atol=1e-5)
+        modules.attention.query.weight *= 4
+    x, rows = torch.rand(sensors, features).numpy(), [sensors - 1, 0, 17]
+    scores, z = reference(x.astype(np.float64), np.ones(sensors, dtype=np.bool_), modules.attention)
+    attended = modules.weights().attend(x)
+    np.testing.assert_allclose(attended.scores, scores, atol=2e-6)
+    np.testing.assert_allclose(attended.contexts(rows), z[rows], atol=2e-6)
+    # Which rows are asked for at a time changes no bit of a velocity's value.
+    np.testing.assert_array_equal(attended.contexts(rows[:1])[0], attended.contexts(rows)[0])
 
 
 def test_a_masked_sensor_changes_nothing() -> None:

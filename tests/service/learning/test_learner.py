@@ -105,9 +105,9 @@ def test_decisions_compute_what_the_modules_compute(preset: Features, sensors: i
         modules, case = Modules(preset, 15, seed=seed), sample(preset, seed, sensors)
         with torch.no_grad():
             scores, values = modules.evaluate(case)
-        found, contexts = modules.weights().score(case.features)
+        found, contexts = modules.weights().attend(case.features)
         np.testing.assert_allclose(found, scores.numpy(), atol=2e-6)
-        levels = modules.weights().velocities(contexts[[case.chosen]], case.approach[None])[0]
+        levels = modules.weights().velocities(contexts([case.chosen]), case.approach[None])[0]
         np.testing.assert_allclose(levels, values.numpy(), atol=2e-6)
 
 
@@ -136,7 +136,7 @@ def test_what_was_kept_goes_on_as_if_it_had_never_stopped() -> None:
     for seed in range(10, 20):
         again.update(sample("reach", seed), cost=0.3)
     assert np.array_equal(
-        again.weights.score(sample("reach").features)[0], through.weights.score(sample("reach").features)[0]
+        again.weights.attend(sample("reach").features).scores, through.weights.attend(sample("reach").features).scores
     )
     with pytest.raises(ValueError):
         Learner(Modules("paper", 15, seed=1).weights(), learning_rate=5e-3).load_state_dict(first.state_dict())
@@ -150,11 +150,11 @@ def test_missions_share_modules_and_until_they_learn_the_pretrained_weights() ->
         other.update(sample("reach", 100 + seed), cost=1.3)
     for seed in range(20):
         alone.update(sample("reach", seed), cost=0.3)
-    scores = [learner.weights.score(sample("reach").features)[0] for learner in (one, other, alone)]
+    scores = [learner.weights.attend(sample("reach").features).scores for learner in (one, other, alone)]
     assert np.array_equal(scores[0], scores[2])
     assert not np.array_equal(scores[0], scores[1])
     assert not np.array_equal(
-        scores[0], initial_weights("pretrained", "reach", 15, 0).score(sample("reach").features)[0]
+        scores[0], initial_weights("pretrained", "reach", 15, 0).attend(sample("reach").features).scores
     )
 
 
@@ -189,7 +189,7 @@ def test_a_decision_never_sees_half_a_step() -> None:
     learner = Learner(Modules("reach", 15, seed=1).weights(), learning_rate=0.1)
 
     def scores() -> Scores:
-        return tuple(learner.weights.score(features)[0].tolist())
+        return tuple(learner.weights.attend(features).scores.tolist())
 
     for seed in range(3):
         in_hand, before = learner.weights, scores()
@@ -198,7 +198,7 @@ def test_a_decision_never_sees_half_a_step() -> None:
         assert before != after
         assert len(seen) > 10 and {before, after} == {*seen, after}
         # Nor does a decision that was begun before the lesson: its copy is as it was.
-        assert tuple(in_hand.score(features)[0].tolist()) == before
+        assert tuple(in_hand.attend(features).scores.tolist()) == before
 
 
 def test_nothing_brings_torchs_compiler_into_the_process() -> None:
@@ -217,6 +217,6 @@ def test_the_seed_decides_the_initial_weights_and_leaves_torch_alone() -> None:
     state = torch.random.get_rng_state()
     a, b, c = Modules("paper", 15, seed=1), Modules("paper", 15, seed=1), Modules("paper", 15, seed=2)
     assert torch.equal(torch.random.get_rng_state(), state)
-    scores = [m.weights().score(sample().features)[0] for m in (a, b, c)]
+    scores = [m.weights().attend(sample().features).scores for m in (a, b, c)]
     assert np.array_equal(scores[0], scores[1])
     assert not np.array_equal(scores[0], scores[2])

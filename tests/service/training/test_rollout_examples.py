@@ -132,8 +132,8 @@ def test_recall_is_one_where_everyone_is_kept_and_grows_with_k() -> None:
 
 def test_velocities_agree_with_themselves() -> None:
     weights = Modules("reach", 15, seed=0).weights()
-    _, z = weights.score(taught().sample.features)
-    best = int(weights.velocities(z[2, None], taught().sample.approach[None])[0].argmax())
+    contexts = weights.attend(taught().sample.features).contexts([2])
+    best = int(weights.velocities(contexts, taught().sample.approach[None])[0].argmax())
     assert velocity_agreement(weights, [taught(velocity=best)]) == 1
     assert velocity_error(weights, [taught(velocity=best)]) == 0
     other = best - 3 if best >= 3 else best + 3

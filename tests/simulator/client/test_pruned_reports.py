@@ -36,7 +36,7 @@ def test_the_same_features_have_the_same_scores(features: Features, n: int) -> N
     mission = Mission("test", MissionSpec(features=features), Settings(mode="value"))
     told = MissionAttention.model_validate_json(attention_of(mission).model_dump_json())
     x = np.random.default_rng(n).random((n, FEATURES[features]), dtype=np.float32)
-    expected, _ = mission.learner.weights.score(x)
+    expected = mission.learner.weights.attend(x).scores
     scores = Attention.of(told).scores(x)
     assert scores.shape == (n,) and np.abs(scores - expected).max() < 1e-5
     assert np.argsort(-scores, kind="stable")[:5].tolist() == top_k(expected, 5)
