@@ -26,9 +26,10 @@ _KEYS, _DIMENSIONS = 4, 4
 # The largest product of a query with some keys, about so many, stands for its largest product. Where it is so far below
 # that the sum of the weights exceeds this, the largest one of all is looked for.
 _SOME_KEYS, _MOST_WEIGHT = 64, np.float32(2.0**100)
-# Exponents of 2 that a number has: weights outside are as good as zero, or too large.
-_LEAST, _MOST = np.float32(-126.0), np.float32(126.0)
-# Added before a number of these is cut, and subtracted after it, so that it is rounded.
+# Exponents of 2. Weights below are as good as zero, and not so small that the processor computes them slowly; weights
+# above are more than a number can be.
+_LEAST, _MOST = np.float32(-100.0), np.float32(126.0)
+# Added before an exponent is cut to a whole number, and subtracted after it: it is rounded.
 _ROUNDS, _BACK = np.float32(126.5), np.float32(126.0)
 # The bits of a number's exponent, and the exponent of 1 after _ROUNDS.
 _EXPONENT, _ONE = np.int32(23), np.int32(1)
