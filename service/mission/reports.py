@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from service.errors import Incomplete, Refused
 from service.mission.decisions import MAX_STEPS_APART, PendingDecisions
 from shared.channel import FloatArray
+from shared.features import arrays_of
 from shared.fleetplan import FleetBelief
 from shared.scenario import Scenario
 from shared.schemas import SensorColumns, UavState
@@ -71,10 +72,10 @@ class Reports:
             raise Refused(f"{at}sensors.id", f"sensor {highest} is unknown: there are {scenario.sensors}, from 0")
         if report.base is not None or not report.sensors.x:
             report = self._in_full(report, step, at)
-        fullest = max((q for q in report.sensors.queue if q is not None), default=0.0)
-        if fullest > scenario.queue_capacity:
+        sensors = arrays_of(report.sensors)
+        if (fullest := sensors.queue.max(initial=0.0)) > scenario.queue_capacity:
             raise Refused(f"{at}sensors.queue", f"{fullest:g} packets exceed the capacity of {scenario.queue_capacity}")
-        if (latest := max((s for s in report.sensors.last_seen if s is not None), default=0)) > step:
+        if (latest := sensors.beacon.max(initial=0)) > step:
             raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if report.outcome is not None:
             self._pending.check_outcome(report.outcome, report.uav_id, f"{at}outcome.")
