@@ -1,7 +1,7 @@
 """The attention and velocity modules, which score a mission's sensors and the velocities for each of them.
 
-Decisions use :class:`Weights`, a frozen copy of the parameters, and numpy. :class:`Modules` are the same computations
-as torch modules, for training offline.
+Decisions use :class:`Weights`, a frozen copy of the parameters, with numpy or, for many sensors,
+:mod:`service.learning.softmax_means`. :class:`Modules` are the same computations as torch modules, for training offline.
 """
 
 from __future__ import annotations
