@@ -171,14 +171,13 @@ class AttendedState:
         return [self._velocity_values[row] for row in rows]
 
 
-def _attend(mission: Mission, features: NDArray[np.float32], added: FloatArray | None) -> tuple[list[int], Attended]:
-    """Places among the n sensors of those to keep, best first, and the attention of all, with ``added`` packets."""
+def _attend(mission: Mission, features: NDArray[np.float32], packets: FloatArray | None) -> tuple[list[int], Attended]:
+    """Places among the n sensors of those to keep, best first, and their attention, with added ``packets`` ``(n,)``."""
     if not len(features):
         return [], Attended(np.empty(0, dtype=np.float32), features.__getitem__)
-    attended = mission.learner.weights.attend(features)
-    if added is not None:
-        # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
-        more = (added / mission.scenario.queue_capacity).astype(np.float32)
-        attended = attended._replace(scores=attended.scores + more)
-    kept = top_k(attended.scores, mission.top_k) if mission.uses_attention else list(range(len(features)))
-    return kept, attended
+    # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
+    added = None if packets is None else (packets / mission.scenario.queue_capacity).astype(np.float32)
+    if not mission.uses_attention:
+        return list(range(len(features))), mission.learner.weights.attend(features, added=added)
+    attended = mission.learner.weights.attend(features, mission.top_k, added)
+    return top_k(attended.scores, mission.top_k), attended

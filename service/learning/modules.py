@@ -1,7 +1,8 @@
 """The attention and velocity modules, which score a mission's sensors and the velocities for each of them.
 
 Decisions use :class:`Weights`, a frozen copy of the parameters, with numpy or, for many sensors,
-:mod:`service.learning.softmax_means`. :class:`Modules` are the same computations as torch modules, for training offline.
+:mod:`service.learning.softmax_means`. :class:`Modules` are the same computations as torch modules, for training
+offline.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from service.learning.contenders import contenders
 from service.learning.softmax_means import softmax_means
 from shared.features import FEATURES, LEVEL_FEATURES
 from shared.schemas import Features
@@ -23,8 +25,9 @@ from shared.schemas import Features
 Array = NDArray[np.float32]
 
 WIDTH = 32
-# Fewer sensors are scored in numpy, with an n x n array.
-_MANY = 64
+# Fewer sensors are scored in numpy, with an n x n array. Of very many, those are scored that may be among the best, if
+# many times fewer are needed.
+_MANY, _VERY_MANY, _FEW = 64, 4096, 20
 
 
 class Sample(NamedTuple):
@@ -154,18 +157,31 @@ class Weights:
         """The attention module's parameters by name."""
         return {name: getattr(self.parameters, name) for name in AttentionWeights._fields}
 
-    def attend(self, features: Array) -> Attended:
-        """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`."""
+    def attend(self, features: Array, best: int | None = None, added: Array | None = None) -> Attended:
+        """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`.
+
+        Args:
+            best: so many highest scores are needed: others may be minus infinity.
+            added: shape ``(n,)``, is added to the scores.
+        """
         own = self.parameters
         if len(features) >= _MANY:
             # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
             queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)
-            scores = softmax_means(queries, features, features @ (own.score[0] @ own.value)) + own.bias[0]
-            return Attended(scores, partial(self._contexts, features, queries))
-        similar: Array = (features @ own.query.T) @ (features @ own.key.T).T
-        similar *= np.float32(len(own.query) ** -0.5)
-        z = _softmax(similar) @ (features @ own.value.T)
-        return Attended(z @ own.score[0] + own.bias[0], z.__getitem__)
+            values = features @ (own.score[0] @ own.value)
+            contexts = partial(self._contexts, features, queries)
+            if best is None or len(features) < max(_VERY_MANY, _FEW * best):
+                scores = softmax_means(queries, features, values) + own.bias[0]
+            else:
+                rows = contenders(queries, features, values, best, added)
+                scores = np.full(len(features), -np.inf, dtype=np.float32)
+                scores[rows] = softmax_means(queries[rows], features, values) + own.bias[0]
+        else:
+            similar: Array = (features @ own.query.T) @ (features @ own.key.T).T
+            similar *= np.float32(len(own.query) ** -0.5)
+            z = _softmax(similar) @ (features @ own.value.T)
+            scores, contexts = z @ own.score[0] + own.bias[0], z.__getitem__
+        return Attended(scores if added is None else scores + added, contexts)
 
     def _contexts(self, features: Array, queries: Array, rows: list[int]) -> Array:
         """The contexts of some rows ``(m, d')``, from all features and queries ``(n, d)``."""
