@@ -165,6 +165,7 @@ class Weights:
             added: shape ``(n,)``, is added to the scores.
         """
         own = self.parameters
+        contexts: Callable[[list[int]], Array]
         if len(features) >= _MANY:
             # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
             queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)

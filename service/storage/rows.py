@@ -21,14 +21,14 @@ from service.mission.idempotency import Answered
 from service.mission.sensor_readings import Reading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, leases, missions
-from shared.schemas import Outcome, UavState
+from shared.schemas import Outcome, SensorColumns, UavState
 
 # The first size of a packer's buffer, which grows as it must.
 PACK_BYTES = 4096
 # The extension type of an array.
 _ARRAY = 1
 # A request also carries an outcome, which is an event of its own, and its encoding, which is of no use later.
-_REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink"}
+_REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink", "sensors"}
 # The fields of an outcome that change a mission's state.
 _OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}
 
@@ -113,7 +113,11 @@ def encode(event: Event) -> tuple[Kind, bytes]:
     """An event's kind, and its body as bytes."""
     match event:
         case Reported(step, uav):
-            return "reported", pack([step, uav.model_dump(include=_REPORT, exclude_defaults=True)])
+            body: dict[str, Any] = uav.model_dump(include=_REPORT, exclude_defaults=True)
+            # The columns themselves: pydantic would copy each of their numbers.
+            columns = ((name, getattr(uav.sensors, name)) for name in SensorColumns.model_fields)
+            body["sensors"] = {name: column for name, column in columns if column}
+            return "reported", pack([step, body])
         case Decided(decision, attempt, report):
             packed = None if report is None else [report.model, report.advice._asdict()]
             return "decided", pack([decision._asdict(), attempt, packed])
