@@ -56,7 +56,8 @@ def contenders(queries: Array, keys: Array, values: Array, best: int, added: Arr
     if added is not None:
         likely += added
     surely = np.partition(likely - unsure, -best)[-best]
-    return np.flatnonzero(likely + unsure >= surely - _ROUNDING * spread)
+    # Nothing is ruled out where a number is not finite.
+    return np.flatnonzero(~(likely + unsure < surely - _ROUNDING * spread))
 
 
 def _groups(queries: Array, ranges: Array) -> IntArray:

@@ -43,3 +43,9 @@ def test_most_sensors_are_ruled_out_where_they_are_much_alike() -> None:
 def test_sensors_that_are_all_the_same_are_all_among_them() -> None:
     same = np.ones((700, 3), dtype=np.float32)
     assert contenders(same, same, same[:, 0], 2).tolist() == list(range(700))
+
+
+def test_a_number_that_is_not_finite_rules_nothing_out() -> None:
+    queries, keys, values = drawn(2, 2000, 0.3)
+    values[7] = np.nan
+    assert len(contenders(queries, keys, values, 5)) == 2000
