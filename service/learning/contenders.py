@@ -16,11 +16,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from service.learning.softmax_means import Array, softmax
 from shared.channel import IntArray
-
-Array = NDArray[np.float32]
 
 # Centres are the means of so many groups of queries: by one dimension, and in each of these by another.
 _GROUPS, _PARTS = 32, 4
@@ -42,10 +40,7 @@ def contenders(queries: Array, keys: Array, values: Array, best: int, added: Arr
     away = queries[groups]
     centres = away.mean(axis=1)
     away -= centres[:, None]
-    weights = centres @ keys.T
-    weights -= weights.max(axis=1, keepdims=True)
-    np.exp(weights, out=weights)
-    weights /= weights.sum(axis=1, keepdims=True)
+    weights = softmax(centres @ keys.T)
     means = weights @ values
     covariances = (weights * values) @ keys - means[:, None] * (weights @ keys)
     more = np.matmul(away, covariances[:, :, None])[:, :, 0]

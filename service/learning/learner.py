@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from service.learning.modules import Array, Layout, Parameters, Sample, Weights
+from service.learning.modules import Layout, Parameters, Sample, Weights
+from service.learning.softmax_means import Array
 from service.learning.training_step import Moments, adam_step, descend
 
 

@@ -13,16 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
 from service.learning.contenders import contenders
-from service.learning.softmax_means import softmax_means
+from service.learning.softmax_means import Array, softmax, softmax_means
+from shared.channel import IntArray
 from shared.features import FEATURES, LEVEL_FEATURES
 from shared.schemas import Features
-
-Array = NDArray[np.float32]
 
 WIDTH = 32
 # Fewer sensors are scored in numpy, with an n x n array. Of very many, those are scored that may be among the best, if
@@ -107,14 +105,6 @@ class Attended(NamedTuple):
     contexts: Callable[[list[int]], Array]
 
 
-def _softmax(logits: Array) -> Array:
-    """The softmax of each row; ``logits`` are overwritten."""
-    logits -= logits.max(axis=1, keepdims=True)
-    np.exp(logits, out=logits)
-    logits /= logits.sum(axis=1, keepdims=True)
-    return logits
-
-
 def top_k(scores: Array, k: int) -> list[int]:
     """Indices of the k best scores, best first; of all where there are fewer. Of equals, the first."""
     best: list[int] = (-scores).argsort(kind="stable")[:k].tolist()
@@ -164,32 +154,35 @@ class Weights:
             best: so many highest scores are needed: others may be minus infinity.
             added: shape ``(n,)``, is added to the scores.
         """
+        attended = self._attend_few(features) if len(features) < _MANY else self._attend_many(features, best, added)
+        return attended if added is None else attended._replace(scores=attended.scores + added)
+
+    def _attend_few(self, features: Array) -> Attended:
         own = self.parameters
-        contexts: Callable[[list[int]], Array]
-        if len(features) >= _MANY:
-            # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
-            queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)
-            values = features @ (own.score[0] @ own.value)
-            contexts = partial(self._contexts, features, queries)
-            if best is None or len(features) < max(_VERY_MANY, _FEW * best):
-                scores = softmax_means(queries, features, values) + own.bias[0]
-            else:
-                rows = contenders(queries, features, values, best, added)
-                scores = np.full(len(features), -np.inf, dtype=np.float32)
-                scores[rows] = softmax_means(queries[rows], features, values) + own.bias[0]
-        else:
-            similar: Array = (features @ own.query.T) @ (features @ own.key.T).T
-            similar *= np.float32(len(own.query) ** -0.5)
-            z = _softmax(similar) @ (features @ own.value.T)
-            scores, contexts = z @ own.score[0] + own.bias[0], z.__getitem__
-        return Attended(scores if added is None else scores + added, contexts)
+        similar: Array = (features @ own.query.T) @ (features @ own.key.T).T
+        similar *= np.float32(len(own.query) ** -0.5)
+        z = softmax(similar) @ (features @ own.value.T)
+        return Attended(z @ own.score[0] + own.bias[0], z.__getitem__)
+
+    def _attend_many(self, features: Array, best: int | None, added: Array | None) -> Attended:
+        """As :meth:`attend`, without ``added`` in the scores."""
+        own = self.parameters
+        # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
+        queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)
+        values = features @ (own.score[0] @ own.value)
+        rows: slice | IntArray = slice(None)
+        if best is not None and len(features) >= max(_VERY_MANY, _FEW * best):
+            rows = contenders(queries, features, values, best, added)
+        scores = np.full(len(features), -np.inf, dtype=np.float32)
+        scores[rows] = softmax_means(queries[rows], features, values) + own.bias[0]
+        return Attended(scores, partial(self._contexts, features, queries))
 
     def _contexts(self, features: Array, queries: Array, rows: list[int]) -> Array:
         """The contexts of some rows ``(m, d')``, from all features and queries ``(n, d)``."""
         contexts = np.empty((len(rows), len(self.parameters.value)), dtype=np.float32)
         # One after another, as in `velocities`.
         for place, row in enumerate(rows):
-            weights = _softmax((features @ queries[row])[None])
+            weights = softmax((features @ queries[row])[None])
             contexts[place] = self.parameters.value @ (weights @ features)[0]
         return contexts
 

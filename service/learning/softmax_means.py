@@ -60,6 +60,14 @@ class _Work(NamedTuple):
         return cls(product, part, power, power.view(np.float32), *np.empty((3, queries), dtype=np.float32))
 
 
+def softmax(logits: Array) -> Array:
+    """The softmax of each row ``(m, n)``; the logits are overwritten."""
+    logits -= logits.max(axis=1, keepdims=True)
+    np.exp(logits, out=logits)
+    logits /= logits.sum(axis=1, keepdims=True)
+    return logits
+
+
 def softmax_means(queries: Array, keys: Array, values: Array) -> Array:
     """The weighted means ``(m,)``, the same to the bit on any number of cores.
 
@@ -109,10 +117,7 @@ def _sum_up(queries: Array, keys: Array, counted: Array, stride: int, work: _Wor
     """
     largest, product, part = work.largest, work.product, work.part
     for i in range(len(largest)):
-        largest[i] = work.weight[i] = work.weighted[i] = 0.0
-    _multiply(queries, work.weight, keys, 0, product[0], product[1], product[2], product[3])
-    for i in range(len(largest)):
-        largest[i] = product[0, i]
+        largest[i], work.weight[i], work.weighted[i] = -math.inf, 0.0, 0.0
     for j in range(0, keys.shape[0], stride):
         _multiply(queries, work.weight, keys, j, product[0], product[1], product[2], product[3])
         _raise_largest(product, largest)

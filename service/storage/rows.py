@@ -27,7 +27,8 @@ from shared.schemas import Outcome, SensorColumns, UavState
 PACK_BYTES = 4096
 # The extension type of an array.
 _ARRAY = 1
-# A request also carries an outcome, which is an event of its own, and its encoding, which is of no use later.
+# A request also carries an outcome, which is an event of its own, and its encoding, which is of no use later. `encode`
+# adds the sensors.
 _REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink", "sensors"}
 # The fields of an outcome that change a mission's state.
 _OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from service.learning.contenders import Array, contenders
-from service.learning.softmax_means import softmax_means
+from service.learning.contenders import contenders
+from service.learning.softmax_means import Array, softmax_means
 
 
 def drawn(seed: int, sensors: int, scale: float, outliers: float = 4.0) -> tuple[Array, Array, Array]:
