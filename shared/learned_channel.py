@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from shared.channel import FloatArray, IntArray, LinkBudget, Links, path_loss_db
 from shared.radio_map import RadioMap
@@ -124,7 +125,7 @@ class LearnedChannel:
         """Whether all that was seen agrees with the formula."""
         return self.radio_map.exact and self.failures.none and self.share == 1.0
 
-    def measure(self, ids: IntArray, place: FloatArray, distance: FloatArray, gain_db: FloatArray) -> FloatArray:
+    def measure(self, ids: IntArray, place: ArrayLike, distance: FloatArray, gain_db: FloatArray) -> FloatArray:
         """Take the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``.
 
         Returns:
@@ -169,10 +170,11 @@ class LearnedChannel:
         if not metres <= self._scenario.radio_radius_m:
             return 0
         distance, which = np.array([[metres]]), np.array([sensor])
-        if held and not self.by_formula:
-            return int(self._transfers(np.array([position]), distance, which)[0][0, 0])
-        links = self.links(np.array([position]), distance, which)
-        return int(links.packets[0, 0]) if held or links.hold[0, 0] >= LIKELY else 0
+        if self.by_formula:
+            return int(ExpectedLinks.by_formula(distance, self._scenario).packets[0, 0])
+        packets, margin = self._transfers(np.array([position]), distance, which)
+        likely = held or (_probability(margin) * self.failures.alive(which))[0, 0] >= LIKELY
+        return int(packets[0, 0]) if likely else 0
 
     def gain_db(self, place: FloatArray, distance: FloatArray, ids: IntArray) -> FloatArray:
         """The expected gains ``(n,)``, dB, at a UAV's place ``(2,)``."""
@@ -181,12 +183,22 @@ class LearnedChannel:
             return -loss
         return np.asarray(-(loss + self.radio_map.predict(place[None], ids)[0][0]))
 
-    def transmitted(self, sensor: int, failed: bool, link: Links) -> bool:
-        """Take the outcome of a transmission over this link; returns whether the sensor's radio failed."""
-        good = bool(link.loss_db < self._scenario.path_loss_limit_db - GOOD_LINK_DB)
+    def transmitted(self, sensor: int, failed: bool, loss_db: float) -> bool:
+        """Take the outcome of a transmission over a link; returns whether the sensor's radio failed."""
+        good = loss_db < self._scenario.path_loss_limit_db - GOOD_LINK_DB
         if good:
             self.failures.settle(sensor, failed)
         return good and failed
+
+    def transfer(self, loss_db: float) -> tuple[float, int]:
+        """What a packet costs a sensor's battery, joules, and the packets that a step moves, over a link of this loss.
+
+        The link is in radio range; no packets move where the loss exceeds the threshold.
+        """
+        from shared.link_expectations import transfer
+
+        packet_j, packets = transfer(self._budget, loss_db)
+        return packet_j, packets if loss_db < self._scenario.path_loss_limit_db else 0
 
     def moved(self, packets: float, before: float, link: int, slack: float) -> None:
         """Learn the rate share from a visit.

@@ -10,7 +10,32 @@ from shared.compiled import compiled, inlined
 # A link below this margin hardly ever holds.
 _LEAST_MARGIN = -3.0
 
+# A loss this far below the one that caps the rate is certain to cap it, dB.
+_ROUNDING_DB = 1e-6
+
 _mean_loss_db, _whole_rate_bps = inlined(mean_loss_db), inlined(whole_rate_bps)
+
+
+@inlined
+def _capped_db(world: LinkBudget) -> float:
+    """A loss below which the modulation's cap is the rate of every link."""
+    noise_dbm = world.noise_dbm_hz + 10.0 * math.log10(world.bandwidth_hz) + world.noise_figure_db
+    snr_db = 10.0 * math.log10(2.0**world.spectral_cap - 1.0)
+    return 10.0 * math.log10(world.transmit_power_w * 1e3) - noise_dbm - snr_db - _ROUNDING_DB
+
+
+@inlined
+def _rate_bps(loss_db: float, capped_db: float, world: LinkBudget) -> float:
+    """As :func:`shared.channel.whole_rate_bps`: most links have the capped rate, which needs no logarithm."""
+    if loss_db < capped_db:
+        return world.link_share * world.bandwidth_hz * world.spectral_cap
+    return float(_whole_rate_bps(loss_db, world))
+
+
+@inlined
+def _packets(rate_bps: float, world: LinkBudget) -> int:
+    """Whole packets that a step moves at a rate."""
+    return int(math.floor(rate_bps * world.step_s / world.packet_bits + 1e-9))
 
 
 @compiled
@@ -18,6 +43,13 @@ def measured_excess(world: LinkBudget, distance: FloatArray, gain_db: FloatArray
     """The excess losses over the formula of n links, dB, from their distances, metres, and their measured gains."""
     for n in range(distance.shape[0]):
         excess_db[n] = -gain_db[n] - _mean_loss_db(distance[n], world)
+
+
+@compiled
+def transfer(world: LinkBudget, loss_db: float) -> tuple[float, int]:
+    """What a packet costs the sensor's battery, joules, and the packets that a step moves, over a link that holds."""
+    rate = _whole_rate_bps(loss_db, world)
+    return world.transmit_power_w * (world.packet_bits / max(rate, 1e-12)), _packets(rate, world)
 
 
 @compiled
@@ -38,6 +70,7 @@ def expected_transfers(
         mean_db, deviation_db: of the excess losses.
         packets, margin: are written.
     """
+    capped_db = _capped_db(world)
     for p in range(metres.shape[0]):
         for n in range(metres.shape[1]):
             packets[p, n], margin[p, n] = 0, -math.inf
@@ -51,6 +84,5 @@ def expected_transfers(
                 margin[p, n] = math.copysign(math.inf, spare)
             if margin[p, n] > _LEAST_MARGIN:
                 # If a link holds that is expected to fail, its loss is just below the threshold.
-                rate = _whole_rate_bps(min(loss, world.path_loss_limit_db - 1e-9), world)
-                moved = math.floor(rate * world.step_s / world.packet_bits + 1e-9)
-                packets[p, n] = int(math.floor(moved * share + 1e-9))
+                rate = _rate_bps(min(loss, world.path_loss_limit_db - 1e-9), capped_db, world)
+                packets[p, n] = int(math.floor(_packets(rate, world) * share + 1e-9))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import ValidationInfo
+
 # More than any model has fields, so that a few misspelt names still get an error each.
 MOST_NAMES = 128
 
@@ -19,12 +21,12 @@ def few_names(given: Any) -> Any:
     return given
 
 
-def plain(given: Any) -> Any:
+def plain(given: Any, info: ValidationInfo) -> Any:
     """Turn numpy's arrays and numbers in an object into Python's, so that a strict model takes them.
 
     For pydantic's ``model_validator(mode="before")``. Anything else, JSON above all, passes as it is.
     """
-    if not isinstance(given, dict):
+    if info.mode == "json" or not isinstance(given, dict):
         return given
     return {name: _plain(value) for name, value in given.items()} if any(map(_numeric, given.values())) else given
 

@@ -49,13 +49,11 @@ class Records:
 
         Between two beacons of a sensor without a visit or an overflow, the queue grows by the arrivals.
         """
-        news = seen > self._seen[ids]
-        undisturbed = (self._seen[ids] >= 0) & (self.visits[ids] < self._seen[ids])
-        usable = news & undisturbed & (queue < self._capacity) & (queue >= self._queue[ids])
-        self._arrivals[ids[usable]] += (queue - self._queue[ids])[usable]
-        self._exposure[ids[usable]] += (seen - self._seen[ids])[usable]
-        self._seen[ids[news]] = seen[news]
-        self._queue[ids[news]] = queue[news]
+        from shared.record_updates import record_beacons
+
+        arrays = self.visits, self._seen, self._queue, self._arrivals, self._exposure
+        # Copies, because numba would compile the function again for arrays that are read-only.
+        record_beacons(*arrays, float(self._capacity), np.array(ids), np.array(seen), np.array(queue))
 
     def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
         """Count a decision as a visit until its outcome is known."""

@@ -9,10 +9,13 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.softmax_means import softmax_means
-from shared.features import FEATURES
-from shared.fleetplan import annealing
-from shared.learned_channel import LearnedChannel
+from shared.features import FEATURES, augment
+from shared.fleetplan import FleetBelief, annealing
+from shared.records import Records, take_report
 from shared.scenario import SCENARIOS
+from shared.schemas import SensorColumns, UavState
+
+_PAPER = SCENARIOS["paper"]
 
 
 def load_for_event_loop() -> None:
@@ -25,11 +28,21 @@ def load_for_event_loop() -> None:
     learner = Learner(initial_weights("random", "paper", 1, 0), learning_rate=1e-3)
     features, approach = np.zeros((1, FEATURES["paper"]), dtype=np.float32), np.zeros(1, dtype=np.float32)
     learner.update(Sample(features=features, chosen=0, approach=approach, velocity=0), cost=1.0)
-    channel, sensor = LearnedChannel(SCENARIOS["paper"]), np.zeros(1, dtype=np.int64)
+    belief, records = FleetBelief(_PAPER), Records(_PAPER)
     # The eighth measurement compares the kinds of shadowing.
-    for excess_db in range(8):
-        channel.measure(sensor, np.zeros(2), np.zeros(1), np.array([-100.0 - excess_db]))
-    channel.links(np.zeros((1, 2)), np.zeros((1, 1)), sensor)
+    for step in range(8):
+        uav = UavState(uav_id=0, position=[500.0, 500.0], sensors=_heard(step))
+        take_report(uav, step, records, belief)
+        augment(uav, step, _PAPER, visits=records.visits, rates=None, reserved=(), preset="reach", belief=belief)
+    belief.arrivals.burst(0)
+    belief.channel.transfer(0.0)
+
+
+def _heard(step: int) -> SensorColumns:
+    """One sensor, heard in this step, with a gain that no formula expects."""
+    return SensorColumns(
+        id=[0], x=[500.0], y=[500.0], queue=[0.0], battery=[1.0], channel_gain=[-100.0 - step], last_seen=[step]
+    )
 
 
 def compile_all() -> None:

@@ -62,9 +62,10 @@ class _Work(NamedTuple):
 
 def softmax(logits: Array) -> Array:
     """The softmax of each row ``(m, n)``; the logits are overwritten."""
-    logits -= logits.max(axis=1, keepdims=True)
+    # For a few numbers their own methods take twice as long.
+    logits -= np.maximum.reduce(logits, axis=1, keepdims=True)
     np.exp(logits, out=logits)
-    logits /= logits.sum(axis=1, keepdims=True)
+    logits /= np.add.reduce(logits, axis=1, keepdims=True)
     return logits
 
 

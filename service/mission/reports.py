@@ -73,9 +73,9 @@ class Reports:
         if report.base is not None or not report.sensors.x:
             report = self._in_full(report, step, at)
         sensors = arrays_of(report.sensors)
-        if (fullest := sensors.queue.max(initial=0.0)) > scenario.queue_capacity:
+        if (fullest := np.maximum.reduce(sensors.queue, initial=0.0)) > scenario.queue_capacity:
             raise Refused(f"{at}sensors.queue", f"{fullest:g} packets exceed the capacity of {scenario.queue_capacity}")
-        if (latest := sensors.beacon.max(initial=0)) > step:
+        if (latest := np.maximum.reduce(sensors.beacon, initial=0)) > step:
             raise Refused(f"{at}sensors.last_seen", f"step {latest} is later than this step {step}")
         if report.outcome is not None:
             self._pending.check_outcome(report.outcome, report.uav_id, f"{at}outcome.")

@@ -30,7 +30,7 @@ class ArrayHistogram(Collector):
         """Count values ``(n,)``; a value that equals a bound is in the bound's bucket."""
         taken = np.asarray(values, dtype=np.float64)
         self._counts += np.bincount(self._bounds.searchsorted(taken), minlength=len(self._counts))
-        self._sum += float(taken.sum())
+        self._sum += float(np.add.reduce(taken))
 
     def collect(self) -> Iterable[Metric]:
         """The histogram as it is now."""

@@ -11,15 +11,14 @@ from numpy.typing import ArrayLike
 from shared.channel import FloatArray, IntArray
 from shared.scenario import Scenario
 
-# Sensors, by index.
-Which = slice | list[int] | IntArray
 # A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
 _ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
 # The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least dispersion that
 # is no chance.
 _POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
-# The probability that a burst lasts into the next step.
-_GOES_ON = 0.7
+# The probability that a burst lasts into the next step, and its powers until they are 0.
+GOES_ON = 0.7
+_POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
 _ARRAYS = ("arrived", "watched")
 _NEWER_ARRAYS = ("recent", "recent_at")
 
@@ -52,40 +51,50 @@ class Arrivals:
         self.dispersion = 1.0
 
     def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
-        """Take the packets ``(n,)`` that came to sensors ``(n,)`` in so many steps, until these steps."""
-        rate = self.rate[ids]
-        expected = rate * steps
-        # At least a packet's: where next to nothing is expected, one packet is no burst.
-        variance = np.maximum(expected + np.square(steps) * rate / self.watched[ids], 1.0)
-        self._surprise += float(np.sum(np.square(came - expected) / variance))
+        """Take the packets ``(n,)`` that came to sensors ``(n,)``, each once, in so many steps, until these steps."""
+        from shared.fleetplan.beacon_updates import take_arrivals
+
+        surprises = np.empty(len(ids))
+        arrays = self.arrived, self.watched, self.rate, self.recent, self.recent_at
+        take_arrivals(*arrays, ids, came, steps, at, surprises)
+        self._surprise += float(np.add.reduce(surprises))
         self._intervals += len(ids)
         self._estimate_dispersion()
-        self.recent[ids], self.recent_at[ids] = came / steps, at
-        self.arrived[ids] += came
-        self.watched[ids] += steps
-        self.rate = self.arrived / self.watched
 
     def _estimate_dispersion(self) -> None:
         found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
         self.dispersion = found if found > _LEAST_DISPERSION else 1.0
 
-    def burst(self, step: int | IntArray) -> FloatArray:
-        """Packets above the rate that are still to come of the bursts seen, from this step or steps on, ``(J,)``."""
-        if self.dispersion == 1.0:
-            return np.zeros(len(self.arrived))
-        above = np.where(self.recent_at >= 0, np.maximum(self.recent - self.rate, 0.0), 0.0)
-        return np.asarray(above * _GOES_ON ** (np.maximum(step - self.recent_at, 0) + 1) / (1.0 - _GOES_ON))
+    @property
+    def in_bursts(self) -> bool:
+        """Whether arrivals come in bursts."""
+        return self.dispersion > 1.0
 
-    def coming(self, step: int, horizon: float) -> FloatArray:
-        """Packets a step that are expected in the steps from this one to the horizon, ``(J,)``."""
-        if self.dispersion == 1.0:
-            return self.rate
-        return self.rate + self.burst(step) * float(self.burst_over(horizon)) / horizon
+    @property
+    def newest(self) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+        """``rate``, ``recent``, ``recent_at`` and the powers of ``GOES_ON``, for compiled functions."""
+        return self.rate, self.recent, self.recent_at, _POWERS
+
+    def burst(self, step: int, ids: IntArray | None = None) -> FloatArray:
+        """Packets above the rate that are still to come of the bursts seen, from this step on, ``(J,)`` or ``(n,)``."""
+        from shared.fleetplan.expected_queues import bursts_to_come
+
+        which = np.arange(len(self.rate)) if ids is None else np.array(ids)
+        packets = np.empty(len(which))
+        bursts_to_come(*self.newest, self.in_bursts, which, step, packets)
+        return packets
+
+    def coming(self, step: int, horizon: float, ids: IntArray | None = None) -> FloatArray:
+        """Packets a step that are expected in the steps from this one to the horizon, ``(J,)`` or ``(n,)``."""
+        rate = self.rate if ids is None else self.rate[ids]
+        if not self.in_bursts:
+            return rate
+        return rate + self.burst(step, ids) * float(self.burst_over(horizon)) / horizon
 
     @staticmethod
     def burst_over(steps: ArrayLike) -> FloatArray:
         """The share of a burst's coming packets that come in the next steps ``(n,)``."""
-        return np.asarray(1.0 - _GOES_ON ** np.asarray(steps, dtype=np.float64))
+        return np.asarray(1.0 - GOES_ON ** np.asarray(steps, dtype=np.float64))
 
     def state_dict(self) -> dict[str, Any]:
         """The arrivals, as copies."""

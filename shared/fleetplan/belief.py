@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.channel import FloatArray, IntArray, Links
+from shared.channel import FloatArray, IntArray
 from shared.drift import Drift
-from shared.fleetplan.arrivals import Arrivals, Which
+from shared.fleetplan.arrivals import Arrivals
 from shared.fleetplan.gain_measurements import NOTHING_MEASURED, Measured
 from shared.fleetplan.whereabouts import Visit, Whereabouts
 from shared.learned_channel import ExpectedLinks, LearnedChannel
@@ -79,19 +79,15 @@ class FleetBelief:
             queue: shape ``(n,)``, packets at the start of that step.
             battery: shape ``(n,)``, joules.
         """
-        self.places[ids] = places
-        newer = beacon > self.heard[ids]
-        known, base, since = self.heard[ids] >= 0, self.base[ids], self.since[ids]
-        counted = newer & known & (beacon > since) & (queue < self._scenario.queue_capacity)
-        # After a visit that moved less than believed, the packets that stayed are no arrivals.
-        expected = self.arrivals.rate[ids] * np.maximum(beacon - since, 0)
-        stayed = (self.visited[ids] == since) & (queue - base > expected + 4.0 * np.sqrt(expected) + 2.0)
-        counted &= ~stayed
-        came = np.maximum(queue - base, 0.0)
-        self.arrivals.take(ids[counted], came[counted], (beacon - since)[counted], beacon[counted])
-        news = ids[newer]
-        self.base[news], self.battery[news] = queue[newer], battery[newer]
-        self.since[news] = self.heard[news] = beacon[newer]
+        from shared.fleetplan.beacon_updates import take_beacons
+
+        # Copies, because numba would compile the function again for arrays that are read-only.
+        beacons = np.array(ids), np.array(places, order="C"), np.array(beacon), np.array(queue), np.array(battery)
+        (which, steps, at), came = np.empty((3, len(ids)), dtype=np.int64), np.empty(len(ids))
+        known = self.places, self.base, self.since, self.heard, self.battery, self.visited, self.arrivals.rate
+        count = take_beacons(*known, float(self._scenario.queue_capacity), *beacons, which, came, steps, at)
+        if count:
+            self.arrivals.take(which[:count], came[:count], steps[:count], at[:count])
 
     def begin(self, ids: IntArray, step: IntArray, queue: FloatArray, battery: FloatArray) -> None:
         """Take the queues ``(n,)`` that sensors ``(n,)`` had in steps ``(n,)`` before the mission's first one."""
@@ -122,36 +118,37 @@ class FleetBelief:
         if last.taught == last.step:
             return NOTHING_MEASURED
         last.taught = last.step
-        place = np.asarray(last.position)
-        offset = self.places[ids] - place
-        distance = np.hypot(offset[:, 0], offset[:, 1])
-        near = distance <= self._scenario.radio_radius_m
-        excess_db = self.channel.measure(ids[near], place, distance[near], gain_db[near])
+        from shared.fleetplan.beacon_updates import in_range
+
+        rows, distance = np.empty(len(ids), dtype=np.int64), np.empty(len(ids))
+        count = in_range(self.places, np.array(ids), *last.position, self._scenario.radio_radius_m, rows, distance)
+        rows, distance = rows[:count], distance[:count]
+        near, gain_db = ids[rows], gain_db[rows]
+        excess_db = self.channel.measure(near, last.position, distance, gain_db)
         visit = last.visit
         if visit is None or visit.failed is None or visit.step != last.step - 1:
             return Measured(excess_db)
-        row = np.flatnonzero(near & (ids == visit.sensor))
+        row = np.flatnonzero(near == visit.sensor)
         others = (other.visit for index, other in self.uavs.items() if index != uav)
         contested = any(o is not None and (o.sensor, o.step) == (visit.sensor, visit.step) for o in others)
         # A sensor serves one UAV in a step, whatever its radio does.
         if not len(row) or contested:
             return Measured(excess_db)
-        link = Links(distance[row[0]], np.asarray(-gain_db[row[0]]), self._scenario)
-        return Measured(excess_db, radio_failed=self._learn_of_visit(visit, link))
+        return Measured(excess_db, radio_failed=self._learn_of_visit(visit, -float(gain_db[row[0]])))
 
-    def _learn_of_visit(self, visit: Visit, link: Links) -> bool:
-        """Learn from the outcome of a UAV's last visit, over this link; whether the sensor's radio failed."""
-        if self.battery[visit.sensor] < link.packet_j:
+    def _learn_of_visit(self, visit: Visit, loss_db: float) -> bool:
+        """Learn from the outcome of a UAV's last visit, over a link of this loss; whether the sensor's radio failed."""
+        packet_j, packets = self.channel.transfer(loss_db)
+        if self.battery[visit.sensor] < packet_j:
             return False
         failed = bool(visit.failed)
-        radio_failed = self.channel.transmitted(visit.sensor, failed, link)
+        radio_failed = self.channel.transmitted(visit.sensor, failed, loss_db)
         if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
             # The queue was known before and after: it tells what the link moved.
-            soon = self.arrivals.burst(visit.step) * Arrivals.burst_over(1)
-            rate = float((self.arrivals.rate + soon)[visit.sensor])
+            rate = float(self.arrivals.coming(visit.step, 1, np.array([visit.sensor]))[0])
             moved = visit.base + rate - float(self.base[visit.sensor])
             slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
-            self.channel.moved(moved, visit.base, int(link.packets), slack)
+            self.channel.moved(moved, visit.base, packets, slack)
         return radio_failed
 
     def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
@@ -215,7 +212,7 @@ class FleetBelief:
         self.visited[sensor] = max(int(self.visited[sensor]), step)
         if self.since[sensor] > step:
             return
-        self.base[sensor] = max(0.0, self.queue(step, [sensor])[0] - packets)
+        self.base[sensor] = max(0.0, float(self.queue(step, np.array([sensor]))[0]) - packets)
         self.since[sensor] = step
 
     def copy(self) -> Self:
@@ -240,13 +237,14 @@ class FleetBelief:
             self.channel.load_state_dict(state["channel"])
             self.drift.load_state_dict(state["drift"])
 
-    def queue(self, step: int, which: Which = slice(None)) -> FloatArray:
-        """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``which``."""
-        came = self.arrivals.rate[which] * np.maximum(step - self.since[which], 0)
-        if self.arrivals.dispersion > 1.0:
-            since = np.minimum(self.since, step)
-            came = came + (self.arrivals.burst(since) - self.arrivals.burst(step))[which]
-        return np.minimum(self.base[which] + came, float(self._scenario.queue_capacity))
+    def queue(self, step: int, ids: IntArray | None = None) -> FloatArray:
+        """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``ids``."""
+        from shared.fleetplan.expected_queues import expected_queues
+
+        which = np.arange(len(self.base)) if ids is None else np.array(ids)
+        queue, capacity, bursts = np.empty(len(which)), float(self._scenario.queue_capacity), self.arrivals.in_bursts
+        expected_queues(*self.arrivals.newest, bursts, self.base, self.since, capacity, which, step, queue)
+        return queue
 
     def present(self, step: int) -> list[int]:
         """The UAVs located in this step or the one before."""
@@ -265,15 +263,15 @@ class FleetBelief:
         ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
         return self.channel.links(ahead, self._distances_from(ahead))
 
-    def distances(self, uav: int, metres: ArrayLike, which: Which = slice(None)) -> FloatArray:
+    def distances(self, uav: int, metres: ArrayLike) -> FloatArray:
         """Horizontal distances, metres, ``(n, J)``, after the UAV has flown ``metres`` ``(n,)`` on.
 
-        ``which`` selects the sensors, by default all. A sensor of unknown position is far away.
+        A sensor of unknown position is far away.
         """
-        return self._distances_from(self.uavs[uav].ahead(self._paths[uav], self.drift, metres), which)
+        return self._distances_from(self.uavs[uav].ahead(self._paths[uav], self.drift, metres))
 
-    def _distances_from(self, places: FloatArray, which: Which = slice(None)) -> FloatArray:
-        offset = places[:, None, :] - self.places[which]
+    def _distances_from(self, places: FloatArray) -> FloatArray:
+        offset = places[:, None, :] - self.places
         metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
         metres_off[np.isnan(metres_off)] = FAR_M
         return metres_off

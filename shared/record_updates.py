@@ -1,0 +1,35 @@
+"""What beacons change in the sensors' records, compiled by numba; without numba it is plain Python."""
+
+from __future__ import annotations
+
+from shared.channel import FloatArray, IntArray
+from shared.compiled import compiled
+
+
+@compiled
+def record_beacons(
+    visits: IntArray,
+    seen: IntArray,
+    queue: FloatArray,
+    arrivals: FloatArray,
+    exposure: FloatArray,
+    capacity: float,
+    ids: IntArray,
+    beacon_step: IntArray,
+    beacon_queue: FloatArray,
+) -> None:
+    """Take n sensors' beacons that are newer than the known ones, as :meth:`Records.hear` does.
+
+    Args:
+        visits, seen, queue, arrivals, exposure: shape ``(J,)``, the arrays of :class:`~shared.records.Records`.
+        ids, beacon_step, beacon_queue: shape ``(n,)``, each sensor once.
+    """
+    for n in range(ids.shape[0]):
+        sensor, before = ids[n], seen[ids[n]]
+        if beacon_step[n] <= before:
+            continue
+        undisturbed = before >= 0 and visits[sensor] < before
+        if undisturbed and queue[sensor] <= beacon_queue[n] < capacity:
+            arrivals[sensor] += beacon_queue[n] - queue[sensor]
+            exposure[sensor] += beacon_step[n] - before
+        seen[sensor], queue[sensor] = beacon_step[n], beacon_queue[n]

@@ -1,0 +1,182 @@
+"""The belief's compiled functions compute what the formulas do, with and without numba, and are compiled once."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from service.edge.compilation import load_for_event_loop
+from shared import link_expectations, record_updates
+from shared.channel import FloatArray, IntArray, Links
+from shared.features import augment
+from shared.fleetplan import FleetBelief, beacon_updates, expected_queues
+from shared.fleetplan.arrivals import GOES_ON
+from shared.records import Records, take_report
+from shared.scenario import SCENARIOS, Scenario
+from shared.schemas import SensorColumns, UavState
+
+WORLD = Scenario(name="ten", sensors=10, uavs=2)
+# The last queues of a fleet that hears beacons in random order; with an argument numba is missing.
+HEARD = """
+import json, sys
+if len(sys.argv) > 1:
+    sys.modules["numba"] = None
+from tests.shared.test_belief_updates import flown
+belief, records = flown(40)
+print(json.dumps([belief.queue(41).tolist(), belief.arrivals.burst(41).tolist(), records.rates.tolist()]))
+"""
+
+
+def report(step: int) -> UavState:
+    """Some of the sensors, with beacons of this step and of earlier ones, and some that were never heard."""
+    random = np.random.default_rng(step)
+    ids = np.sort(random.choice(10, random.integers(1, 10), replace=False))
+    seen = [int(s) if s >= 0 else None for s in step - random.integers(0, 4, len(ids))]
+    columns = {
+        "queue": random.integers(0, 61, len(ids)).tolist(),
+        "battery": random.uniform(0, 50, len(ids)).tolist(),
+        "channel_gain": random.uniform(-110, -80, len(ids)).tolist(),
+    }
+    known = {
+        name: [None if s is None else float(v) for v, s in zip(c, seen, strict=True)] for name, c in columns.items()
+    }
+    places = {axis: (100.0 * ids + step % 3).tolist() for axis in ("x", "y")}
+    sensors = SensorColumns.model_validate({"id": ids.tolist(), "last_seen": seen, **places, **known})
+    return UavState(uav_id=step % 2, position=[480.0 + step, 450.0], sensors=sensors)
+
+
+def flown(steps: int) -> tuple[FleetBelief, Records]:
+    """A belief and records after so many reports, with decisions and outcomes."""
+    belief, records = FleetBelief(WORLD), Records(WORLD)
+    for step in range(steps):
+        take_report(report(step), step, records, belief)
+        belief.tell(step % 2, step, step % 10, 7)
+        records.presume(step % 10, str(step), step)
+        belief.settle(step % 2, step, step % 3 == 0)
+    return belief, records
+
+
+def heard(belief: FleetBelief, step: int) -> tuple[IntArray, FloatArray, IntArray]:
+    """The sensors of a step's report, their queues and the steps of their beacons, -1 for none."""
+    sensors = report(step).sensors
+    seen = [-1 if s is None else s for s in sensors.last_seen]
+    return np.array(sensors.id), np.array([q or 0.0 for q in sensors.queue]), np.array(seen)
+
+
+@pytest.mark.parametrize("step", range(1, 40))
+def test_newer_beacons_count_and_show_arrivals_unless_a_visit_left_packets(step: int) -> None:
+    belief, records = flown(step)
+    belief.advance(step)
+    ids, queue, seen = heard(belief, step)
+    arrivals, since, base = belief.arrivals, belief.since[ids], belief.base[ids]
+    newer, passed = seen > belief.heard[ids], seen - since
+    counted = newer & (belief.heard[ids] >= 0) & (passed > 0) & (queue < 60)
+    expected = arrivals.rate[ids] * np.maximum(passed, 0)
+    counted &= ~((belief.visited[ids] == since) & (queue - base > expected + 4 * np.sqrt(expected) + 2))
+    arrived, watched, recent = arrivals.arrived.copy(), arrivals.watched.copy(), arrivals.recent.copy()
+    came = np.maximum(queue - base, 0.0)[counted]
+    arrived[ids[counted]] += came
+    watched[ids[counted]] += passed[counted]
+    recent[ids[counted]] = came / passed[counted]
+    variance = np.maximum(expected + passed**2 * arrivals.rate[ids] / arrivals.watched[ids], 1.0)[counted]
+    surprise = arrivals.state_dict()["surprise"] + ((came - expected[counted]) ** 2 / variance).sum()
+    take_report(report(step), step, records, belief)
+    np.testing.assert_array_equal(belief.base[ids], np.where(newer, queue, base))
+    np.testing.assert_array_equal(belief.since[ids], np.where(newer, seen, since))
+    np.testing.assert_array_equal(arrivals.arrived, arrived)
+    np.testing.assert_array_equal(arrivals.rate, arrived / watched)
+    np.testing.assert_array_equal(arrivals.recent, recent)
+    assert arrivals.state_dict()["surprise"] == pytest.approx(surprise, rel=1e-12)
+
+
+def test_the_records_count_what_came_between_two_beacons_without_a_visit() -> None:
+    records = Records(WORLD)
+    before = records.rates[0]
+    one, four = np.array([0]), np.array([4])
+    records.hear(one, np.array([0]), np.array([10.0]))
+    records.hear(one, four, np.array([42.0]))
+    assert records.rates[0] == pytest.approx((before * 2 + 32) / (2 + 4))
+    for seen, queue in ((3, 50.0), (6, 30.0), (7, 60.0)):
+        # An old beacon, less than before, and a full queue.
+        known = records.rates[0]
+        records.hear(one, np.array([seen]), np.array([queue]))
+        assert records.rates[0] == known
+    records.presume(0, "visit", 8)
+    records.hear(one, np.array([8]), np.array([0.0]))
+    records.hear(one, np.array([9]), np.array([5.0]))
+    assert records.rates[0] == known
+
+
+def test_queues_and_bursts_are_those_of_the_formula() -> None:
+    belief, _ = flown(40)
+    arrivals, step = belief.arrivals, 43
+    assert arrivals.in_bursts
+
+    def burst(at: IntArray) -> FloatArray:
+        above = np.where(arrivals.recent_at >= 0, np.maximum(arrivals.recent - arrivals.rate, 0.0), 0.0)
+        return np.asarray(above * GOES_ON ** (np.maximum(at - arrivals.recent_at, 0) + 1) / (1 - GOES_ON))
+
+    every = np.full(10, step)
+    came = arrivals.rate * np.maximum(step - belief.since, 0)
+    came += burst(np.minimum(belief.since, step)) - burst(every)
+    np.testing.assert_allclose(arrivals.burst(step), burst(every), rtol=1e-14)
+    np.testing.assert_allclose(belief.queue(step), np.minimum(belief.base + came, 60.0), rtol=1e-14)
+    some = np.array([7, 2])
+    np.testing.assert_array_equal(belief.queue(step, some), belief.queue(step)[some])
+    np.testing.assert_array_equal(arrivals.burst(step, some), arrivals.burst(step)[some])
+    assert (arrivals.burst(1_000_000) == 0.0).all()
+
+
+def test_a_transfer_is_the_channels() -> None:
+    channel = FleetBelief(SCENARIOS["paper"]).channel
+    for loss_db in (80.0, 106.0, 109.0, 111.0):
+        link = Links(np.array(100.0), np.array(loss_db), SCENARIOS["paper"])
+        packet_j, packets = channel.transfer(loss_db)
+        assert packet_j == pytest.approx(float(link.packet_j), rel=1e-12)
+        assert packets == int(link.packets)
+
+
+def test_without_numba_the_belief_is_the_same() -> None:
+    found = [
+        json.loads(subprocess.run([sys.executable, "-c", HEARD, *missing], check=True, capture_output=True).stdout)
+        for missing in ([], ["missing"])
+    ]
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
+    """On the event loop every decision would wait for the compiler."""
+    functions = [
+        beacon_updates.take_beacons,
+        beacon_updates.take_arrivals,
+        beacon_updates.in_range,
+        expected_queues.bursts_to_come,
+        expected_queues.expected_queues,
+        record_updates.record_beacons,
+        link_expectations.measured_excess,
+        link_expectations.expected_transfers,
+        link_expectations.transfer,
+    ]
+    load_for_event_loop()
+    assert {function.__name__: len(function.signatures) for function in functions} == {  # type: ignore[attr-defined]
+        function.__name__: 1 for function in functions
+    }
+    belief, records = flown(60)
+    again = FleetBelief(WORLD)
+    again.load_state_dict(belief.state_dict())
+    for step in range(60, 64):
+        take_report(report(step), step, records, again)
+        for known, rates in ((again, None), (None, records.rates)):
+            augment(
+                report(step), step, WORLD, visits=records.visits, rates=rates, reserved=(), preset="reach", belief=known
+            )
+        again.tell(step % 2, step, 0, 3)
+        again.settle(step % 2, step, failed=False)
+    again.queue(70)
+    again.arrivals.burst(70)
+    assert {len(function.signatures) for function in functions} == {1}  # type: ignore[attr-defined]
