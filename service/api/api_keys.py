@@ -32,7 +32,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 _PREFIX = "aicvds_"
 # Seconds between two checks whether the file has changed.
 _STALE_S = 1.0
-_MOST_KEYS = 1000
+MOST_KEYS = 1000
 
 
 class BadKeys(Exception):
@@ -55,7 +55,7 @@ class KeyFile(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    keys: list[ApiKey] = Field(default_factory=list, max_length=_MOST_KEYS)
+    keys: list[ApiKey] = Field(default_factory=list, max_length=MOST_KEYS)
 
     @classmethod
     def read(cls, path: Path) -> KeyFile:
@@ -91,8 +91,8 @@ class KeyFile(BaseModel):
         """Add a key; returns the key itself. Raises ``BadKeys`` for a name in use, or too many keys."""
         if any(key.name == name for key in self.keys):
             raise BadKeys(f"there is already a key {name}: remove it first, or choose another name")
-        if len(self.keys) >= _MOST_KEYS:
-            raise BadKeys(f"there are already {_MOST_KEYS} keys")
+        if len(self.keys) >= MOST_KEYS:
+            raise BadKeys(f"there are already {MOST_KEYS} keys")
         shown = _PREFIX + secrets.token_urlsafe(32)
         self.keys.append(ApiKey(name=name, scopes=scopes, per_minute=per_minute, sha256=hash_of(shown)))
         return shown

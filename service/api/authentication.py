@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from collections.abc import Sequence
 
-from limits import RateLimitItemPerMinute
-from limits.aio.storage import MemoryStorage
-from limits.aio.strategies import SlidingWindowCounterRateLimiter
 from starlette.types import ASGIApp, Receive, Send
 from starlette.types import Scope as AsgiScope
+from throttled import MemoryStore, RateLimiterType, Throttled, per_min
 
-from service.api.api_keys import ApiKey, ApiKeys, Scope
+from service.api.api_keys import MOST_KEYS, ApiKey, ApiKeys, Scope
 from service.api.load_limits import READING
 from service.api.problem_details import problem_response
 
@@ -23,6 +20,8 @@ _OPEN = frozenset(("/healthz", "/readyz", "/"))
 _OPEN_PREFIX = "/static/"
 _ATTENTION = re.compile(r"/missions/[^/]+/attention")
 _READINGS = re.compile(r"/missions/[^/]+/readings")
+# Counts of a key's requests that may be in memory: of this minute, the one before, and those that are over.
+_COUNTS_A_KEY = 4
 # The ASGI scope's entry with the scopes of the request's key.
 SCOPES = "aicvds.scopes"
 # The ASGI scope's entry for streams: a function that returns whether the key is still known.
@@ -54,7 +53,8 @@ class KeyAuthentication:
     def __init__(self, app: ASGIApp, keys: ApiKeys) -> None:
         self.app = app
         self._keys = keys
-        self._rates = SlidingWindowCounterRateLimiter(MemoryStorage())
+        self._counts = MemoryStore(options={"MAX_SIZE": _COUNTS_A_KEY * MOST_KEYS})
+        self._limiters: dict[int, Throttled] = {}
 
     async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or is_open(scope["method"], scope["path"]):
@@ -68,7 +68,7 @@ class KeyAuthentication:
             refusal.headers["WWW-Authenticate"] = "Bearer"
         elif needed is not None and needed not in key.scopes:
             refusal = problem_response(403, f"key {key.name} lacks the scope {needed}")
-        elif (wait_s := await self._wait(key)) is not None:
+        elif (wait_s := self._wait(key)) is not None:
             refusal = problem_response(429, f"key {key.name} has a limit of {key.per_minute} requests a minute")
             refusal.headers["Retry-After"] = str(wait_s)
         else:
@@ -80,13 +80,14 @@ class KeyAuthentication:
         refusal.headers["Connection"] = "close"
         await refusal(scope, receive, send)
 
-    async def _wait(self, key: ApiKey) -> int | None:
+    def _wait(self, key: ApiKey) -> int | None:
         """Seconds until the key's next request is allowed; None where this one is, which then counts."""
-        rate = RateLimitItemPerMinute(key.per_minute)
-        if await self._rates.hit(rate, key.name):
-            return None
-        stats = await self._rates.get_window_stats(rate, key.name)
-        return max(1, math.ceil(stats.reset_time - time.time()))
+        limiter = self._limiters.get(key.per_minute)
+        if limiter is None:
+            window, quota = RateLimiterType.SLIDING_WINDOW.value, per_min(key.per_minute)
+            limiter = self._limiters[key.per_minute] = Throttled(using=window, quota=quota, store=self._counts)
+        found = limiter.limit(key.name)
+        return max(1, math.ceil(found.state.retry_after)) if found.limited else None
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import uuid
+import secrets
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -77,7 +77,7 @@ class Pipeline:
             if not mode.plan_first:
                 await _await_plan(task)
             choice = choice.to(_without_llm(state))
-        orders, decision_id = task.mission.guidance.orders, uuid.uuid4().hex
+        orders, decision_id = task.mission.guidance.orders, secrets.token_hex(16)
         if orders is not None:
             choice = _enforce(orders, task.mission, choice)
         pending = state.pending(decision_id, choice.action)
