@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.channel import FloatArray, IntArray, LinkBudget, Links, path_loss_db
+from shared.channel import FloatArray, IntArray, LinkBudget, path_loss_db
 from shared.radio_map import RadioMap
 from shared.scenario import Point, Scenario
 
+# Rings around a UAV whose links by the formula are computed once; all but some twenty have the same link everywhere.
+_RINGS = 1024
 # A link that holds with at least this probability counts as one.
 LIKELY = 0.5
 # The rate share is the median of this many visits that show it: one visit proves nothing where arrivals come in bursts.
@@ -49,17 +52,27 @@ class ExpectedLinks:
     @classmethod
     def by_formula(cls, distance: FloatArray, scenario: Scenario) -> Self:
         """The links of the mean path loss."""
-        packets, hold = np.zeros(distance.shape, dtype=np.int64), np.zeros(distance.shape)
-        # The path loss takes most of the time, and of many sensors most are out of radio range.
-        near = distance <= scenario.radio_radius_m
-        links = Links.at(distance[near], scenario)
-        packets[near], hold[near] = links.packets, links.hold
+        from shared.link_expectations import formula_transfers
+
+        world = LinkBudget.of(scenario)
+        packets, hold = np.empty(distance.shape, dtype=np.int64), np.empty(distance.shape)
+        formula_transfers(world, *_rings(world), np.ascontiguousarray(distance), packets, hold)
         return cls(distance, packets, hold)
 
     @property
     def likely(self) -> IntArray:
         """``packets`` where the link is likely to hold, else 0."""
         return np.asarray(np.where(self.hold >= LIKELY, self.packets, 0))
+
+
+@lru_cache(maxsize=64)
+def _rings(world: LinkBudget) -> tuple[IntArray, FloatArray]:
+    """What :func:`shared.link_expectations.know_rings` writes, computed once for a scenario."""
+    from shared.link_expectations import know_rings
+
+    packets, hold = np.empty(_RINGS, dtype=np.int64), np.empty(_RINGS)
+    know_rings(world, packets, hold)
+    return packets, hold
 
 
 class RadioFailures:

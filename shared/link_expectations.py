@@ -45,6 +45,59 @@ def measured_excess(world: LinkBudget, distance: FloatArray, gain_db: FloatArray
         excess_db[n] = -gain_db[n] - _mean_loss_db(distance[n], world)
 
 
+@inlined
+def _formula_transfer(metres: float, capped_db: float, world: LinkBudget) -> tuple[int, bool]:
+    """Packets that a step moves over a link of the mean path loss in radio range, and whether it holds."""
+    loss = _mean_loss_db(metres, world)
+    holds = loss < world.path_loss_limit_db
+    return (_packets(_rate_bps(loss, capped_db, world), world) if holds else 0), holds
+
+
+@compiled
+def know_rings(world: LinkBudget, packets: IntArray, hold: FloatArray) -> None:
+    """Write the packets and whether they hold, 1 or 0, of links of the mean path loss to K rings around a UAV.
+
+    The rings are equally wide and fill the radio range. ``packets`` is -1 where a ring's links differ: where those at
+    its edges do, or where the loss does not grow with the distance.
+    """
+    width, capped_db = world.radio_radius_m / packets.shape[0], _capped_db(world)
+    grows = world.nlos_excess_db >= world.los_excess_db and world.los_kappa >= 0.0
+    for ring in range(packets.shape[0]):
+        inner, inner_holds = _formula_transfer(ring * width, capped_db, world)
+        outer, outer_holds = _formula_transfer((ring + 1) * width, capped_db, world)
+        same = grows and inner == outer and inner_holds == outer_holds
+        packets[ring], hold[ring] = inner if same else -1, 1.0 if inner_holds else 0.0
+
+
+@compiled
+def formula_transfers(
+    world: LinkBudget,
+    ring_packets: IntArray,
+    ring_hold: FloatArray,
+    metres: FloatArray,
+    packets: IntArray,
+    hold: FloatArray,
+) -> None:
+    """Write the packets and whether they hold, 1 or 0, of links ``(P, n)`` of the mean path loss.
+
+    Args:
+        ring_packets, ring_hold: of :func:`know_rings`.
+        metres: horizontal distances.
+    """
+    capped_db, last = _capped_db(world), ring_packets.shape[0] - 1
+    rings_a_metre = ring_packets.shape[0] / world.radio_radius_m
+    for p in range(metres.shape[0]):
+        for n in range(metres.shape[1]):
+            if not metres[p, n] <= world.radio_radius_m:
+                packets[p, n], hold[p, n] = 0, 0.0
+                continue
+            ring = min(int(metres[p, n] * rings_a_metre), last)
+            packets[p, n], hold[p, n] = ring_packets[ring], ring_hold[ring]
+            if ring_packets[ring] < 0:
+                moved, holds = _formula_transfer(metres[p, n], capped_db, world)
+                packets[p, n], hold[p, n] = moved, 1.0 if holds else 0.0
+
+
 @compiled
 def transfer(world: LinkBudget, loss_db: float) -> tuple[float, int]:
     """What a packet costs the sensor's battery, joules, and the packets that a step moves, over a link that holds."""

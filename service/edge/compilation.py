@@ -9,8 +9,10 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.softmax_means import softmax_means
+from service.prompting.token_accounting import UnprunedState
 from shared.features import FEATURES, augment
 from shared.fleetplan import FleetBelief, annealing
+from shared.learned_channel import ExpectedLinks
 from shared.records import Records, take_report
 from shared.scenario import SCENARIOS
 from shared.schemas import SensorColumns, UavState
@@ -33,9 +35,13 @@ def load_for_event_loop() -> None:
     for step in range(8):
         uav = UavState(uav_id=0, position=[500.0, 500.0], sensors=_heard(step))
         take_report(uav, step, records, belief)
-        augment(uav, step, _PAPER, visits=records.visits, rates=None, reserved=(), preset="reach", belief=belief)
+        state = augment(
+            uav, step, _PAPER, visits=records.visits, rates=None, reserved=(), preset="reach", belief=belief
+        )
     belief.arrivals.burst(0)
     belief.channel.transfer(0.0)
+    ExpectedLinks.by_formula(state.distance[None], _PAPER)
+    UnprunedState(state, ",".join).tokens(len)
 
 
 def _heard(step: int) -> SensorColumns:

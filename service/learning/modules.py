@@ -107,7 +107,13 @@ class Attended(NamedTuple):
 
 def top_k(scores: Array, k: int) -> list[int]:
     """Indices of the k best scores, best first; of all where there are fewer. Of equals, the first."""
-    best: list[int] = (-scores).argsort(kind="stable")[:k].tolist()
+    losses = -scores
+    if len(scores) <= max(_MANY, k):
+        best: list[int] = losses.argsort(kind="stable")[:k].tolist()
+        return best
+    # Of many, those alone are sorted that are not behind the k-th.
+    ahead = np.flatnonzero(~(losses > np.partition(losses, k - 1)[k - 1]))
+    best = ahead[losses[ahead].argsort(kind="stable")[:k]].tolist()
     return best
 
 

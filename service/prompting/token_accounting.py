@@ -9,7 +9,6 @@ hundred.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from service.config.settings import Settings
 from service.llm.answers import Completion
 from service.prompting.row_formats import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
+from service.prompting.row_kinds import count_kinds
 from service.prompting.tokenizer import ENCODING, encoding
 from shared.features import State
 from shared.schemas import Tokens
@@ -29,10 +29,8 @@ from shared.schemas import Tokens
 if TYPE_CHECKING:
     from service.prompting.prompt import Prompt
 
-# The tokenizer makes a token of every three digits, from the left.
-_DIGITS_A_TOKEN = 3
-# The least numbers of one token more, in ascending order.
-_LONGER = 10 ** np.arange(_DIGITS_A_TOKEN, 18, _DIGITS_A_TOKEN)
+# The tokenizer makes a token of every three digits, from the left: a number below this is one token.
+_ONE_TOKEN_MORE = 1000
 # The placeholder for a number while the text around it is counted: one token, and not zero, which has no sign.
 _PLACEHOLDER = "5"
 
@@ -106,7 +104,10 @@ class UnprunedState:
     @property
     def text(self) -> str:
         """The block's text."""
-        names, numbers, unknown = self._numbers()
+        columns = full_columns(self.state)
+        names = tuple(columns)
+        numbers = np.rint(np.array(list(columns.values())).T).astype(np.int64)
+        unknown = ~self.state.heard[:, None] & _columns(names)[0]
         lines = [
             self.write({n: UNKNOWN if u else str(v) for n, v, u in zip(names, row, missing, strict=True)})
             for row, missing in zip(numbers.tolist(), unknown.tolist(), strict=True)
@@ -115,22 +116,18 @@ class UnprunedState:
 
     def tokens(self, count: Callable[[str], int]) -> int:
         """``count(text)``, for a tokenizer that splits digits and lines as o200k_base does."""
-        names, numbers, unknown = self._numbers()
-        sizes = np.abs(numbers[~unknown])
-        digits = len(sizes) + int(np.add.reduce(_LONGER.searchsorted(sizes, side="right")))
-        kinds = np.where(unknown, 2, numbers < 0) @ _columns(names)[1]
-        total = count(self.head) if self.head else 0
-        for kind, often in Counter(kinds.tolist()).items():
-            text, known = _example_row(self.write, names, kind)
-            total += often * (count(text) - known)
-        return total + digits
-
-    def _numbers(self) -> tuple[tuple[str, ...], NDArray[np.int64], NDArray[np.bool_]]:
-        """The columns' names, their whole numbers ``(J, C)``, and which of these are unknown for want of a beacon."""
         columns = full_columns(self.state)
         names = tuple(columns)
-        numbers = np.rint(np.array(list(columns.values())).T).astype(np.int64)
-        return names, numbers, ~self.state.heard[:, None] & _columns(names)[0]
+        numbers = np.array(list(columns.values()), dtype=np.float64)
+        kinds, counts = np.empty((2, numbers.shape[1]), dtype=np.int64)
+        # A copy, because numba would compile the function again for an array that is read-only.
+        heard = np.array(self.state.heard)
+        found, total = count_kinds(numbers, *_columns(names), heard, _ONE_TOKEN_MORE, kinds, counts)
+        total += count(self.head) if self.head else 0
+        for kind, often in zip(kinds[:found].tolist(), counts[:found].tolist(), strict=True):
+            text, known = _example_row(self.write, names, kind)
+            total += often * (count(text) - known)
+        return total
 
 
 @lru_cache(maxsize=16)

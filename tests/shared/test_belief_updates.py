@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 
 from service.edge.compilation import load_for_event_loop
+from service.prompting import row_kinds
+from service.prompting.token_accounting import UnprunedState
 from shared import link_expectations, record_updates
 from shared.channel import FloatArray, IntArray, Links
 from shared.features import augment
 from shared.fleetplan import FleetBelief, beacon_updates, expected_queues
 from shared.fleetplan.arrivals import GOES_ON
+from shared.learned_channel import ExpectedLinks
 from shared.records import Records, take_report
 from shared.scenario import SCENARIOS, Scenario
 from shared.schemas import SensorColumns, UavState
@@ -131,6 +134,27 @@ def test_queues_and_bursts_are_those_of_the_formula() -> None:
     assert (arrivals.burst(1_000_000) == 0.0).all()
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_links_by_formula_are_those_of_the_channel(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    ranges = {
+        "altitude_m": (10, 300),
+        "transmit_power_w": (1e-3, 1),
+        "path_loss_limit_db": (80, 140),
+        "spectral_cap": (0.5, 12),
+        "los_excess_db": (0, 5),
+        # A loss that falls with the distance, too.
+        "nlos_excess_db": (0, 40) if seed % 4 else (0, 0.1),
+        "link_share": (0.1, 1),
+        "radio_radius_m": (50, 600),
+    }
+    world = Scenario.model_validate({name: float(random.uniform(*bounds)) for name, bounds in ranges.items()})
+    distance = np.append(random.uniform(0, 700, (15, 400)), np.full((15, 1), world.radio_radius_m), axis=1)
+    ours, links = ExpectedLinks.by_formula(distance, world), Links.at(distance, world)
+    np.testing.assert_array_equal(ours.packets, links.packets)
+    np.testing.assert_array_equal(ours.hold, links.hold)
+
+
 def test_a_transfer_is_the_channels() -> None:
     channel = FleetBelief(SCENARIOS["paper"]).channel
     for loss_db in (80.0, 106.0, 109.0, 111.0):
@@ -161,6 +185,9 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
         link_expectations.measured_excess,
         link_expectations.expected_transfers,
         link_expectations.transfer,
+        link_expectations.know_rings,
+        link_expectations.formula_transfers,
+        row_kinds.count_kinds,
     ]
     load_for_event_loop()
     assert {function.__name__: len(function.signatures) for function in functions} == {  # type: ignore[attr-defined]
@@ -172,9 +199,10 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
     for step in range(60, 64):
         take_report(report(step), step, records, again)
         for known, rates in ((again, None), (None, records.rates)):
-            augment(
+            state = augment(
                 report(step), step, WORLD, visits=records.visits, rates=rates, reserved=(), preset="reach", belief=known
             )
+            UnprunedState(state, ",".join).tokens(len)
         again.tell(step % 2, step, 0, 3)
         again.settle(step % 2, step, failed=False)
     again.queue(70)

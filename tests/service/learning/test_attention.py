@@ -100,3 +100,13 @@ def test_top_k_is_best_first_and_never_more_than_there_are() -> None:
     scores = np.array([0.1, 3.0, -1.0, 2.0], dtype=np.float32)
     assert top_k(scores, 3) == [1, 3, 0]
     assert top_k(scores, 9) == [1, 3, 0, 2]
+
+
+@pytest.mark.parametrize("k", [1, 5, 199, 200, 300])
+def test_the_best_of_many_are_those_of_a_sort(k: int) -> None:
+    random = np.random.default_rng(k)
+    # Many are equal, many are ruled out, and an overflow gives no number.
+    scores = random.integers(0, 20, 200).astype(np.float32)
+    scores[random.random(200) < 0.5] = -np.inf
+    scores[7] = np.nan
+    assert top_k(scores, k) == (-scores).argsort(kind="stable")[:k].tolist()
