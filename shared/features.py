@@ -256,7 +256,7 @@ def augment(
         rate = rates[ids]
     else:
         heard = np.ones_like(heard)
-        queue, battery = belief.queue(step, ids), belief.battery[ids]
+        battery, queue = belief.battery[ids], belief.queue(step, ids)
         rate = belief.arrivals.coming(step, scenario.overflow_horizon_steps, ids)
     stale = reported.beacon != step
     if stale.any():

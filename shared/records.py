@@ -52,8 +52,9 @@ class Records:
         from shared.record_updates import record_beacons
 
         arrays = self.visits, self._seen, self._queue, self._arrivals, self._exposure
-        # Copies, because numba would compile the function again for arrays that are read-only.
-        record_beacons(*arrays, float(self._capacity), np.array(ids), np.array(seen), np.array(queue))
+        # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
+        given = np.array(ids, dtype=np.int64), np.array(seen, dtype=np.int64), np.array(queue, dtype=np.float64)
+        record_beacons(*arrays, float(self._capacity), *given)
 
     def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
         """Count a decision as a visit until its outcome is known."""

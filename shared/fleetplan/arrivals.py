@@ -71,7 +71,7 @@ class Arrivals:
         return self.dispersion > 1.0
 
     @property
-    def newest(self) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+    def burst_arrays(self) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
         """``rate``, ``recent``, ``recent_at`` and the powers of ``GOES_ON``, for compiled functions."""
         return self.rate, self.recent, self.recent_at, _POWERS
 
@@ -81,7 +81,7 @@ class Arrivals:
 
         which = np.arange(len(self.rate)) if ids is None else np.array(ids)
         packets = np.empty(len(which))
-        bursts_to_come(*self.newest, self.in_bursts, which, step, packets)
+        bursts_to_come(*self.burst_arrays, self.in_bursts, which, step, packets)
         return packets
 
     def coming(self, step: int, horizon: float, ids: IntArray | None = None) -> FloatArray:

@@ -1,8 +1,8 @@
 """What beacons change in a fleet's belief, compiled by numba; without numba it is plain Python.
 
 Arrays ``(J,)`` are by sensor, those of :class:`~shared.fleetplan.belief.FleetBelief` and
-:class:`~shared.fleetplan.arrivals.Arrivals` of the same names; ``places`` is ``(J, 2)``. They are arguments of their
-own, because a tuple of them takes four times as long to pass.
+:class:`~shared.fleetplan.arrivals.Arrivals` of the same names. They are arguments of their own, because a tuple of them
+takes four times as long to pass.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from shared.compiled import compiled
 
 @compiled
 def take_beacons(
-    places: FloatArray,
     base: FloatArray,
     since: IntArray,
     heard: IntArray,
@@ -26,7 +25,6 @@ def take_beacons(
     rate: FloatArray,
     capacity: float,
     ids: IntArray,
-    beacon_places: FloatArray,
     beacon_step: IntArray,
     beacon_queue: FloatArray,
     beacon_battery: FloatArray,
@@ -38,7 +36,7 @@ def take_beacons(
     """Take n sensors' beacons that are newer than the known ones, as :meth:`FleetBelief.hear` does.
 
     Args:
-        ids, beacon_places, beacon_step, beacon_queue, beacon_battery: the beacons, as that method has them.
+        ids, beacon_step, beacon_queue, beacon_battery: the beacons, as that method has them.
         interval_ids, came, steps, at: shape ``(n,)``, are written: the sensors whose interval between two beacons shows
             arrivals, the packets that came, the interval's length, and the step in which it ended.
 
@@ -48,7 +46,6 @@ def take_beacons(
     count = 0
     for n in range(ids.shape[0]):
         sensor, step, queue = ids[n], beacon_step[n], beacon_queue[n]
-        places[sensor, 0], places[sensor, 1] = beacon_places[n, 0], beacon_places[n, 1]
         if step <= heard[sensor]:
             continue
         passed = step - since[sensor]

@@ -81,11 +81,14 @@ class FleetBelief:
         """
         from shared.fleetplan.beacon_updates import take_beacons
 
-        # Copies, because numba would compile the function again for arrays that are read-only.
-        beacons = np.array(ids), np.array(places, order="C"), np.array(beacon), np.array(queue), np.array(battery)
+        # numpy raises an error for a sensor that there is not; compiled code would write past the end.
+        self.places[ids] = places
+        # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
+        heard = np.array(ids, dtype=np.int64), np.array(beacon, dtype=np.int64)
+        told = np.array(queue, dtype=np.float64), np.array(battery, dtype=np.float64)
         (which, steps, at), came = np.empty((3, len(ids)), dtype=np.int64), np.empty(len(ids))
-        known = self.places, self.base, self.since, self.heard, self.battery, self.visited, self.arrivals.rate
-        count = take_beacons(*known, float(self._scenario.queue_capacity), *beacons, which, came, steps, at)
+        known = self.base, self.since, self.heard, self.battery, self.visited, self.arrivals.rate
+        count = take_beacons(*known, float(self._scenario.queue_capacity), *heard, *told, which, came, steps, at)
         if count:
             self.arrivals.take(which[:count], came[:count], steps[:count], at[:count])
 
@@ -114,12 +117,12 @@ class FleetBelief:
         A transmission of the UAV's last step was over the same link as the beacon now. If it failed although that link
         is good, the sensor's radio failed.
         """
+        from shared.fleetplan.beacon_updates import in_range
+
         last = self.uavs[uav]
         if last.taught == last.step:
             return NOTHING_MEASURED
         last.taught = last.step
-        from shared.fleetplan.beacon_updates import in_range
-
         rows, distance = np.empty(len(ids), dtype=np.int64), np.empty(len(ids))
         count = in_range(self.places, np.array(ids), *last.position, self._scenario.radio_radius_m, rows, distance)
         rows, distance = rows[:count], distance[:count]
@@ -243,7 +246,7 @@ class FleetBelief:
 
         which = np.arange(len(self.base)) if ids is None else np.array(ids)
         queue, capacity, bursts = np.empty(len(which)), float(self._scenario.queue_capacity), self.arrivals.in_bursts
-        expected_queues(*self.arrivals.newest, bursts, self.base, self.since, capacity, which, step, queue)
+        expected_queues(*self.arrivals.burst_arrays, bursts, self.base, self.since, capacity, which, step, queue)
         return queue
 
     def present(self, step: int) -> list[int]:
