@@ -116,12 +116,6 @@ class Links:
         return np.asarray(whole_rate_bps(self.loss_db, self.scenario) * self.share)
 
     @property
-    def packet_j(self) -> FloatArray:
-        """What a packet costs the sensor's battery, joules."""
-        world = self.scenario
-        return np.asarray(world.transmit_power_w * (world.packet_bits / np.maximum(self.rate_bps, 1e-12)))
-
-    @property
     def packets(self) -> NDArray[np.int64]:
         """As :func:`packets_per_step`."""
         moved = np.floor(self.rate_bps * self.scenario.step_s / self.scenario.packet_bits + 1e-9)

@@ -14,7 +14,7 @@ from shared.channel import FloatArray, IntArray, LinkBudget, path_loss_db
 from shared.radio_map import RadioMap
 from shared.scenario import Point, Scenario
 
-# Rings around a UAV whose links by the formula are computed once; all but some twenty have the same link everywhere.
+# Rings around a UAV whose links by the formula are computed once. In the scenarios, all but nine have equal links.
 _RINGS = 1024
 # A link that holds with at least this probability counts as one.
 LIKELY = 0.5
@@ -51,7 +51,7 @@ class ExpectedLinks:
 
     @classmethod
     def by_formula(cls, distance: FloatArray, scenario: Scenario) -> Self:
-        """The links of the mean path loss."""
+        """The links of the mean path loss at distances ``(P, n)``."""
         from shared.link_expectations import formula_transfers
 
         world = LinkBudget.of(scenario)
@@ -206,7 +206,7 @@ class LearnedChannel:
     def transfer(self, loss_db: float) -> tuple[float, int]:
         """What a packet costs a sensor's battery, joules, and the packets that a step moves, over a link of this loss.
 
-        The link is in radio range; no packets move where the loss exceeds the threshold.
+        The link is in radio range; no packets move where the loss is not below the threshold.
         """
         from shared.link_expectations import transfer
 

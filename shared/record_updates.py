@@ -15,6 +15,7 @@ def record_beacons(
     exposure: FloatArray,
     capacity: float,
     ids: IntArray,
+    before: IntArray,
     beacon_step: IntArray,
     beacon_queue: FloatArray,
 ) -> None:
@@ -22,14 +23,15 @@ def record_beacons(
 
     Args:
         visits, seen, queue, arrivals, exposure: shape ``(J,)``, the arrays of :class:`~shared.records.Records`.
-        ids, beacon_step, beacon_queue: shape ``(n,)``, each sensor once.
+        ids, before: shape ``(n,)``, each sensor once, and their ``seen``.
+        beacon_step, beacon_queue: shape ``(n,)``.
     """
     for n in range(ids.shape[0]):
-        sensor, before = ids[n], seen[ids[n]]
-        if beacon_step[n] <= before:
+        sensor = ids[n]
+        if beacon_step[n] <= before[n]:
             continue
-        undisturbed = before >= 0 and visits[sensor] < before
+        undisturbed = before[n] >= 0 and visits[sensor] < before[n]
         if undisturbed and queue[sensor] <= beacon_queue[n] < capacity:
             arrivals[sensor] += beacon_queue[n] - queue[sensor]
-            exposure[sensor] += beacon_step[n] - before
+            exposure[sensor] += beacon_step[n] - before[n]
         seen[sensor], queue[sensor] = beacon_step[n], beacon_queue[n]

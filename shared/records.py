@@ -53,8 +53,16 @@ class Records:
 
         arrays = self.visits, self._seen, self._queue, self._arrivals, self._exposure
         # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
-        given = np.array(ids, dtype=np.int64), np.array(seen, dtype=np.int64), np.array(queue, dtype=np.float64)
-        record_beacons(*arrays, float(self._capacity), *given)
+        which, steps, queues = (
+            np.array(ids, dtype=np.int64),
+            np.array(seen, dtype=np.int64),
+            np.array(queue, dtype=np.float64),
+        )
+        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        before = self._seen[which]
+        if not len(which) == len(steps) == len(queues):
+            raise ValueError(f"{len(which)} sensors with {len(steps)} steps and {len(queues)} queues")
+        record_beacons(*arrays, float(self._capacity), which, before, steps, queues)
 
     def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
         """Count a decision as a visit until its outcome is known."""

@@ -86,7 +86,8 @@ class KeyAuthentication:
         if limiter is None:
             window, quota = RateLimiterType.SLIDING_WINDOW.value, per_min(key.per_minute)
             limiter = self._limiters[key.per_minute] = Throttled(using=window, quota=quota, store=self._counts)
-        found = limiter.limit(key.name)
+        # A key whose rate was changed begins anew.
+        found = limiter.limit(f"{key.name}:{key.per_minute}")
         return max(1, math.ceil(found.state.retry_after)) if found.limited else None
 
 

@@ -84,9 +84,9 @@ class Arrivals:
         bursts_to_come(*self.burst_arrays, self.in_bursts, which, step, packets)
         return packets
 
-    def coming(self, step: int, horizon: float, ids: IntArray | None = None) -> FloatArray:
-        """Packets a step that are expected in the steps from this one to the horizon, ``(J,)`` or ``(n,)``."""
-        rate = self.rate if ids is None else self.rate[ids]
+    def coming(self, step: int, horizon: float, ids: IntArray) -> FloatArray:
+        """Packets a step that sensors ``(n,)`` are expected to get in the steps from this one to the horizon."""
+        rate = self.rate[ids]
         if not self.in_bursts:
             return rate
         return rate + self.burst(step, ids) * float(self.burst_over(horizon)) / horizon

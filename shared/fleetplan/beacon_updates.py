@@ -1,8 +1,8 @@
 """What beacons change in a fleet's belief, compiled by numba; without numba it is plain Python.
 
 Arrays ``(J,)`` are by sensor, those of :class:`~shared.fleetplan.belief.FleetBelief` and
-:class:`~shared.fleetplan.arrivals.Arrivals` of the same names. They are arguments of their own, because a tuple of them
-takes four times as long to pass.
+:class:`~shared.fleetplan.arrivals.Arrivals` of the same names. They are arguments of their own, because making and
+passing a tuple of them takes five times as long.
 """
 
 from __future__ import annotations
@@ -62,20 +62,19 @@ def take_beacons(
 
 
 @compiled
-def in_range(
-    places: FloatArray, ids: IntArray, east: float, north: float, radius: float, rows: IntArray, distance: FloatArray
-) -> int:
+def in_range(places: FloatArray, east: float, north: float, radius: float, rows: IntArray, distance: FloatArray) -> int:
     """Find which of n sensors are within a radius of a UAV, metres; one of unknown position is not.
 
     Args:
+        places: shape ``(n, 2)``, of these sensors.
         rows, distance: shape ``(n,)``, are written: the indices of those sensors, and their distances.
 
     Returns:
         their number.
     """
     count = 0
-    for n in range(ids.shape[0]):
-        metres = np.hypot(places[ids[n], 0] - east, places[ids[n], 1] - north)
+    for n in range(places.shape[0]):
+        metres = np.hypot(places[n, 0] - east, places[n, 1] - north)
         if metres <= radius:
             rows[count], distance[count] = n, metres
             count += 1

@@ -81,8 +81,12 @@ class FleetBelief:
         """
         from shared.fleetplan.beacon_updates import take_beacons
 
-        # numpy raises an error for a sensor that there is not; compiled code would write past the end.
+        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
         self.places[ids] = places
+        if not len(ids) == len(beacon) == len(queue) == len(battery):
+            raise ValueError(
+                f"{len(ids)} sensors with {len(beacon)} beacons, {len(queue)} queues, {len(battery)} batteries"
+            )
         # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
         heard = np.array(ids, dtype=np.int64), np.array(beacon, dtype=np.int64)
         told = np.array(queue, dtype=np.float64), np.array(battery, dtype=np.float64)
@@ -124,7 +128,7 @@ class FleetBelief:
             return NOTHING_MEASURED
         last.taught = last.step
         rows, distance = np.empty(len(ids), dtype=np.int64), np.empty(len(ids))
-        count = in_range(self.places, np.array(ids), *last.position, self._scenario.radio_radius_m, rows, distance)
+        count = in_range(self.places[ids], *last.position, self._scenario.radio_radius_m, rows, distance)
         rows, distance = rows[:count], distance[:count]
         near, gain_db = ids[rows], gain_db[rows]
         excess_db = self.channel.measure(near, last.position, distance, gain_db)
@@ -246,7 +250,9 @@ class FleetBelief:
 
         which = np.arange(len(self.base)) if ids is None else np.array(ids)
         queue, capacity, bursts = np.empty(len(which)), float(self._scenario.queue_capacity), self.arrivals.in_bursts
-        expected_queues(*self.arrivals.burst_arrays, bursts, self.base, self.since, capacity, which, step, queue)
+        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        base, since = self.base[which], self.since[which]
+        expected_queues(*self.arrivals.burst_arrays, bursts, base, since, which, capacity, step, queue)
         return queue
 
     def present(self, step: int) -> list[int]:

@@ -52,8 +52,8 @@ def expected_queues(
     bursts: bool,
     base: FloatArray,
     since: IntArray,
-    capacity: float,
     ids: IntArray,
+    capacity: float,
     step: int,
     queue: FloatArray,
 ) -> None:
@@ -61,11 +61,12 @@ def expected_queues(
 
     Args:
         bursts: whether arrivals come in bursts.
+        base, since: shape ``(n,)``, of these sensors.
     """
     for n in range(ids.shape[0]):
         sensor = ids[n]
-        came = rate[sensor] * max(step - since[sensor], 0)
+        came = rate[sensor] * max(step - since[n], 0)
         if bursts:
-            then = _still_to_come(rate, recent, recent_at, powers, sensor, min(since[sensor], step))
+            then = _still_to_come(rate, recent, recent_at, powers, sensor, min(since[n], step))
             came = came + (then - _still_to_come(rate, recent, recent_at, powers, sensor, step))
-        queue[n] = min(base[sensor] + came, capacity)
+        queue[n] = min(base[n] + came, capacity)

@@ -36,7 +36,7 @@ def test_poissons_arrivals_have_no_bursts_to_the_bit(steps: int) -> None:
     arrivals = told(poisson(steps))
     assert arrivals.dispersion == 1.0
     assert not arrivals.burst(steps).any()
-    np.testing.assert_array_equal(arrivals.coming(steps, 8.0), arrivals.rate)
+    np.testing.assert_array_equal(arrivals.coming(steps, 8.0, ALL), arrivals.rate)
 
 
 def test_bursts_are_seen_and_go_on_for_a_while() -> None:
@@ -45,7 +45,7 @@ def test_bursts_are_seen_and_go_on_for_a_while() -> None:
     soon = in_burst.burst(196)
     assert (soon > 3.0).all()
     assert (in_burst.burst(206) < 0.1 * soon).all()
-    assert (in_burst.coming(196, 8.0) > in_burst.rate + 0.5).all()
+    assert (in_burst.coming(196, 8.0, ALL) > in_burst.rate + 0.5).all()
     # A sensor that has less than its rate now expects its rate.
     np.testing.assert_array_equal(after.burst(216), 0.0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -142,6 +143,8 @@ def test_links_by_formula_are_those_of_the_channel(seed: int) -> None:
         "nlos_excess_db": (0, 40) if seed % 4 else (0, 0.1),
         "link_share": (0.1, 1),
         "radio_radius_m": (50, 600),
+        # In many steps of rates, most rings differ.
+        "packet_bits": (1e3, 1e5),
     }
     world = Scenario.model_validate({name: float(random.uniform(*bounds)) for name, bounds in ranges.items()})
     distance = np.append(random.uniform(0, 700, (15, 400)), np.full((15, 1), world.radio_radius_m), axis=1)
@@ -155,7 +158,8 @@ def test_a_transfer_is_the_channels() -> None:
     for loss_db in (80.0, 106.0, 109.0, 111.0):
         link = Links(np.array(100.0), np.array(loss_db), SCENARIOS["paper"])
         packet_j, packets = channel.transfer(loss_db)
-        assert packet_j == pytest.approx(float(link.packet_j), rel=1e-12)
+        world = link.scenario
+        assert packet_j == pytest.approx(world.transmit_power_w * world.packet_bits / float(link.rate_bps), rel=1e-12)
         assert packets == int(link.packets)
 
 
@@ -168,7 +172,22 @@ def test_without_numba_the_belief_is_the_same() -> None:
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
 
-def test_a_sensor_that_there_is_not_is_an_error() -> None:
-    one = np.ones(1)
-    with pytest.raises(IndexError, match="10"):
-        FleetBelief(WORLD).hear(np.array([10]), np.ones((1, 2)), np.array([3]), one, one)
+def test_a_sensor_that_there_is_not_is_an_error_and_so_are_columns_of_other_lengths() -> None:
+    belief, records, one, unknown = FleetBelief(WORLD), Records(WORLD), np.ones(1), np.array([10])
+    belief.locate(0, 3, (500.0, 450.0))
+    calls: list[Callable[[], object]] = [
+        lambda: belief.hear(unknown, np.ones((1, 2)), np.array([3]), one, one),
+        lambda: belief.measure(0, unknown, one),
+        lambda: belief.queue(3, unknown),
+        lambda: belief.arrivals.coming(3, 8.0, unknown),
+        lambda: records.hear(unknown, np.array([3]), one),
+    ]
+    for call in calls:
+        with pytest.raises(IndexError, match="10"):
+            call()
+    three = np.arange(3)
+    with pytest.raises(ValueError, match="3 sensors with 1 beacons, 1 queues, 1 batteries"):
+        belief.hear(three, np.ones((3, 2)), np.array([3]), one, one)
+    with pytest.raises(ValueError, match="3 sensors with 1 steps and 1 queues"):
+        records.hear(three, np.array([3]), one)
+    assert (belief.heard == -1).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import stat
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -91,6 +92,21 @@ def test_a_key_that_asks_too_often_is_told_to_wait(edge: Edge, report: Report, t
     assert [answer.status_code for answer in answers] == [200] * 5 + [429] * 2
     assert 1 <= int(answers[-1].headers["retry-after"]) <= 60
     assert client.post("/decide", json=report(), headers=bearer(other)).status_code == 200
+
+
+def test_a_key_whose_rate_is_lowered_begins_anew(edge: Edge, report: Report, tmp_path: Path) -> None:
+    file, path = KeyFile(), tmp_path / "keys.json"
+    key = file.add("fleet", frozenset({"decide", "admin"}), per_minute=100)
+    file.write(path)
+    client = edge(keys=path)
+    assert [client.post("/decide", json=report(step=step), headers=bearer(key)).status_code for step in range(9)] == [
+        200
+    ] * 9
+    file.keys = [file.keys[0].model_copy(update={"per_minute": 3})]
+    file.write(path)
+    time.sleep(1.1)
+    answers = [client.post("/decide", json=report(step=step), headers=bearer(key)) for step in range(9, 14)]
+    assert [answer.status_code for answer in answers] == [200] * 3 + [429] * 2
 
 
 def test_a_key_taken_back_is_out_and_a_new_one_in_without_a_restart(tmp_path: Path) -> None:
