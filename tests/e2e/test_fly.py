@@ -103,10 +103,11 @@ def check_report(out: Path, decisions: list[Decision], told: str) -> None:
     assert summary.by_source.onboard == onboard and summary.by_source.policy == STEPS * UAVS - onboard
     real = summary.real_uavs
     assert real is not None and real.uavs == sums_by_uav(decisions)
-    # Each UAV's share has what it heard of; the whole has each packet once, and no more than the sensors lost.
+    # Each UAV counts what a sensor lost since that UAV first heard it, the whole since any UAV did, each packet once.
+    # So the whole may exceed the UAVs' sum. It is no less than any UAV's own, and no more than the sensors lost.
     lost = summary.lost_packets["aic_vds"]
     assert real.simulated_lost is not None and lost <= real.simulated_lost
-    assert max(one.lost_packets for one in real.uavs) <= lost <= sum(one.lost_packets for one in real.uavs)
+    assert max(one.lost_packets for one in real.uavs) <= lost
     page = (out / "report.html").read_text(encoding="utf-8")
     assert 'id="uavs"' in page and "WQCS fly at a constant" not in page and f"Late: {real.late} decisions" in page
     assert {path.name for path in (out / "figures").glob("*.svg")} == {
