@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from shared.channel import FloatArray
 from shared.scenario import Scenario
@@ -171,6 +171,14 @@ class Guidance(Received):
 
     def in_words(self) -> str:
         """The orders in plain English, from the structure alone."""
+        return " ".join(self._each_in_words()) or "Nothing beyond the mission's own rules."
+
+    def beyond(self, other: Guidance) -> list[str]:
+        """The orders, each in words, that the other guidance does not have."""
+        others = set(other._each_in_words())
+        return [order for order in self._each_in_words() if order not in others]
+
+    def _each_in_words(self) -> list[str]:
         said = []
         for wish in self.sensors:
             if wish.visit_every is not None:
@@ -187,7 +195,7 @@ class Guidance(Received):
         if self.forbidden_velocities:
             levels = " or ".join(map(str, sorted(set(self.forbidden_velocities))))
             said.append(f"Never fly at {levels} m/s.")
-        return " ".join(said) or "Nothing beyond the mission's own rules."
+        return said
 
 
 class Impossible(ValueError):
@@ -212,6 +220,9 @@ class GuidanceStatus(Wire):
     decides by in mode ``llm``.
     """
 
+    # The status of a newer edge may have more fields.
+    model_config = ConfigDict(extra="ignore")
+
     mission_id: MissionId
     status: GuidanceState
     note: str | None = None
@@ -222,19 +233,28 @@ class GuidanceStatus(Wire):
     model: str | None = Field(None, description="the LLM that compiled the note")
     failure: str | None = Field(None, description="why the note could not be compiled")
     doubts: list[str] = Field([], description="what may be wrong with the LLM's reading; empty where it is certain")
+    begins: list[str] = Field([], description="the orders that begin when `guidance` is confirmed, each in words")
+    ends: list[str] = Field([], description="the orders in force that end when `guidance` is confirmed, each in words")
+    begun: list[str] = Field([], description="the orders that began when those in force last changed, each in words")
+    ended: list[str] = Field([], description="the orders that ended when those in force last changed, each in words")
+    version: str = Field("", description="another one after every change; an answer may name the one that it answers")
 
 
 class GuidanceAnswer(Received):
-    """``POST /missions/{id}/guidance``: confirm or reject the compiled guidance, or replace it.
+    """``POST /missions/{id}/guidance``: confirm or reject the compiled guidance, replace it, or withdraw all orders.
 
     A new note is compiled, and obeyed once it is confirmed; until then the orders before it stay. A given structure
-    counts as confirmed. It needs neither an LLM nor a note.
+    counts as confirmed. It needs neither an LLM nor a note. Both replace all orders in force. `withdraw` ends these,
+    whatever has become of the note; `reject` does the same where no proposal waits for an answer.
     """
 
-    answer: Literal["confirm", "reject"] | None = None
+    answer: Literal["confirm", "reject", "withdraw"] | None = None
     guidance: Guidance | None = None
     note: Note | None = Field(
         None, description="a new note in plain words; a long prompt keeps the text of the mission's first one"
+    )
+    version: str | None = Field(
+        None, max_length=64, description="the status's `version`: the answer gets 409 if the guidance has changed since"
     )
 
     @model_validator(mode="after")

@@ -78,6 +78,11 @@ GUIDANCE: dict[str, Any] = {
     "model": None,
     "failure": None,
     "doubts": [],
+    "begins": [],
+    "ends": [],
+    "begun": ["Visit sensor 4 at least once in every 3 steps.", "Never fly faster than 10 m/s."],
+    "ended": ["Visit sensor 2 at least once in every 5 steps."],
+    "version": "5f0c2d9a1b7e4836",
 }
 MISSION = {
     "mission_id": "patrol",
@@ -153,6 +158,7 @@ REQUESTS: dict[tuple[str, str], dict[str, Example]] = {
         "own": {"summary": "The operator's own structure: obeyed at once", "value": {"guidance": ORDERS}},
         "confirm": {"summary": "What was understood is right", "value": {"answer": "confirm"}},
         "reject": {"summary": "It is not", "value": {"answer": "reject"}},
+        "withdraw": {"summary": "End all orders in force", "value": {"answer": "withdraw"}},
         "note": {"summary": "A new note: read by the LLM, and obeyed once it is confirmed", "value": {"note": NOTE}},
     },
     ("post", "/missions/{mission_id}/readings"): {

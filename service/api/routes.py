@@ -170,7 +170,10 @@ async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStat
     tags=["missions"],
 )
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
-    """Confirm or reject what was understood, or give a structure or a new note. Only confirmed orders are obeyed."""
+    """Confirm or reject what was understood, give a structure or a new note, or withdraw the orders in force.
+
+    Only confirmed orders are obeyed. `ends` of the status says which of those in force a confirmation ends.
+    """
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")
     mission.answer_guidance(body)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ class OperatorGuidance:
 
     The operator may give a structure at any time, which is confirmed at once. A proposal that an LLM makes afterwards
     is ignored. A new note begins this life again; the orders that were confirmed before stay until the operator
-    confirms the new ones, and a rejected proposal leaves them as they are.
+    confirms the new ones, or withdraws them; a rejected proposal leaves them as they are.
 
     Attributes:
         confirmed: the guidance that planner and scores follow; empty until the operator confirms one.
@@ -25,6 +26,8 @@ class OperatorGuidance:
     def __init__(self, note: str | None, scenario: Scenario) -> None:
         self.note = note
         self.status: GuidanceState = "none" if note is None else "compiling"
+        self._begun: list[str] = []
+        self._ended: list[str] = []
         self._obey(NO_GUIDANCE)
         self._scenario = scenario
         self._proposed: Guidance | None = None
@@ -48,36 +51,58 @@ class OperatorGuidance:
         """Apply the operator's answer, which takes effect with the next decision.
 
         Raises:
-            Conflict: there is nothing to confirm or reject.
+            Conflict: there is nothing to confirm or reject, or the guidance is no longer that of the answer's version.
             Refused: the fleet cannot follow the operator's structure; the guidance stays as it is.
         """
+        if answer.version not in (None, self.version):
+            raise Conflict("version", "the guidance has changed since this version: read it again, then answer")
         if answer.note is not None:
             self.note, self.status = answer.note, "compiling"
             self._proposed = self._origin = self._model = self._failure = None
             self._doubts = []
-            return
-        if answer.guidance is not None:
+        elif answer.guidance is not None:
             try:
                 answer.guidance.check(self._scenario)
             except Impossible as error:
                 raise Refused(f"guidance.{error.field}", error.detail) from None
             self._proposed, self._origin, self._failure = answer.guidance, "operator", None
             self._doubts = []
+            self._confirm(answer.guidance)
+        elif answer.answer == "withdraw" or (answer.answer == "reject" and self.orders and self.status != "proposed"):
+            self._withdraw()
         elif self._proposed is None:
             raise Conflict(
                 "answer", f"guidance is {self.status}: there is nothing to {answer.answer}; give `guidance` of your own"
             )
-        if answer.answer != "reject":
-            self.status = "confirmed"
-            self._obey(self._proposed)
-            return
-        if self.status != "proposed":
-            self._obey(NO_GUIDANCE)
-        self.status = "rejected"
+        elif answer.answer == "confirm":
+            self._confirm(self._proposed)
+        else:
+            self.status = "rejected"
+
+    def _confirm(self, guidance: Guidance) -> None:
+        self.status = "confirmed"
+        self._change(guidance)
+
+    def _withdraw(self) -> None:
+        # A note that is being read, was not understood or waits for an answer stays as it is.
+        if self.status == "confirmed":
+            self.status = "rejected"
+        self._change(NO_GUIDANCE)
+
+    def _change(self, guidance: Guidance) -> None:
+        begun, ended = guidance.beyond(self.confirmed), self.confirmed.beyond(guidance)
+        if begun or ended:
+            self._begun, self._ended = begun, ended
+        self._obey(guidance)
 
     def _obey(self, guidance: Guidance) -> None:
         self.confirmed = guidance
         self.orders = guidance or None
+
+    @property
+    def version(self) -> str:
+        """A digest of the whole state, so that it outlives a restart and names no other state after one."""
+        return hashlib.sha256(repr(self.state_dict()).encode()).hexdigest()[:16]
 
     @property
     def read(self) -> Guidance | None:
@@ -99,6 +124,11 @@ class OperatorGuidance:
             model=self._model,
             failure=self._failure,
             doubts=self._doubts,
+            begins=[] if self._proposed is None else self._proposed.beyond(self.confirmed),
+            ends=[] if self._proposed is None else self.confirmed.beyond(self._proposed),
+            begun=self._begun,
+            ended=self._ended,
+            version=self.version,
         )
 
     def state_dict(self) -> dict[str, Any]:
@@ -112,6 +142,8 @@ class OperatorGuidance:
             "model": self._model,
             "failure": self._failure,
             "doubts": self._doubts,
+            "begun": self._begun,
+            "ended": self._ended,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -124,3 +156,4 @@ class OperatorGuidance:
         self._proposed = None if proposed is None else Guidance.model_validate(proposed)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]
         self._doubts = state.get("doubts", [])
+        self._begun, self._ended = state.get("begun", []), state.get("ended", [])

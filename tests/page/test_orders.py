@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from service.config.settings import Settings
 from simulator.commands import simulate
 from simulator.flying.pilots import Choice, EdgePilot
 from simulator.world import Observation
-from tests.page.conftest import Open
+from tests.page.conftest import Open, violations
 from tests.running import serving
 from tests.service.guidance.test_operator_guidance import Scribe
 from tests.service.stub_llm import wait_for
@@ -28,19 +29,34 @@ pytestmark = pytest.mark.needs("chromium")
 
 NOTE = "Suspected leak at sensor 3: visit it every third step."
 EVERY = 3
+ORDERS = f"visit sensor 3 every {EVERY} steps"
+FIRST, SECOND = (f"Visit sensor {sensor} at least once in every {every} steps." for sensor, every in ((3, 3), (2, 4)))
 # Two of ten radios are dead, so that some visits fail.
 FLIGHT = ("--scenario", "faulty", "--seed", "2", "--no-bound")
 
 
-@pytest.fixture(scope="module")
-def edge() -> Iterator[str]:
-    """One in this process, whose LLM rewrites the note as orders."""
-    with serving(Scribe(f"visit sensor 3 every {EVERY} steps").app) as llm:
+@contextmanager
+def reading(*orders: str) -> Iterator[str]:
+    """An edge in this process, whose LLM rewrites notes as these orders, one after another."""
+    with serving(Scribe(*orders).app) as llm:
         settings = Settings(mode="llm", llm_url=f"{llm}/v1", llm_model="scribe", deadline_ms=60_000)
         with serving(create_app(settings)) as url:
             with httpx.Client(base_url=url) as client:
                 wait_for(client, "ready")
             yield url
+
+
+@pytest.fixture(scope="module")
+def edge() -> Iterator[str]:
+    with reading(ORDERS) as url:
+        yield url
+
+
+@pytest.fixture
+def renewed() -> Iterator[str]:
+    """An edge that reads two notes, and understands no third."""
+    with reading(ORDERS, "visit sensor 2 every 4 steps", "hm") as url:
+        yield url
 
 
 def deadlines(out: Path, sensor: int, every: int, since: int = 0, end: int | None = None) -> list[int]:
@@ -125,3 +141,39 @@ def test_orders_that_change_in_flight_are_counted_while_they_are_in_force(
     assert operator == {"note": NOTE, "orders": None, "deadlines": expected}
     assert httpx.get(f"{edge}/missions/watch").json()["deadlines"] == expected
     assert shown(visit, edge, "watch") == [sum(counts) for counts in zip(*counted, strict=True)]
+
+
+def test_the_page_says_which_orders_end_and_always_offers_to_withdraw_them(renewed: str, visit: Open) -> None:
+    assert httpx.put(f"{renewed}/missions/two", json={"mode": "value", "note": NOTE}).status_code == 200
+    page = visit(f"{renewed}/?mission=two", expected=("409",))
+    note, changes, in_force = (page.locator(f"#{name}") for name in ("note-input", "note-changes", "orders-words"))
+    send, confirm, withdraw = (
+        page.get_by_role("button", name=name) for name in ("Send the note", "Confirm", "Withdraw the orders")
+    )
+    # The first reading ends nothing.
+    expect(confirm).to_be_visible()
+    expect(changes).to_be_hidden()
+    expect(withdraw).to_be_hidden()
+    confirm.click()
+    expect(in_force).to_have_text(FIRST)
+    note.fill("Look at sensor 2 every 4 steps.")
+    send.click()
+    expect(changes).to_have_text(f"These orders end when you confirm: {FIRST} These begin: {SECOND}")
+    expect(withdraw).to_be_visible()
+    assert violations(page) == []
+    # Another operator answers meanwhile; what this one confirms is what the page shows.
+    page.get_by_role("button", name="Freeze view").click()
+    guide(renewed, "two", guidance={"max_velocity": 9})
+    confirm.click()
+    expect(page.locator("#operator-error")).to_contain_text("the guidance has changed since")
+    page.get_by_role("button", name="Freeze view").click()
+    expect(in_force).to_have_text("Never fly faster than 9 m/s.")
+    expect(page.locator("#orders-ended")).to_have_text(f"Ended by the last change: {FIRST}")
+    note.fill("Mind sensor 2.")
+    send.click()
+    expect(page.locator("#note-state")).to_contain_text("was not understood")
+    withdraw.click()
+    expect(in_force).to_have_text("None.")
+    expect(page.locator("#orders-ended")).to_contain_text("Never fly faster than 9 m/s.")
+    expect(page.locator("#note-state")).to_contain_text("was not understood")
+    expect(withdraw).to_be_hidden()

@@ -12,8 +12,9 @@ export class Operator {
     this.busy = false;
     at("note-form").addEventListener("submit", (event) => this.#submit(event, () => ({ note: at("note-input").value.trim() }), at("note-input")));
     at("orders-form").addEventListener("submit", (event) => this.#submit(event, () => ({ guidance: JSON.parse(at("orders-input").value) }), null));
-    at("confirm").addEventListener("click", () => this.#send({ answer: "confirm" }));
-    at("reject").addEventListener("click", () => this.#send({ answer: "reject" }));
+    // Refused where another operator was faster: what is answered is what the page shows, also while its view is frozen.
+    for (const answer of ["confirm", "reject"]) at(answer).addEventListener("click", () => this.#send({ answer, version: this.version }));
+    at("withdraw").addEventListener("click", () => this.#send({ answer: "withdraw" }));
     at("edit").addEventListener("click", () => this.#edit());
     at("orders-input").placeholder = EXAMPLE;
   }
@@ -30,6 +31,8 @@ export class Operator {
     this.mission = mission;
     const { guidance, deadlines, step } = mission.now;
     const waits = guidance.status === "proposed";
+    const inForce = Boolean(guidance.obeyed_in_words);
+    this.version = guidance.version;
     say(at("operator-summary"), summary(guidance, waits));
     at("note").hidden = guidance.note === null && guidance.guidance === null;
     at("note-quote").hidden = guidance.note === null;
@@ -40,9 +43,12 @@ export class Operator {
     at("note-words").hidden = !orders;
     say(at("note-doubts"), waits ? (guidance.doubts ?? []).join(" ") : "");
     at("note-doubts").hidden = !at("note-doubts").textContent;
-    at("answer").hidden = !mayCommand || !(waits || (guidance.status === "confirmed" && guidance.obeyed_in_words));
-    at("confirm").hidden = !waits;
-    say(at("reject"), waits ? "Reject" : "Withdraw the orders");
+    say(at("note-changes"), waits && inForce ? changes(guidance) : "");
+    at("note-changes").hidden = !at("note-changes").textContent;
+    at("answer").hidden = !mayCommand || !(waits || inForce);
+    at("confirm").hidden = at("reject").hidden = !waits;
+    at("withdraw").hidden = !inForce;
+    at("edit").hidden = guidance.guidance === null;
     at("command").hidden = !mayCommand;
     at("read-only").hidden = mayCommand;
     this.#orders(guidance, deadlines, step);
@@ -53,6 +59,8 @@ export class Operator {
 
   #orders(guidance, deadlines, step) {
     say(at("orders-words"), guidance.obeyed_in_words ?? "None.");
+    say(at("orders-ended"), guidance.ended.length ? `Ended by the last change: ${guidance.ended.join(" ")}` : "");
+    at("orders-ended").hidden = guidance.ended.length === 0;
     const due = guidance.orders.filter((order) => order.due !== null);
     at("deadlines").hidden = due.length + deadlines.met + deadlines.missed === 0;
     say(at("deadlines-met"), `Visit deadlines of the steps that are over: ${deadlines.met} met, ${deadlines.missed} missed.`);
@@ -99,6 +107,11 @@ export class Operator {
       this.busy = false;
     }
   }
+}
+
+function changes({ begins, ends }) {
+  const parts = [ends.length && `These orders end when you confirm: ${ends.join(" ")}`, begins.length && `These begin: ${begins.join(" ")}`];
+  return parts.filter(Boolean).join(" ") || "These orders are in force already.";
 }
 
 function summary(guidance, waits) {

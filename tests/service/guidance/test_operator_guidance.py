@@ -101,6 +101,11 @@ def test_a_note_is_compiled_proposed_and_obeyed_only_once_confirmed(edge: Edge, 
             "model": "stub-1",
             "failure": None,
             "doubts": ["How well this LLM reads notes is not known: compare each order with the note."],
+            "begins": ["Visit sensor 3 at least once in every 3 steps."],
+            "ends": [],
+            "begun": [],
+            "ended": [],
+            "version": told["version"],
         }
         # At step 2 sensor 3 is due, and its queue is the shortest.
         assert client.post("/decide", json=report(step=2)).json()["sensor_id"] != 3
