@@ -25,11 +25,13 @@ A transmission fails beyond {radius:g} m, or at a channel gain of {limit:g} dB o
 Rules:
 1. Prefer a full queue, then a long age.
 2. The sensor must be in reach after the UAV has moved.
-3. Velocity is a whole number from 0 to {max_velocity} m/s. Fly slowly to stay near a far sensor with a full queue, \
-fast when the sensor is near or there is little to collect.
+3. Velocity, in whole m/s, follows the chosen sensor's distance: {far} beyond 50 m, {near} within 50 m, \
+0 at the sensor.
 
 {note}{experiences}{demonstrations}Answer with two whole numbers and nothing else: sensor_id velocity"""
 
+# The paper's highest velocity within 50 m of the chosen sensor, m/s.
+_NEAR_VELOCITY = 7
 _EXAMPLES = "Worked examples, each solved by a scheduler that looks ahead:"
 
 
@@ -67,7 +69,8 @@ class Template:
             capacity=scenario.queue_capacity,
             radius=scenario.radio_radius_m,
             limit=-scenario.path_loss_limit_db,
-            max_velocity=scenario.max_velocity,
+            far=_levels(_NEAR_VELOCITY + 1, scenario.max_velocity),
+            near=_levels(1, min(_NEAR_VELOCITY, scenario.max_velocity)),
             introduction=self._format.introduction(self._columns, order),
             meanings=meanings(features),
             note=note_block(note),
@@ -110,3 +113,7 @@ class Template:
 
     def _table(self, rows: Sequence[Cells]) -> str:
         return "".join((self._format.header(rows[0]), *map(self._format.row, rows))) if rows else ""
+
+
+def _levels(slowest: int, fastest: int) -> str:
+    return f"{slowest} to {fastest}" if slowest < fastest else f"{fastest}"

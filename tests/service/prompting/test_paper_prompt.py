@@ -45,10 +45,33 @@ def test_the_static_block_tells_the_scenarios_numbers() -> None:
     assert Template(PAPER).static != Template(SCENARIOS["paper"].model_copy(update={"queue_capacity": 50})).static
 
 
-def test_by_default_the_static_block_is_the_one_whose_tokens_were_published() -> None:
+def test_by_default_the_static_block_changes_on_purpose_only() -> None:
     static = mission().template.static
     assert static == Template(PAPER).static
-    assert hashlib.sha256(static.encode()).hexdigest().startswith("00a6a10ee927d1fa")
+    assert hashlib.sha256(static.encode()).hexdigest().startswith("a6882f4c33fcbf53")
+
+
+@pytest.mark.parametrize(
+    ("max_velocity", "rule"),
+    [
+        (14, "8 to 14 beyond 50 m, 1 to 7 within 50 m, 0 at the sensor."),
+        (8, "8 beyond 50 m, 1 to 7 within 50 m, 0 at the sensor."),
+        (5, "5 beyond 50 m, 1 to 5 within 50 m, 0 at the sensor."),
+        (1, "1 beyond 50 m, 1 within 50 m, 0 at the sensor."),
+    ],
+)
+@pytest.mark.parametrize("row_format", FORMATS)
+@pytest.mark.parametrize("features", ["paper", "reach"])
+def test_the_velocity_rule_is_the_papers_up_to_the_worlds_limit(
+    max_velocity: int, rule: str, row_format: Format, features: Literal["paper", "reach"]
+) -> None:
+    scenario = PAPER.model_copy(update={"max_velocity": max_velocity})
+    static = Template(scenario, PromptStyle(format=row_format), features).static
+    rules = static.split("Rules:\n")[1].split("\n\n")[0].splitlines()
+    assert [one for one in rules if "elocity" in one] == [
+        f"3. Velocity, in whole m/s, follows the chosen sensor's distance: {rule}"
+    ]
+    assert "slow" not in static.lower() and "fast" not in static.lower()
 
 
 def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
