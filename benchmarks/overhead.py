@@ -27,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,11 +88,16 @@ class Uav:
     told: dict[str, Any] = field(default_factory=dict)
     step: int = 0
 
+    @property
+    def mission(self) -> str:
+        """Its fleet's."""
+        return f"fleet{self.number // FLEET}"
+
     def report(self, outcomes: bool) -> bytes:
         """The next request's body."""
         random = np.random.default_rng([self.number, self.step])
         body: dict[str, Any] = {
-            "mission_id": f"fleet{self.number // FLEET}",
+            "mission_id": self.mission,
             "step": self.step,
             "uav_id": self.number % FLEET,
             "position": [500.0, 450.0],
@@ -129,6 +134,13 @@ class Target:
         key = f"Authorization: Bearer {self.key}\r\n" if self.key else ""
         head = f"POST {self.path} HTTP/1.1\r\nHost: {HOST}\r\nContent-Type: application/json\r\n{key}"
         return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
+
+
+def make_missions(edge: Target, uavs: Iterable[Uav]) -> None:
+    """Make the missions of UAVs that an edge is to decide for."""
+    for mission in {uav.mission for uav in uavs}:
+        url, bearer = f"http://{HOST}:{edge.port}/missions/{mission}", {"Authorization": f"Bearer {edge.key}"}
+        httpx.put(url, json={}, headers=bearer, timeout=60).raise_for_status()
 
 
 async def _flies(target: Target, uav: Uav, ends: float, took_ms: list[float]) -> None:
@@ -243,7 +255,9 @@ def start(folder: Path, litellm: str | None, before: Path | None, stack: ExitSta
         other = edge_of({**settings, "AICVDS_STORE": str(folder / "before.db")}, stack, before.absolute())
         targets.insert(2, Target("before", *other, "/decide", lambda uav: uav.report(outcomes=True), key))
     # LiteLLM is to forward the edge's own query.
-    load(targets[1], [Uav(n) for n in range(FLEET)], 1.0)
+    first = [Uav(n) for n in range(FLEET)]
+    make_missions(targets[1], first)
+    load(targets[1], first, 1.0)
     asked = httpx.get(f"http://{HOST}:{llm}/last").json()
     chat = json.dumps({"model": "instant", "messages": asked["messages"], "temperature": 0, "max_tokens": 12}).encode()
     if litellm is not None:
@@ -266,6 +280,9 @@ def measure(targets: list[Target], options: Overhead, console: Console) -> Figur
     found: Figures = {t.name: {n: {q: [] for q in QUANTITIES} for n in options.uavs} for t in targets}
     # Each target's UAVs continue their missions from round to round; the edge's two kinds fly separate missions.
     fleets = {t.name: [Uav(999 * i + n) for n in range(max(options.uavs))] for i, t in enumerate(targets)}
+    for target in targets:
+        if target.name.startswith(("edge", "before")):
+            make_missions(target, fleets[target.name])
     with Progress(console=console) as progress:
         task = progress.add_task("measuring", total=(options.rounds + 1) * len(targets) * len(options.uavs))
         for turn in range(options.rounds + 1):

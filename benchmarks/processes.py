@@ -37,6 +37,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from shared.schemas import MissionSpec
 from simulator.client import EdgeClient
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 
@@ -197,6 +198,16 @@ def measured(edge: Edge, traffic: str, options: Processes) -> dict[str, float]:
     return {"rate": len(took_ms) / lasted, "p50": float(p50), "p99": float(p99), **a_decision}
 
 
+def made(port: int, count: int) -> list[Mission]:
+    """New missions of an edge, once it is ready."""
+    missions = [Mission(f"mission-{number}") for number in range(count)]
+    with EdgeClient(f"http://{HOST}:{port}", timeout_s=60) as client:
+        client.wait_ready(120)
+        for mission in missions:
+            client.put_mission(mission.name, MissionSpec())
+    return missions
+
+
 def start(options: Processes, folder: Path, stack: ExitStack) -> list[Edge]:
     """Start the edges, and fly one decision of each mission."""
     edges = list[Edge]()
@@ -211,9 +222,7 @@ def start(options: Processes, folder: Path, stack: ExitStack) -> list[Edge]:
                 "AICVDS_PROCESSES": str(processes),
             }
             process = stack.enter_context(edge_process(port, folder / f"{name}.log", {**os.environ, **settings}))
-            with EdgeClient(f"http://{HOST}:{port}", timeout_s=60) as client:
-                client.wait_ready(120)
-            missions = [Mission(f"mission-{number}") for number in range(options.missions)]
+            missions = made(port, options.missions)
             edges.append(Edge(processes, store, psutil.Process(process.pid), port, missions))
     for edge in edges:
         left = iter([*edge.missions, *[None] * options.uavs])

@@ -30,7 +30,7 @@ import httpx
 import numpy as np
 import psutil
 import tyro
-from overhead import EDGE, FLEET, HERE, Target, Uav, load, running
+from overhead import EDGE, FLEET, HERE, Target, Uav, load, make_missions, running
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -129,6 +129,7 @@ def measure(options: ProcessorStages, console: Console) -> list[dict[str, float]
             time.sleep(0.1)
         target = Target("edge", process, port, "/decide", lambda uav: uav.report(outcomes=True), key)
         uavs = [Uav(number) for number in range(FLEET)]
+        make_missions(target, uavs)
         load(target, uavs, 2.0)
         rounds = range(options.rounds)
         return [

@@ -26,13 +26,12 @@ import psutil
 import psycopg
 import tyro
 from capacity import Database
-from processes import Edge, Mission, load
+from processes import Edge, load, made
 from ratios import ratio_of_medians, shown
 from rich.console import Console
 from rich.table import Table
 
-from simulator.client import EdgeClient
-from simulator.flying.local_edge import HOST, edge_process, usable_port
+from simulator.flying.local_edge import edge_process, usable_port
 
 QUANTITIES = ("alone_p50", "rate", "p50", "p99")
 
@@ -70,10 +69,7 @@ def start(args: RayServe, folder: Path, database: Database, stack: ExitStack) ->
         }
         port = usable_port(0)
         process = stack.enter_context(edge_process(port, folder / f"{way}.log", {**os.environ, **settings}, options))
-        with EdgeClient(f"http://{HOST}:{port}", timeout_s=60) as client:
-            client.wait_ready(120)
-        missions = [Mission(f"mission-{number}") for number in range(args.uavs)]
-        edges[way] = Edge(args.edges, way, psutil.Process(process.pid), port, missions)
+        edges[way] = Edge(args.edges, way, psutil.Process(process.pid), port, made(port, args.uavs))
     return edges
 
 

@@ -44,6 +44,11 @@ class EdgeRefused(EdgeError):
         """Whether the problem's fields or detail name ``field``."""
         return field in self.detail or any(field in value for error in self.errors for value in error.values())
 
+    @property
+    def lacks_mission(self) -> bool:
+        """Whether the edge does not have the request's mission."""
+        return self.status == 404 and self.blames("mission_id")
+
 
 class EdgeProtocolError(EdgeError):
     """A server answered with success, but the answer does not follow the edge's protocol."""

@@ -82,6 +82,14 @@ def certificates() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def made_on_decide() -> Iterator[None]:
+    """Edges that make a test's missions on their first decision."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AICVDS_CREATE_ON_DECIDE", "on")
+        yield
+
+
 @pytest.fixture
 def edge(tmp_path: Path) -> Iterator[Edge]:
     """Starts real edges with stores and the given settings (by default no LLM), and returns a client of each.

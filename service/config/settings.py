@@ -135,6 +135,9 @@ class Settings(BaseSettings):
     processes: int = Field(1, ge=1, le=64)
     # Missions at once, in memory or in the store; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
+    # Whether a decision for a mission that does not exist makes it. `off`: mission `default` alone, so that a mistyped
+    # name is refused; PUT /missions/{id} makes the others.
+    create_on_decide: Literal["on", "off"] = "off"
     # Folder of the model file and the token vocabulary.
     cache_dir: Path = Field(default_factory=_default_cache)
     log_level: Literal["debug", "info", "warning", "error"] = "info"

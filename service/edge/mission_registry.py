@@ -114,7 +114,8 @@ class MissionRegistry:
     ) -> tuple[Mission, AnyRequest]:
         """The mission of a request that fits it, and the request in full.
 
-        A mission with scenario ``paper`` is made on first use, where ``may_make`` allows it.
+        Mission ``default`` is made on first use, with scenario ``paper``, where ``may_make`` allows it; any other only
+        where the settings do too, so that a mistyped name is an error.
 
         Args:
             key: the idempotency key; a request whose answer is remembered or in progress is returned unchanged.
@@ -137,8 +138,7 @@ class MissionRegistry:
         if mission is not None and key is not None and mission.idempotent_answers.knows(key):
             return mission, request
         if mission is None:
-            if not may_make:
-                raise NotFound("mission_id", f"there is no mission {mission_id}: a key with the scope admin makes it")
+            self._refuse_to_make(mission_id, may_make)
             new = Mission(mission_id, MissionSpec(), self._settings)
             # A request that does not fit is refused before anything is recorded.
             full = _complete(new, request)
@@ -233,6 +233,14 @@ class MissionRegistry:
         self._missions[mission.mission_id] = mission
         self._journal.begin(mission, self._ownership.epoch(mission.mission_id))
         self._count()
+
+    def _refuse_to_make(self, mission_id: str, may_make: bool) -> None:
+        """Raises :class:`NotFound` where a decision may not make this mission."""
+        detail = f"there is no mission {mission_id}: check the name, or make it by PUT /missions/{mission_id}"
+        if not may_make:
+            raise NotFound("mission_id", f"{detail} with a key of scope admin")
+        if mission_id != "default" and self._settings.create_on_decide == "off":
+            raise NotFound("mission_id", f"{detail}; AICVDS_CREATE_ON_DECIDE=on lets decisions make missions")
 
     def _refuse_if_full(self) -> None:
         if len(self._missions) + len(self._listed) >= self._settings.max_missions:

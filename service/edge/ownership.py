@@ -37,6 +37,9 @@ class SoleOwnership:
         """Return 0: no lease is needed."""
         return 0
 
+    def check_free(self, mission_id: str) -> None:
+        """Do nothing: there is no other edge."""
+
     def epoch(self, mission_id: str) -> int:
         """Return 0, the epoch without leases."""
         return 0
@@ -122,14 +125,18 @@ class LeasedOwnership:
         answer = self._leases.acquire(mission_id, self._address, self._term_s)
         if isinstance(answer, Owner):
             self._leased.pop(mission_id, None)
-            detail = f"another edge has mission {mission_id}: send the request there"
-            raise Misdirected("mission_id", detail, answer.address or None, answer.left_s)
+            raise _misdirected(mission_id, answer)
         lease = self._leased.get(mission_id)
         if answer > 1 and (lease is None or lease.epoch != answer):
             self._metrics.leases_taken_over.inc()
             log.info("mission %s is taken over, epoch %d", mission_id, answer)
         self._leased[mission_id] = _Lease(answer, asked_at + self._term_s)
         return answer
+
+    def check_free(self, mission_id: str) -> None:
+        """Raises as :meth:`claim`, and takes no lease: the owner may not have stored its new mission yet."""
+        if (owner := self._leases.owner(mission_id)) is not None:
+            raise _misdirected(mission_id, owner)
 
     def forget(self, mission_id: str) -> None:
         """Own a mission no longer that is deleted or taken over."""
@@ -179,3 +186,8 @@ class LeasedOwnership:
         if failure != self._failure:
             log.error("the leases cannot be renewed, decisions end with their terms: %s", failure)
         self._failure = failure
+
+
+def _misdirected(mission_id: str, owner: Owner) -> Misdirected:
+    detail = f"another edge has mission {mission_id}: send the request there"
+    return Misdirected("mission_id", detail, owner.address or None, owner.left_s)

@@ -131,6 +131,7 @@ class StoredMissions:
         """Take the lease of a mission that is in memory or in the store; returns whether it is."""
         if mission_id not in self._missions and not await self._read(self._store.has, mission_id):
             self.listed.discard(mission_id)
+            await self._unless_misdirected(self.ownership.check_free, mission_id)
             return False
         await self._claim(mission_id)
         if mission_id not in self._missions:
@@ -139,16 +140,20 @@ class StoredMissions:
 
     async def _claim(self, mission_id: str) -> None:
         """Take a mission's lease, if it is free. The mission stays in memory only if nobody else has had it since."""
+        epoch = await self._unless_misdirected(self.ownership.claim, mission_id)
+        if mission_id in self._missions and self._journal.epoch(mission_id) != epoch:
+            self._unload(mission_id)
+
+    async def _unless_misdirected(self, function: Callable[[str], T], mission_id: str) -> T:
+        """Run a function of the ownership; forget the mission where another edge has it."""
         try:
-            epoch = await self._read(self.ownership.claim, mission_id)
+            return await self._read(function, mission_id)
         except Misdirected as other:
             self.drop(mission_id)
             if other.owner is not None and other.owner == self._settings.advertise_url:
                 # One that has ended. A client that is sent to its address would come back here.
                 raise Unavailable("mission_id", "its owner at this address has ended: send it again") from None
             raise
-        if mission_id in self._missions and self._journal.epoch(mission_id) != epoch:
-            self._unload(mission_id)
 
     async def _restore(self, mission_id: str) -> None:
         """Make the mission from what is in the store, in the reader's thread, unless it is in memory."""

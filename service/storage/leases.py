@@ -32,7 +32,7 @@ _ACQUIRE = sa.text("""
     RETURNING epoch
 """)
 _OWNER = sa.text("""
-    SELECT address, extract(epoch FROM expires_at - clock_timestamp())::float8 AS left_s
+    SELECT owner, address, extract(epoch FROM expires_at - clock_timestamp())::float8 AS left_s
     FROM leases WHERE mission_id = :mission_id
 """)
 # Rows are locked in the order of their keys, as the fence does: two transactions never wait for each other.
@@ -116,6 +116,14 @@ class Leases:
                 return int(epoch)
             row = db.execute(_OWNER, {"mission_id": mission_id}).one()
         return Owner(row.address, max(0.0, row.left_s))
+
+    def owner(self, mission_id: str) -> Owner | None:
+        """Who else has the mission's lease, whether the mission is stored or not; None where nobody has."""
+        with self._alone() as db:
+            row = db.execute(_OWNER, {"mission_id": mission_id}).first()
+        if row is None or row.owner == self._owner or row.left_s <= 0:
+            return None
+        return Owner(row.address, row.left_s)
 
     def renew(self, term_s: float) -> dict[str, int]:
         """Prolong every lease of this owner that has not ended; returns their missions with their epochs."""

@@ -138,7 +138,7 @@ class EdgePilot:
         began = time.monotonic()
         try:
             self._probe.wait_ready(self._wait_left_s, on_wait=self._on_wait)
-            # Without this, a restarted edge would create the mission from the next request, with another spec.
+            # An edge that has restarted without a store has lost the mission.
             self._probe.put_mission(self._mission_id, self.spec)
         except EdgeError as error:
             self.last_error = str(error)
@@ -153,7 +153,7 @@ class EdgePilot:
             raise
         except EdgeRefused as refused:
             # A restarted edge has neither the mission nor the earlier decision: create it, and omit the outcome.
-            if request.outcome is None or not refused.blames("outcome"):
+            if not (refused.lacks_mission or (request.outcome is not None and refused.blames("outcome"))):
                 raise
             self._client.put_mission(self._mission_id, self.spec)
             exchange = self._client.decide(request.model_copy(update={"outcome": None}))

@@ -117,7 +117,7 @@ class FieldPilot:
                 exchange = await self._ask(request)
         except (EdgeError, UsageError, TimeoutError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
-            # An edge that comes back may have lost the mission, and would make another of this ID.
+            # An edge that comes back may have lost the mission.
             self._joined = False
             return reason_on_board(error if isinstance(error, EdgeError) else EdgeUnreachable(self.last_error))
         answer = exchange.response
@@ -133,9 +133,9 @@ class FieldPilot:
         try:
             exchange = await self._client.decide(request)
         except EdgeRefused as refused:
-            # An edge that lost its store knows neither the mission's sensors nor the earlier decision, but it can still
-            # decide.
-            if not (refused.blames("outcome") or refused.blames("sensors")):
+            # An edge that lost its store knows neither the mission nor the earlier decision, but it can still decide.
+            # The mission of this ID that it has since may have other sensors.
+            if not (refused.lacks_mission or refused.blames("outcome") or refused.blames("sensors")):
                 raise
             self._owed.pop(request.uav_id, None)
             await self.join()

@@ -16,7 +16,7 @@ from tests.e2e.shared_out import Report, drained, first_event
 from tests.faults.shared_store import Database
 from tests.waiting import PATIENCE_S, until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("made_on_decide")]
 
 NAMES = ("one", "two", "three")
 

@@ -16,6 +16,8 @@ from tests.e2e.shared_out import NAMES, Report, first_event, outlive_a_kill, ser
 from tests.service.stub_llm import wait_for
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = pytest.mark.usefixtures("made_on_decide")
+
 
 def test_every_mission_is_decided_by_its_own_process(tmp_path: Path, report: Report) -> None:
     with serving(tmp_path / "m.db") as edge, httpx.Client(base_url=edge.url, timeout=PATIENCE_S) as client:

@@ -185,7 +185,7 @@ def test_it_stops_when_asked_in_its_first_second() -> None:
 
 def test_a_decision_asked_for_before_it_is_loaded_is_answered(report: Callable[..., dict[str, Any]]) -> None:
     with serving_edge(AICVDS_MODE="policy") as (url, _):
-        answer = httpx.post(f"{url}/decide", json=report(deadline_ms=60_000), timeout=PATIENCE_S)
+        answer = httpx.post(f"{url}/decide", json=report(mission_id="default", deadline_ms=60_000), timeout=PATIENCE_S)
     assert (answer.status_code, answer.json()["source"]) == (200, "policy")
 
 
@@ -211,7 +211,7 @@ def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable
         ThreadPoolExecutor() as pool,
     ):
         wait_for(client, "ready")
-        waiting = pool.submit(client.post, "/decide", json=report(deadline_ms=60_000))
+        waiting = pool.submit(client.post, "/decide", json=report(mission_id="default", deadline_ms=60_000))
         until(lambda: gate.came)
         process.send_signal(signal.SIGTERM)
         answer = waiting.result(timeout=PATIENCE_S)
@@ -221,7 +221,7 @@ def test_a_decision_in_flight_is_answered_before_the_edge_stops(report: Callable
 
 @pytest.mark.long
 def test_who_has_connected_before_the_edge_stops_is_answered(report: Callable[..., dict[str, Any]]) -> None:
-    body = json.dumps(report()).encode()
+    body = json.dumps(report(mission_id="default")).encode()
     head = "POST /decide HTTP/1.1\r\nHost: edge\r\nContent-Type: application/json\r\n"
     head += f"Content-Length: {len(body)}\r\n\r\n"
     with serving_edge(AICVDS_MODE="policy") as (url, process):

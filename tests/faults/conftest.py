@@ -10,6 +10,11 @@ import pytest
 from tests.faults.table import PAGE, Tables
 
 
+@pytest.fixture(autouse=True, scope="module")
+def made_missions(made_on_decide: None) -> None:
+    """No test here is about missions that there are not."""
+
+
 @pytest.fixture(scope="session")
 def tables(request: pytest.FixtureRequest) -> Iterator[Tables]:
     """Where each test writes what it measured; a run of the whole suite that passes makes the page anew."""

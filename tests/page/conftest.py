@@ -39,6 +39,11 @@ def violations(page: Page) -> list[str]:
     return [f"{one['id']}: {one['help']}: {[node['target'] for node in one['nodes']][:3]}" for one in found]
 
 
+@pytest.fixture(autouse=True, scope="module")
+def made_missions(made_on_decide: None) -> None:
+    """No test here is about missions that there are not."""
+
+
 # Playwright runs an event loop in this thread as long as it lives: tests of other files could run none.
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:

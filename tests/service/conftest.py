@@ -1,4 +1,4 @@
-"""Stores for tests of the service."""
+"""Stores and settings for tests of the service."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+
+@pytest.fixture(autouse=True, scope="module")
+def made_missions(made_on_decide: None) -> None:
+    """Only test_unknown_missions.py is about edges by default."""
 
 
 @pytest.fixture(scope="module")

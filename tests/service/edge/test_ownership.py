@@ -101,6 +101,54 @@ def _uav(body: Body) -> Body:
     return {key: body[key] for key in ("uav_id", "position", "sensors")}
 
 
+def test_a_decision_for_a_mission_of_nobody_takes_no_lease(
+    start: Start, report: Report, database: sa.Connection
+) -> None:
+    (one, engine), (two, _) = (start(name, create_on_decide="off") for name in ("one", "two"))
+    one.put("/missions/test", json={}).raise_for_status()
+    for client in (one, two):
+        refused = client.post("/decide", json=report(mission_id="tset"))
+        assert refused.status_code == 404 and "PUT /missions/tset" in refused.text
+    assert list(database.scalars(sa.text("SELECT mission_id FROM leases"))) == ["test"]
+    # One that is being made has an owner before it is stored.
+    ownership(engine).claim("new")
+    for answer in (two.post("/decide", json=report(mission_id="new")), two.get("/missions/new")):
+        assert (answer.status_code, answer.json()["owner"]) == (421, "http://one:8000")
+    leave(database)
+    assert two.post("/decide", json=report(mission_id="new")).status_code == 404
+    assert two.post("/decide", json=report()).status_code == 200
+
+
+def test_a_decision_that_comes_while_its_mission_is_made_waits_for_it(
+    start: Start, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, engine = start(create_on_decide="off")
+    acquire, gate = Leases.acquire, Gate()
+
+    def slowly(self: Leases, *args: Any) -> Any:
+        gate.wait()
+        return acquire(self, *args)
+
+    monkeypatch.setattr(Leases, "acquire", slowly)
+    stored = engine.missions._store
+    assert stored is not None
+    share, came = stored._share, list[str]()
+
+    async def sharing(mission_id: str, *args: Any) -> None:
+        came.append(mission_id)
+        await share(mission_id, *args)
+
+    monkeypatch.setattr(stored, "_share", sharing)
+    with ThreadPoolExecutor(2) as pool, gate:
+        made = pool.submit(client.put, "/missions/test", json={})
+        until(lambda: gate.came)
+        before = len(came)
+        decided = pool.submit(client.post, "/decide", json=report())
+        until(lambda: len(came) > before)
+        gate.open()
+        assert (made.result().status_code, decided.result().status_code) == (200, 200)
+
+
 def test_an_edge_takes_over_what_is_free_and_the_former_owner_writes_nothing(
     start: Start, report: Report, database: sa.Connection
 ) -> None:

@@ -48,6 +48,7 @@ def test_a_first_report_is_full(
     edge: Edge, client: Callable[..., EdgeClient], steps: list[list[DecideRequest]]
 ) -> None:
     with client(str(edge().base_url), uplink="delta") as uavs:
+        uavs.put_mission("m", MissionSpec())
         sizes = [[uavs.decide(request).request_bytes for request in requests] for requests in steps]
     assert min(sizes[0]) > 600 > max(size for later in sizes[1:] for size in later)
 
@@ -57,8 +58,10 @@ def test_an_edge_that_forgot_gets_full_reports(
 ) -> None:
     http = edge()
     with client(str(http.base_url), uplink="delta") as uavs:
+        uavs.put_mission("m", MissionSpec())
         uavs.decide(steps[0][0])
         http.delete("/missions/m").raise_for_status()
+        uavs.put_mission("m", MissionSpec())
         again = uavs.decide(steps[1][0])
         assert (again.attempts, again.response.step) == (2, 1) and again.request_bytes > 1000
         assert uavs.decide(steps[2][0]).request_bytes < 600
@@ -67,6 +70,8 @@ def test_an_edge_that_forgot_gets_full_reports(
 def test_a_fleet_at_once(edge: Edge, client: Callable[..., EdgeClient], steps: list[list[DecideRequest]]) -> None:
     http, other = edge(), edge()
     with client(str(http.base_url), uplink="delta") as uavs, client(str(other.base_url)) as full:
+        for calls in (uavs, full):
+            calls.put_mission("m", MissionSpec())
         for requests in steps:
             if requests[0].step == 2:
                 # A single request in between: for this edge, the batch's reference report is no longer the last.
@@ -81,6 +86,7 @@ def test_a_fleet_at_once(edge: Edge, client: Callable[..., EdgeClient], steps: l
 
 def test_another_refusal_is_not_retried(edge: Edge, steps: list[list[DecideRequest]]) -> None:
     with EdgeClient(str(edge().base_url), uplink="delta") as uavs:
+        uavs.put_mission("m", MissionSpec())
         uavs.decide(steps[0][0])
         with pytest.raises(EdgeRefused, match="unknown") as refused:
             uavs.decide(steps[1][0].model_copy(update={"uav_id": 9}))

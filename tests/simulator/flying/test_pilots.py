@@ -13,6 +13,7 @@ from simulator.client import EdgeClient
 from simulator.flying.flight import Flight, fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
 from simulator.sites.site import Site
+from tests.conftest import Edge
 from tests.simulator.edge_stub import EdgeStub, free_port, stub_edge, stub_edge_at
 from tests.waiting import PATIENCE_S
 
@@ -69,6 +70,21 @@ def test_an_edge_that_restarted_gets_the_mission_again(stub: EdgeStub, client: E
     flight = fly(Site(SHORT), EdgePilot(client, "m-7", SHORT, seed=9), seed=9)
     assert all(d.source != "onboard" for d in flight.decisions)
     assert stub.missions["m-7"].scenario == SHORT and stub.missions["m-7"].seed == 9
+
+
+def test_a_mission_that_the_edge_has_lost_is_made_again(edge: Edge) -> None:
+    with EdgeClient(str(edge().base_url), timeout_s=PATIENCE_S) as client:
+        pilot = EdgePilot(client, "m-7", SHORT, seed=9)
+
+        def lost(flight: Flight) -> None:
+            if flight.steps_flown == 2:
+                client.delete_mission("m-7")
+
+        # The edge has none at first either.
+        flight = fly(Site(SHORT), pilot, seed=9, on_step=lost)
+        status = client.mission("m-7")
+    assert all(d.source != "onboard" for d in flight.decisions), pilot.last_error
+    assert status.scenario == SHORT and status.decisions == status.feedback == 3 * 2
 
 
 def test_an_edge_that_comes_back_in_time_rejoins() -> None:
