@@ -59,8 +59,12 @@ class MovableHttpProtocol(BoundedHttpProtocol):
 
     @property
     def movable(self) -> bool:
-        """Whether the connection has nothing but the one request that waits for its answer."""
-        return not self._pipelined and not self.cycle.response_started and not self.transport.get_write_buffer_size()
+        """Whether the connection has nothing but one whole request that waits for its answer.
+
+        The rest of a body would arrive at the other process as a request of its own.
+        """
+        whole = not self._pipelined and not self.cycle.more_body
+        return whole and not self.cycle.response_started and not self.transport.get_write_buffer_size()
 
     @property
     def descriptor(self) -> int | None:
@@ -91,6 +95,9 @@ class Mover:
         with os.fdopen(os.memfd_create("request"), "wb", buffering=0) as memory:
             _write(memory.fileno(), request)
             while (descriptor := connection.descriptor) is not None:
+                # Meanwhile a second request may have come.
+                if not connection.movable:
+                    return False
                 try:
                     # socket.send_fds ignores its address (CPython 3.11 to 3.13).
                     files = socket.SOL_SOCKET, socket.SCM_RIGHTS, array("i", (descriptor, memory.fileno()))

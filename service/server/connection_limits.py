@@ -1,4 +1,4 @@
-"""Limits of connections, in number, and of request heads, in bytes and time; uvicorn has none of them."""
+"""Limits of connections: their number, request heads in bytes and time, unread answers; uvicorn has none of them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import asyncio
 import logging
 import math
 import resource
-from typing import Any
+from typing import Any, ClassVar
 
-from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 
 from shared.problem import Problem
 
@@ -16,12 +16,14 @@ log = logging.getLogger(__name__)
 
 # Open connections at most, and files that are reserved for others: the store, and the LLM servers.
 _MOST_CONNECTIONS, _OTHER_FILES = 4096, 256
-# Seconds between two warnings about refused connections.
+# Seconds between two warnings of one cause.
 _WARNING_S = 60.0
 # Bytes of request line and headers; the longest of an honest client are an Idempotency-Key and a trace's state.
 _MOST_BYTES = 64 * 1024
 # Seconds to the end of a head, from the connection's beginning or the first byte of a further request.
 _MOST_S = 30.0
+# In each such time, in seconds, a client that has an answer to read takes so many bytes of it, or all.
+_READ_S, _LEAST_READ = 30.0, 16 * 1024
 _PROBLEM = Problem(
     title="Request Header Fields Too Large", status=431, detail=f"the headers are larger than {_MOST_BYTES} bytes"
 )
@@ -36,10 +38,14 @@ class BoundedHttpProtocol(HttpToolsProtocol):
 
     A connection past the limit is closed at once, so that files are left for the open connections, the store and the
     LLM. Bytes after a body count as a head too: trailers, and the bytes of chunks beside their data.
+
+    A connection whose client does not read is aborted: in 30 s it takes 16 KB, or all that is left of its answers. Also
+    a closed connection is aborted then, which otherwise waits for its client for ever. Of pipelined requests no more
+    are read until those that were read are answered.
     """
 
-    # Until then refused connections are not logged again.
-    _quiet_until = -math.inf
+    # By cause, until when it is not logged again.
+    _quiet_until: ClassVar[dict[str, float]] = {}
     # Bytes since the last part that was complete: a head, a piece of a body, a request.
     _unfinished = 0
     # Whether the bytes at hand completed a part.
@@ -47,23 +53,48 @@ class BoundedHttpProtocol(HttpToolsProtocol):
     _too_large = False
     # Closes the connection while it waits for a head.
     _timer: asyncio.TimerHandle | None = None
+    # Aborts the connection while its client reads too little.
+    _reading: asyncio.TimerHandle | None = None
+    # The request that is being answered; uvicorn's ``cycle`` is the one that was read last.
+    _answered: RequestResponseCycle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         if len(self.connections) > most_connections():
             transport.abort()
-            if self.loop.time() > BoundedHttpProtocol._quiet_until:
-                BoundedHttpProtocol._quiet_until = self.loop.time() + _WARNING_S
-                log.warning("%d connections: further ones are closed at once", len(self.connections) - 1)
+            self._warn("%d connections: further ones are closed at once", len(self.connections) - 1)
             return
         self._timer = self.loop.call_later(_MOST_S, transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_timer()
+        self._stop_watching()
+        self._give_up()
         super().connection_lost(exc)
+
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
+        self._answered = cycle
+        super()._start_asgi_task(cycle, app)
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if self.pipeline:
+            self.flow.pause_reading()
+        self._watch_reading()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._watch_reading()
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._stop_watching()
 
     def data_received(self, data: bytes) -> None:
         self._completed = False
+        if not self.flow.write_paused:
+            # More answers will follow, and a client that reads none of them soon fills the buffer.
+            self._stop_watching()
         super().data_received(data)
         self._unfinished = 0 if self._completed else self._unfinished + len(data)
         if self._unfinished > _MOST_BYTES and not self.transport.is_closing():
@@ -99,13 +130,49 @@ class BoundedHttpProtocol(HttpToolsProtocol):
         if self._too_large:
             self._refuse()
         else:
+            self._give_up()
             super().send_400_response(msg)
+            self._watch_reading()
 
     def _refuse(self) -> None:
         # While another answer is due or has begun, the connection is closed without a 431.
         if self.cycle is None or self.cycle.response_complete:
             self.transport.write(_refusal(self.server_state.default_headers))
+        self._give_up()
         self.transport.close()
+        self._watch_reading()
+
+    def _give_up(self) -> None:
+        """Write no more of an answer: each write to a closed connection would be a line in the log."""
+        if self._answered is not None and not self._answered.response_complete:
+            self._answered.disconnected = True
+            self._answered.message_event.set()
+
+    def _watch_reading(self) -> None:
+        """Abort the connection in 30 s unless its client has read enough by then."""
+        left = self.transport.get_write_buffer_size()
+        if left and self._reading is None:
+            self._reading = self.loop.call_later(_READ_S, self._check_reading, left)
+
+    def _stop_watching(self) -> None:
+        if self._reading is not None:
+            self._reading.cancel()
+            self._reading = None
+
+    def _check_reading(self, before: int) -> None:
+        self._reading = None
+        left = self.transport.get_write_buffer_size()
+        if left > max(0, before - _LEAST_READ):
+            self._warn("a client does not read its answers: its connection is aborted")
+            self.transport.abort()
+        else:
+            self._watch_reading()
+
+    def _warn(self, text: str, *values: object) -> None:
+        now = self.loop.time()
+        if now > self._quiet_until.get(text, -math.inf):
+            self._quiet_until[text] = now + _WARNING_S
+            log.warning(text, *values)
 
     def _stop_timer(self) -> None:
         if self._timer is not None:

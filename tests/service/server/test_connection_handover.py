@@ -55,8 +55,9 @@ class Process:
         self.connections = state.connections
 
     async def app(self, scope: Scope, receive: Receive, send: Send) -> None:
-        body = await _body(receive)
-        owner = THERE if scope["path"] == "/there" else HERE
+        # The edge reads no body of a GET or a DELETE before it moves the connection.
+        body = b"" if scope["path"] == "/early" else await _body(receive)
+        owner = THERE if scope["path"] in ("/there", "/early") else HERE
         self.scopes.append(scope)
         if owner == self.slot:
             await _answer(send, 200, body, (b"x-process", str(self.slot).encode()))
@@ -144,6 +145,29 @@ async def test_a_connection_with_a_second_request_waiting_does_not_move(short: P
         writer.close()
         await writer.wait_closed()
     assert answers.count(b"HTTP/1.1 503") == 1 and answers.count(b"HTTP/1.1 200") == 1
+    assert not processes[THERE].scopes
+
+
+@pytest.mark.parametrize(
+    "head",
+    [b"GET /early HTTP/1.1\r\ncontent-length: %d", b"DELETE /early HTTP/1.1\r\ncontent-length: %d",
+     b"GET /early HTTP/1.1\r\nx-length: %d\r\ntransfer-encoding: chunked"],
+    ids=["get", "delete", "chunked"],
+)  # fmt: skip
+async def test_a_body_that_arrives_late_is_no_request_of_its_own(short: Path, head: bytes) -> None:
+    body = b"DELETE /there HTTP/1.1\r\nhost: x\r\n\r\n"
+    late = b"%x\r\n%s\r\n0\r\n\r\n" % (len(body), body) if b"chunked" in head else body
+    async with _edge(short) as (url, processes, _):
+        host, port = url.removeprefix("http://").split(":")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(head % len(body) + b"\r\nhost: x\r\n\r\n")
+        answer = await reader.readuntil(b"\r\n\r\n")
+        writer.write(late + b"GET /here HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n")
+        answer += await reader.read()
+        writer.close()
+        await writer.wait_closed()
+    assert answer.count(b"HTTP/1.1 503") == 1 and answer.count(b"HTTP/1.1 200") == 1
+    assert [scope["path"] for scope in processes[HERE].scopes] == ["/early", "/here"]
     assert not processes[THERE].scopes
 
 
