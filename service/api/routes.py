@@ -203,7 +203,8 @@ async def healthz() -> dict[str, str]:
 async def readyz(request: Request, response: Response) -> Readiness:
     """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``.
 
-    Not ready (503) is an edge that cannot reach the PostgreSQL which it shares with other edges.
+    Not ready (503) is an edge that cannot reach the PostgreSQL which it shares with other edges, or whose SQLite file
+    was deleted or replaced.
     """
     llm: ServerPool = request.state.llm
     engine: Engine = request.state.engine

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.config.settings import Settings
+from service.storage.locks import sqlite_file
 from shared.schemas import LLM_MODES
 
 
@@ -44,5 +45,6 @@ def store(settings: Settings, missions: int) -> str:
     """Where missions are kept, without a password."""
     if settings.store == "none":
         return "none: missions end with this process"
-    where = "PostgreSQL" if "://" in settings.store else str(Path(settings.store).absolute())
+    file = sqlite_file(settings.store)
+    where = "PostgreSQL" if file is None else str(Path(file).absolute())
     return f"{where}, {missions} mission{'' if missions == 1 else 's'}"

@@ -120,13 +120,16 @@ def store_of(settings: Settings) -> Finding:
     """Whether the store can be used: a SQLite file's lock, or that PostgreSQL's driver is there."""
     if settings.store == "none":
         return Finding("store", "none: missions end with the edge")
-    if "://" in settings.store:
+    from service.storage.locks import FileLock, StoreUnusable, sqlite_file
+
+    name = sqlite_file(settings.store)
+    if name is None:
+        if not settings.store.startswith("postgres"):
+            return Finding("store", "AICVDS_STORE is no file and no address of PostgreSQL", "aicvds serve --store FILE")
         if find_spec("psycopg") is None:
             return Finding("store", "PostgreSQL, but psycopg is not installed", "pip install 'aic-vds[postgres]'")
         return Finding("store", "PostgreSQL (not tried)")
-    from service.storage.locks import FileLock, StoreUnusable
-
-    file = Path(settings.store).absolute()
+    file = Path(name).absolute()
     if not file.exists():
         folder = next(parent for parent in file.parents if parent.exists())
         if not _writable(folder):

@@ -72,8 +72,8 @@ class MissionRegistry:
 
     @property
     def intact(self) -> bool:
-        """Whether this edge can have missions; False while it cannot renew their leases."""
-        return self._ownership.intact
+        """Whether this edge can have missions: it renews their leases, and its SQLite file is still there."""
+        return self._ownership.intact and not self._journal.replaced
 
     def check_place(self, mission_id: str) -> None:
         """Raises :class:`Elsewhere` where another process decides the mission."""

@@ -20,6 +20,7 @@ from itertools import islice
 from service.observability.metrics import Metrics
 from service.storage.leases import LeaseLost
 from service.storage.operations import Change, Checkpoint, Entry
+from service.storage.sqlite_process import REPLACED
 from service.storage.store import cause
 from service.storage.writer import Writer
 
@@ -87,6 +88,11 @@ class GroupCommit:
     def failing(self) -> bool:
         """Whether the last transaction failed."""
         return self._failure is not None
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the last transaction failed because a file of the store was deleted or replaced."""
+        return self._failure is not None and REPLACED in self._failure
 
     def add(self, change: Change) -> None:
         """Queue a change behind all others."""

@@ -57,7 +57,7 @@ class MissionLog:
 class NullJournal:
     """The journal of an edge without a store: missions live as long as the process."""
 
-    failing = False
+    failing = replaced = False
 
     def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Ignore a new mission."""
@@ -105,6 +105,11 @@ class Journal:
     def failing(self) -> bool:
         """Whether the last transaction failed."""
         return self._commits.failing
+
+    @property
+    def replaced(self) -> bool:
+        """Whether it failed because a file of the store was deleted or replaced."""
+        return self._commits.replaced
 
     def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Record a new mission, and every event of it from now on."""

@@ -15,7 +15,7 @@ import msgpack
 from service.storage import sqlite_process
 from service.storage.operations import Change
 from service.storage.rows import PACK_BYTES, Statements
-from service.storage.sqlite_process import LENGTH
+from service.storage.sqlite_process import LENGTH, identity
 from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)
@@ -42,6 +42,8 @@ class ProcessWriter:
         self._statements = statements
         self._path = path
         self._locks = locks
+        # Another writer, after this one was killed, has to find the same files.
+        self._known = {file: known for file in (path, f"{path}.lock") if (known := identity(file))}
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         # Set while the event loop reads the socket.
@@ -100,11 +102,12 @@ class ProcessWriter:
     def _start(self) -> socket.socket:
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
+        files = [part for file in self._known.items() for part in file]
         with theirs:
             try:
                 self._process = subprocess.Popen(
                     # -P keeps the script's folder out of its path: some modules there have names of standard ones.
-                    [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), self._path],
+                    [sys.executable, "-P", sqlite_process.__file__, str(theirs.fileno()), self._path, *files],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     # With the edge's own stderr, a reader of the edge's log would wait for a killed edge's last commit.

@@ -10,17 +10,22 @@ little, so that it takes 17 MB and starts in a twentieth of a second.
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import sqlite3
 import struct
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
+from urllib.parse import quote
 
 import msgpack
 
 LENGTH = struct.Struct("<I")
+# In the reason of a failure that lasts until the edge ends, unless the file is put back.
+REPLACED = "was deleted or replaced while the edge ran"
 # Milliseconds that a transaction waits while another program has the file locked.
 BUSY_MS = 1000
 # WAL: readers and the writer do not wait for each other. FULL: a commit survives a power failure.
@@ -33,9 +38,18 @@ def framed(message: Any) -> bytes:
     return LENGTH.pack(len(packed)) + packed
 
 
-def serve(edge: socket.socket, path: str) -> None:
-    """Commit the transactions that the edge sends, until it closes the socket."""
-    database = Database(path)
+def identity(file: str) -> str:
+    """The device and the inode of a file; empty where there is none."""
+    try:
+        found = os.stat(file)
+    except OSError:
+        return ""
+    return f"{found.st_dev}:{found.st_ino}"
+
+
+def serve(edge: socket.socket, path: str, known: Mapping[str, str]) -> None:
+    """Commit the transactions that the edge sends, until it closes the socket; arguments as :class:`Database`."""
+    database = Database(path, known)
     with edge.makefile("rb") as sent:
         while len(head := sent.read(LENGTH.size)) == LENGTH.size:
             (length,) = LENGTH.unpack(head)
@@ -46,11 +60,22 @@ def serve(edge: socket.socket, path: str) -> None:
 
 
 class Database:
-    """A connection that opens at its first transaction, and again after each failure."""
+    """A connection that opens at its first transaction, and again after each failure.
 
-    def __init__(self, path: str) -> None:
+    A commit to a file that has no name any more is lost when the edge ends. So each commit fails whose file, whose
+    lock's file or whose write-ahead log is another one, or none, after it.
+
+    Args:
+        path: of the SQLite file, which must exist.
+        known: the identity of the file and of its lock's file, as the edge opened them, by path.
+    """
+
+    def __init__(self, path: str, known: Mapping[str, str]) -> None:
         self._path = path
+        self._known = known
         self._db: sqlite3.Connection | None = None
+        # The identity of the write-ahead log of this connection, which lasts as long.
+        self._log = ""
 
     def commit(self, transaction: list[tuple[str, list[Any]]]) -> str | None:
         """Commit a transaction; returns None, or the reason why nothing of it was committed."""
@@ -60,6 +85,7 @@ class Database:
             for sql, rows in transaction:
                 db.executemany(sql, rows)
             db.execute("COMMIT")
+            self._check(db)
         except Exception as error:
             self.close()
             return str(error) or type(error).__name__
@@ -71,9 +97,27 @@ class Database:
             with suppress(sqlite3.Error):
                 self._db.close()
             self._db = None
+        self._log = ""
+
+    def _check(self, db: sqlite3.Connection) -> None:
+        """Raises ``OSError`` where what was committed is in no file that the next edge opens."""
+        self._check_known()
+        log = identity(f"{self._path}-wal")
+        self._log = self._log or log
+        if not log or log != self._log:
+            # The commits of the log that was deleted go into the file, and the next transaction begins another log.
+            db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            raise OSError(f"{self._path}-wal {REPLACED}")
+
+    def _check_known(self) -> None:
+        for file, known in self._known.items():
+            if identity(file) != known:
+                raise OSError(f"{file} {REPLACED}: put it back, or restart the edge")
 
     def _open(self) -> sqlite3.Connection:
-        self._db = sqlite3.connect(self._path, isolation_level=None)
+        self._check_known()
+        # It must not make a new file.
+        self._db = sqlite3.connect(f"file:{quote(self._path)}?mode=rw", uri=True, isolation_level=None)
         for pragma in PRAGMAS:
             self._db.execute(f"PRAGMA {pragma}")
         return self._db
@@ -84,4 +128,4 @@ if __name__ == "__main__":
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     with socket.socket(fileno=int(sys.argv[1])) as other, suppress(ConnectionError):
-        serve(other, sys.argv[2])
+        serve(other, sys.argv[2], dict(zip(sys.argv[3::2], sys.argv[4::2], strict=True)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.commands import doctor
+from service.commands import banner, doctor
 from service.config.settings import Settings
 from service.storage.locks import FileLock
 from tests.running import serving
@@ -70,3 +70,21 @@ def test_an_llm_server_must_have_the_model() -> None:
 def test_a_missing_model_file_is_fetched(tmp_path: Path) -> None:
     [found] = doctor.embedded(Settings(cache_dir=tmp_path))
     assert found.remedy == "aicvds model fetch"
+
+
+@pytest.mark.parametrize("address", ["{0}/m.db", "sqlite:///{0}/m.db"])
+def test_a_file_is_a_file_by_its_path_or_its_address(tmp_path: Path, address: str) -> None:
+    settings = Settings(store=address.format(tmp_path), llm_url=None)
+    assert doctor.store_of(settings).found == f"{tmp_path}/m.db (new)"
+    assert banner.store(settings, 2) == f"{tmp_path}/m.db, 2 missions"
+
+
+@pytest.mark.parametrize("address", ["postgresql://u:secret@h/d", "postgresql+psycopg://u:secret@h/d"])
+def test_postgresql_is_named_without_its_password(address: str) -> None:
+    settings = Settings(store=address)
+    assert doctor.store_of(settings).found == "PostgreSQL (not tried)"
+    assert banner.store(settings, 1) == "PostgreSQL, 1 mission"
+
+
+def test_an_address_that_is_none_is_said() -> None:
+    assert doctor.store_of(Settings(store="mysql://u:secret@h/d")).remedy == "aicvds serve --store FILE"
