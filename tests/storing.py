@@ -49,7 +49,7 @@ class WriterHere:
     """Commits as the writing process does, on the event loop."""
 
     def __init__(self, statements: Statements, path: str) -> None:
-        self._statements, self._database = statements, Database(path)
+        self._statements, self._database = statements, Database(path, {})
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """As ``Writer`` says."""

@@ -18,9 +18,10 @@ class Import:
     """Make the UAVs' trajectories of a world from flight plans of QGroundControl.
 
     The waypoints of each plan become a UAV's trajectory, its geofence an area that no trajectory may leave (inclusion)
-    or enter (exclusion). They go into FOLDER/world.geojson. Sensors and the pipeline that are there stay; a plan has
-    none, so add the sensors to the file, as features of role sensor. Take-off, landing, camera and speed items are
-    passed over. Exit code: 0 done, 2 bad use or a plan that cannot be flown along straight legs.
+    or enter (exclusion). They go into FOLDER/world.geojson. Sensors and the pipeline that are there stay, and fences
+    where the plans have none; a plan has no sensors, so add them to the file, as features of role sensor. Take-off,
+    landing, camera and speed items are passed over. Exit code: 0 done, 2 bad use or a plan that cannot be flown along
+    straight legs.
 
     Two UAVs over the sensors that world.geojson in north/ already has:
 
@@ -32,7 +33,7 @@ class Import:
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """The world's folder, made if missing. Required."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
-    """Replace the trajectories and fences that the world has."""
+    """Replace the trajectories that the world has, and its fences where the plans have some."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,8 @@ def import_world(options: Import, console: Console) -> int:
         raise UsageError("--out is missing: name the world's folder, such as --out north")
     made = import_plans(options.plans, options.out, options.overwrite)
     print(f"Wrote {made.path}: {made.trajectories} trajectories, {made.fences} fences, {made.sensors} sensors.")
+    if made.replaced:
+        print(f"Fences that were there before and that the plans' geofence replaced: {made.replaced}.")
     if not made.sensors:
         print('Add the sensors before you fly it: Points with the properties "role": "sensor" and "id".')
     if made.altitudes_m:

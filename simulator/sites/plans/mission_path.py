@@ -77,11 +77,14 @@ def path_of(items: Sequence[MissionItem]) -> MissionPath:
     altitudes: list[float | None] = []
     first_number = None
     repeats = False
-    for item in items:
+    for index, item in enumerate(items):
         if item.command in _ENDS:
+            _check_end(item, items[index + 1 :])
             break
         if item.command == JUMP:
             _check_jump(item, items, first_number)
+            if item.parameters[1] != FOREVER:
+                _check_end(item, [after for after in items[index + 1 :] if after.command not in _ENDS])
             repeats = True
             break
         if item.command == WAYPOINT:
@@ -120,6 +123,16 @@ def _position(item: MissionItem) -> Point:
     if item.position is None or not all(math.isfinite(value) for value in item.position) or item.position == (0, 0):
         raise ValueError(f"{item.where}: the waypoint has no position; give it a latitude and a longitude")
     return item.position
+
+
+def _check_end(end: MissionItem, after: Sequence[MissionItem]) -> None:
+    """Raises ``ValueError`` where the vehicle flies on after the item that ends the path."""
+    for item in after:
+        if item.command <= _LAST_NAVIGATION or item.command == JUMP:
+            raise ValueError(
+                f"{item.where}: command {item.command} comes after {end.where} (command {end.command}), where the path "
+                "ends; make a plan of its own of what is flown then, or take it out"
+            )
 
 
 def _check_jump(item: MissionItem, items: Sequence[MissionItem], first_number: int | None) -> None:

@@ -18,39 +18,55 @@ from simulator.sites.plans.qgroundcontrol import FlightPlan, plan_text, read_pla
 
 @dataclass(frozen=True)
 class Imported:
-    """The content of a ``world.geojson`` after an import; ``altitudes_m`` are those of the plans' waypoints."""
+    """The content of a ``world.geojson`` after an import.
+
+    Attributes:
+        replaced: the fences that the file had before and that are gone.
+        altitudes_m: of the plans' waypoints.
+    """
 
     path: Path
     sensors: int
     trajectories: int
     fences: int
+    replaced: int
     altitudes_m: frozenset[float]
 
 
 def import_plans(plans: Sequence[Path], folder: Path, overwrite: bool) -> Imported:
     """Write the plans' paths and fences into a folder's ``world.geojson``, which is made if it is missing.
 
-    Sensors and the pipeline that are there stay. UAV i flies the i-th plan.
+    Sensors and the pipeline that are there stay, and fences where the plans have none. UAV i flies the i-th plan.
 
     Raises:
-        UsageError: a plan or the file is invalid, the plans have different fences, or the file has trajectories and
-            ``overwrite`` is false.
+        UsageError: a plan or the file is invalid, the plans have different fences, or the file has trajectories, or
+            other fences than the plans, and ``overwrite`` is false.
     """
     read = [read_plan(path) for path in plans]
     fences = _one_fence(plans, read)
     path = folder / FEATURES
     kept: list[dict[str, Any]] = []
+    replaced = 0
     if path.exists():
         there = read_survey(path)
         if there.trajectories and not overwrite:
             raise UsageError(f"{path} has {len(there.trajectories)} trajectories; add --overwrite to replace them")
+        lost = [label for label, fence in there.fences.items() if fences and fence not in fences]
+        if lost and not overwrite:
+            raise UsageError(
+                f"{path}, {lost[0]}: the plans' geofence would replace this fence; add --overwrite to replace it, or "
+                "take the geofence out of the plans to keep it"
+            )
+        replaced = len(lost)
         features = json.loads(path.read_text(encoding="utf-8-sig"))["features"]
-        kept = [feature for feature in features if feature["properties"]["role"] in ("sensor", "pipeline")]
+        roles = ("sensor", "pipeline") if fences else ("sensor", "pipeline", "fence", "no_fly")
+        kept = [feature for feature in features if feature["properties"]["role"] in roles]
     flown = [_flown(plan, of.stem) for plan, of in zip(read, plans, strict=True)]
     _write(path, {"type": "FeatureCollection", "features": [*kept, *flown, *map(_fenced, fences)]})
     sensors = sum(feature["properties"]["role"] == "sensor" for feature in kept)
+    drawn = len(fences) + sum(feature["properties"]["role"] in ("fence", "no_fly") for feature in kept)
     altitudes = frozenset(height for plan in read for height in plan.path.altitudes_m if height is not None)
-    return Imported(path, sensors, len(flown), len(fences), altitudes)
+    return Imported(path, sensors, len(flown), drawn, replaced, altitudes)
 
 
 def export_plans(folder: Path, out: Path, overwrite: bool) -> list[Path]:

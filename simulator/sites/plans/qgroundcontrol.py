@@ -57,22 +57,32 @@ class _Mission(_Member):
     items: list[Annotated[_SimpleItem | _ComplexItem, Field(discriminator="type")]] = Field(max_length=MAX_ITEMS)
 
 
-class _Polygon(_Member):
+class _FenceMember(_Member):
+    # A key that is not known may be an area.
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Polygon(_FenceMember):
+    version: int = 1
     inclusion: bool
     polygon: list[_Place] = Field(min_length=3, max_length=1000)
 
 
-class _Circle(_Member):
+class _Circle(_FenceMember):
     center: _Place
     radius: float = Field(gt=0, le=1e6)
 
 
-class _FenceCircle(_Member):
+class _FenceCircle(_FenceMember):
+    version: int = 1
     inclusion: bool
     circle: _Circle
 
 
-class _GeoFence(_Member):
+class _GeoFence(_FenceMember):
+    version: Literal[2] = 2
+    # Where a UAV goes that has left the fence.
+    breachReturn: Any = None
     circles: list[_FenceCircle] = Field([], max_length=100)
     polygons: list[_Polygon] = Field([], max_length=100)
 
@@ -224,6 +234,9 @@ def _complaint(error: ValidationError) -> str:
         return f"no JSON: {first['ctx']['error']}"
     if where == "fileType" or not where:
         return 'no plan of QGroundControl: its top level needs "fileType": "Plan"'
+    if first["type"] == "extra_forbidden" or where == "geoFence.version":
+        fault = f"is {first['input']}" if where == "geoFence.version" else "is not known"
+        return f"{where} {fault}; a geofence of version 2 is read: open the plan in QGroundControl and save it again"
     message = first["msg"]
     shown = "" if first["type"] == "missing" else f", not {quoted(first['input'])}"
     return f"{where}: {message[0].lower()}{message[1:]}{shown}"

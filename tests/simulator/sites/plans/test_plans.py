@@ -67,6 +67,37 @@ def test_sensors_that_are_there_stay_and_trajectories_are_replaced_only_as_asked
     assert (again.scenario.uavs, again.sensor_names, len(again.fences)) == (2, ("a", "b"), 1)
 
 
+def test_fences_that_are_there_are_replaced_only_by_fences_and_as_asked(tmp_path: Path) -> None:
+    bare, fenced = (
+        write(tmp_path / "a.plan", plan(*TRIANGLE)),
+        write(tmp_path / "b.plan", plan(*TRIANGLE, geoFence=FENCED)),
+    )
+    ring = [list(place[::-1]) for place in [*AROUND, AROUND[0]]]
+    circle = feature("no_fly", "Point", [41.7, 39.99], radius_m=20.0)
+    (tmp_path / "w").mkdir()
+    folder = write_world(tmp_path / "w", sensor("a"), feature("fence", "Polygon", [ring]), circle)
+    before = read_survey(folder / "world.geojson").fences.values()
+    made = import_plans([bare], folder, overwrite=False)
+    assert (made.fences, made.replaced) == (2, 0)
+    assert import_plans([bare], folder, overwrite=True).replaced == 0
+    assert list(read_survey(folder / "world.geojson").fences.values()) == list(before)
+    write_world(folder, sensor("a"), circle)
+    with pytest.raises(
+        UsageError, match=r"features\[1\]: the plans' geofence would replace this fence; add --overwrite"
+    ):
+        import_plans([fenced], folder, overwrite=False)
+    assert len(read_survey(folder / "world.geojson").fences) == 1
+    made = import_plans([fenced], folder, overwrite=True)
+    assert (made.fences, made.replaced) == (1, 1)
+
+
+def test_what_no_vehicle_reaches_may_follow_a_jump(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.plan", plan(TAKE_OFF, *TRIANGLE, AGAIN, waypoint(*A, 6), item(21)))
+    assert read_plan(path).path.repeats
+    path = write(tmp_path / "a.plan", plan(TAKE_OFF, *TRIANGLE, item(177, 2, 3), item(206), item(20)))
+    assert read_plan(path).path.repeats
+
+
 def test_what_is_flown_back_the_way_it_came_is_a_line(tmp_path: Path) -> None:
     back = [waypoint(*place, number=number) for number, place in enumerate((A, B, C, B), start=2)]
     flown = read_plan(write(tmp_path / "a.plan", plan(TAKE_OFF, *back, item(177, 2, -1, number=6)))).path
@@ -129,6 +160,24 @@ BROKEN: list[tuple[Any, str]] = [
     (plan(*TRIANGLE, item(177, 2, 0)), "mission.items[3]: it repeats 0 times"),
     (plan(*TRIANGLE, {"type": "ComplexItem", "complexItemType": "fwLandingPattern"}), "item 'fwLandingPattern' has no"),
     (plan(*TRIANGLE, geoFence={"polygons": [{"polygon": AROUND}]}), "geoFence.polygons[0].inclusion: field required"),
+    # Whatever is flown after the path's end.
+    (
+        plan(*TRIANGLE, item(21, number=5), item(211, 1, 0, number=6), TAKE_OFF | {"doJumpId": 7}, *TRIANGLE),
+        "mission.items[5]: command 22 comes after mission.items[3] (command 21), where the path ends",
+    ),
+    (plan(*TRIANGLE, item(20), waypoint(*B, 6)), "mission.items[4]: command 16 comes after mission.items[3]"),
+    (plan(*TRIANGLE, item(177, 2, 3), waypoint(*A, 6)), "mission.items[4]: command 16 comes after mission.items[3]"),
+    (plan(*TRIANGLE, item(21), item(177, 2, -1)), "mission.items[4]: command 177 comes after mission.items[3]"),
+    (
+        plan(*TRIANGLE, geoFence={"polygon": AROUND, "version": 1}),
+        "geoFence.version is 1; a geofence of version 2 is read: open the plan in QGroundControl",
+    ),
+    (plan(*TRIANGLE, geoFence={"polygon": AROUND}), "geoFence.polygon is not known; a geofence of version 2"),
+    (
+        plan(*TRIANGLE, geoFence={"version": 2, "circles": [{"inclusion": True, "center": [1, 2], "radius": 3}]}),
+        "geoFence.circles[0].circle: field required",
+    ),
+    (plan(*TRIANGLE, geoFence=FENCED | {"corridors": []}), "geoFence.corridors is not known"),
     (
         plan(*TRIANGLE, geoFence={"circles": [{"inclusion": True, "circle": {"center": [1, 2], "radius": -3}}]}),
         "geoFence.circles[0].circle.radius: input should be greater than 0, not -3",
