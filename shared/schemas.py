@@ -379,7 +379,9 @@ class Readiness(Wire):
 
     ready: bool
     decides: Source
-    llm: Literal["loading", "ready", "unavailable", "off"]
+    llm: Literal["loading", "ready", "degraded", "unavailable", "off"] = Field(
+        description="degraded: it answers, and its answers cannot be used"
+    )
     model: str | None = None
     standing_by: int = Field(0, description="further healthy LLM servers")
     constraint: str | None = Field(None, description="how the server holds the LLM to the answer's form")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import shutil
@@ -152,7 +153,15 @@ def llm_servers(settings: Settings) -> Iterator[Finding]:
         if isinstance(answer, str):
             yield Finding("LLM", f"{one.llm_url}: {answer}", "start the server, or correct AICVDS_LLM_URL or _API_KEY")
             continue
-        listed = [str(m.get("id")) for m in answer.get("data", []) if isinstance(m, dict)]
+        models = answer.get("data")
+        if not isinstance(models, list):
+            yield Finding(
+                "LLM",
+                f"{one.llm_url}/models lists no models",
+                "check that the address ends in /v1, or set AICVDS_LLM_MODEL" if not one.llm_model else None,
+            )
+            continue
+        listed = [str(m.get("id"))[:200] for m in models if isinstance(m, dict)]
         if one.llm_model and one.llm_model not in listed:
             names = ", ".join(listed[:5]) or "no model"
             yield Finding("LLM", f"{one.llm_url} lists {names}, not {one.llm_model}", "correct AICVDS_LLM_MODEL")
@@ -201,8 +210,11 @@ def _asked(url: str, key: str | None = None) -> Any:
         return f"no answer in {_ASKED_S:g} s"
     except (httpx.HTTPError, httpx.InvalidURL) as error:
         return str(error) or type(error).__name__
-    except ValueError:
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         return "it answers no JSON"
+    except (ImportError, ValueError) as error:
+        # httpx reads the variables itself: one may name a scheme that is unknown, or SOCKS, which needs a package.
+        return f"HTTP_PROXY, HTTPS_PROXY or ALL_PROXY names a proxy that cannot be used: {error}"
     return found if isinstance(found, dict) else "it answers no JSON object"
 
 

@@ -11,13 +11,14 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
 from service.deciding.llm_timeout import QueryLimits
 from service.deciding.stopwatch import Deadline
-from service.llm.answers import Completion, NoDecision, raised
+from service.llm.answers import Completion, NoDecision, check_answer, raised
 from service.llm.calibration import LabelReader
 from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
+from shared.actions import Action
 from shared.reasons import Reason
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,21 @@ class LlmQueries:
     ) -> Completion:
         """Mode ``llm``: a sensor and a velocity; raises ``NoDecision``."""
         query = partial(self._llm.ask, mission.mission_id, prompt.static, prompt.user, sensor_ids, levels)
-        return await self._limits.within(query, deadline)
+        try:
+            return await self._limits.within(query, deadline)
+        except NoDecision as fault:
+            self._llm.judge(mission.mission_id, fault)
+            raise
+
+    def read_pair(self, mission: Mission, completion: Completion, sensor_ids: list[int], levels: int) -> Action:
+        """The sensor and the velocity of an answer; raises ``NoDecision``."""
+        try:
+            answer = check_answer(completion.text, sensor_ids, levels)
+        except NoDecision as fault:
+            self._llm.judge(mission.mission_id, fault)
+            raise
+        self._llm.judge(mission.mission_id, None)
+        return answer
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
@@ -138,7 +153,9 @@ class LlmQueries:
             query = partial(self._llm.ask_labels, mission.mission_id, static, user, labels)
             completion = await self._limits.within(query, deadline)
             by_label = self._labels.read(completion, static, labels)
+            self._llm.judge(mission.mission_id, None)
         except NoDecision as error:
+            self._llm.judge(mission.mission_id, error)
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()

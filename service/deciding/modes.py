@@ -15,10 +15,9 @@ from service.deciding.deliberation import Deliberation, candidates_of, template_
 from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation
 from service.deciding.verifier import verify
-from service.llm.answers import Completion, NoDecision, check_answer
+from service.llm.answers import Completion, NoDecision
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
-from shared.actions import Action
 from shared.schemas import Mode as ModeName
 
 log = logging.getLogger(__name__)
@@ -108,7 +107,7 @@ class Llm(Policy):
                 )
             finally:
                 task.watch.ended.append(("llm", perf_counter()))
-            answer = Action(*check_answer(completion.text, state.kept_ids, levels))
+            answer = self._queries.read_pair(state.mission, completion, state.kept_ids, levels)
             if not state.mission.guidance.confirmed.allows(answer.velocity):
                 raise NoDecision("answer_velocity", f"the operator forbids {answer.velocity} m/s")
             verify(state, answer)

@@ -41,6 +41,9 @@ class LLMClient:
         base_url: up to and including ``/v1``.
         trust_env: obey ``HTTP_PROXY`` and similar variables.
         session_header: name of a header with each completion's session; None: none.
+
+    Raises:
+        NoDecision: the environment names a proxy that cannot be used.
     """
 
     def __init__(
@@ -52,6 +55,8 @@ class LLMClient:
         session_header: str | None = None,
     ) -> None:
         self.base_url = base_url
+        # Found once: aiohttp would look for a proxy at each call, in a thread.
+        self._proxy = _proxy_to(base_url) if trust_env else {}
         self._session_header = session_header
         # Parsed once: aiohttp would parse a string at each call.
         self._models, self._completions = (URL(f"{base_url}/{path}") for path in ("models", "chat/completions"))
@@ -68,8 +73,6 @@ class LLMClient:
             cookie_jar=aiohttp.DummyCookieJar(),
             auto_decompress=False,
         )
-        # Found once: aiohttp would look for a proxy at each call, in a thread.
-        self._proxy = _proxy_to(base_url) if trust_env else {}
 
     async def close(self) -> None:
         """Close every connection."""
@@ -186,7 +189,13 @@ def _proxy_to(url: str) -> dict[str, Any]:
     named = proxies.get(target.scheme) or proxies.get("all")
     if not named or proxy_bypass(target.host):
         return {}
-    proxy = httpx.URL(named if "://" in named else f"http://{named}")
+    try:
+        proxy = httpx.URL(named if "://" in named else f"http://{named}")
+    except httpx.InvalidURL as error:
+        raise NoDecision("llm_error", f"the proxy of the environment is no address: {error}") from None
+    if proxy.scheme not in ("http", "https"):
+        fix = "unset ALL_PROXY, or name an http:// proxy"
+        raise NoDecision("llm_error", f"a {proxy.scheme[:20]} proxy of the environment cannot be used: {fix}")
     found: dict[str, Any] = {"proxy": str(proxy.copy_with(username=None, password=None))}
     if proxy.username:
         # Through a tunnel the server would see the request's own headers; without one the proxy sees no others.

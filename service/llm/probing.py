@@ -1,4 +1,9 @@
-"""Probes of an LLM server's abilities: a server may ignore an unknown field silently, or refuse it."""
+"""Probes of an LLM server's abilities: a server may ignore an unknown field silently, or refuse it by any status.
+
+LiteLLM's proxy before llama.cpp answers ``post_sampling_probs`` by 500 (BerriAI/litellm 21932), Xinference
+``logprobs`` (xorbitsai/inference 1911), vLLM and SGLang what they know no grammar for (vllm 13260, sglang 11401). So a
+probe that fails means that the ability is absent, and only a plain completion says whether the LLM can be used.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from service.llm.answers import NoDecision, NotUnderstood
+from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.calibration import check_labels
 from service.llm.request_bodies import Constraint, chat_body, label_body
 
@@ -20,6 +25,8 @@ _ANY_NUMBER = 1000
 _PROBE_TEXT = "Say hello."
 _PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
 _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
+# A server that answers 503 may only be busy: once it answers a plain request, it is probed once more.
+_PASSES = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +48,7 @@ async def probe(client: LLMClient, model: str | None) -> Abilities:
     """Find out a server's abilities by a few short requests.
 
     Raises:
-        NoDecision: the server does not answer them.
+        NoDecision: the server does not answer a plain one, or is gone.
     """
     constraint = await _constraint(client, model)
     logprobs = await _gives_probabilities(client, model, constraint)
@@ -51,27 +58,30 @@ async def probe(client: LLMClient, model: str | None) -> Abilities:
 
 async def _constraint(client: LLMClient, model: str | None) -> Constraint:
     """The first kind of constraint that the server really obeys."""
-    refusal: NotUnderstood | None = None
-    for constraint in _PROBES:
-        try:
-            body = probe_body(model, constraint)
-            text = (await client.complete(body)).text
-        except NotUnderstood as failed:
-            refusal = failed
-            continue
-        if str(_PROBE_SENSOR) in text:
-            return constraint
-    if refusal is not None:
-        await client.complete(probe_body(model, "none"))
+    for _ in range(_PASSES):
+        answered = perhaps_busy = False
+        for constraint in _PROBES:
+            try:
+                text = (await client.complete(probe_body(model, constraint))).text
+            except Unreachable:
+                raise
+            except NoDecision as failed:
+                perhaps_busy = perhaps_busy or not isinstance(failed, NotUnderstood)
+                continue
+            if str(_PROBE_SENSOR) in text:
+                return constraint
+            answered = True
+        if not answered:
+            await client.complete(probe_body(model, "none"))
+        if not perhaps_busy:
+            break
     return "none"
 
 
 async def _gives_probabilities(client: LLMClient, model: str | None, constraint: Constraint) -> bool:
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, [["A", "B"]])
-    try:
-        return bool((await client.complete(body)).positions)
-    except NotUnderstood:
-        return False
+    found = await _answer(client, body)
+    return found is not None and bool(found.positions)
 
 
 async def _answers_lists(client: LLMClient, model: str | None, constraint: Constraint, logprobs: bool) -> bool:
@@ -80,14 +90,23 @@ async def _answers_lists(client: LLMClient, model: str | None, constraint: Const
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, lists, logprobs)
     try:
         async with asyncio.timeout(_TOGETHER_TIMEOUT_S):
-            check_labels((await client.complete(body)).text, lists)
-    except NoDecision as error:
-        if isinstance(error, NotUnderstood) or error.reason == "answer_format":
-            return False
-        raise
+            found = await _answer(client, body)
     except TimeoutError:
         return False
-    return True
+    try:
+        return found is not None and bool(check_labels(found.text, lists))
+    except NoDecision:
+        return False
+
+
+async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
+    """The answer to a probe, None where it fails; raises :class:`Unreachable`."""
+    try:
+        return await client.complete(body)
+    except Unreachable:
+        raise
+    except NoDecision:
+        return None
 
 
 def probe_body(model: str | None, constraint: Constraint) -> dict[str, Any]:

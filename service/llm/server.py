@@ -29,6 +29,7 @@ from service.llm.request_bodies import (
     rewriting_body,
     warm_up_body,
 )
+from service.llm.usability import Usability
 from shared.reasons import Reason
 from shared.schemas import Readiness
 
@@ -66,6 +67,7 @@ class LlmServer:
 
     Attributes:
         status: replaced as a whole when the state changes.
+        usability: whether its answers can be used.
         url: the server's address; empty for the embedded LLM.
         model, bare_model: name of the model, once it is known, with its adapter and without.
         notes_model: name of the model that reads notes.
@@ -97,6 +99,7 @@ class LlmServer:
         self.constraint: Constraint = "none"
         self.logprobs = False
         self.max_uavs_per_call = 1
+        self.usability = Usability()
         self._breaker = CircuitBreaker()
         self._silence = SilenceCounter(settings.deadline_ms / 2e3)
         self._giving_way = GivingWay()
@@ -112,10 +115,10 @@ class LlmServer:
         return Readiness(
             ready=True,
             decides=self._settings.mode if ready else "policy",
-            llm=self.status.llm,
+            llm="degraded" if ready and self.usability.degraded else self.status.llm,
             model=self.model,
             constraint=self.constraint if ready else None,
-            detail=self.status.detail,
+            detail=self.usability.degraded if ready else self.status.detail,
         )
 
     def start(self) -> None:

@@ -19,6 +19,7 @@ from service.llm.answers import Completion, NoDecision
 from service.llm.embedded import Embed, embedded
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
+from shared.reasons import LLM_FAILURES
 from shared.rendezvous import weight
 from shared.schemas import Readiness
 
@@ -94,6 +95,14 @@ class ServerPool:
         active = self.active
         others = sum(server.status.llm == "ready" for server in self._each if server is not active)
         return active.readiness().model_copy(update={"standing_by": others})
+
+    def judge(self, mission_id: str, fault: NoDecision | None) -> None:
+        """Take whether the answer to a decision's call could be used; ``fault`` says why not."""
+        usability = self.serving(mission_id).usability
+        if fault is None:
+            usability.usable()
+        elif fault.reason in LLM_FAILURES and fault.reason != "llm_timeout":
+            usability.unusable(fault)
 
     def start(self) -> None:
         """Begin to load or reach all servers, unless the LLM is off."""

@@ -6,6 +6,8 @@ import socket
 from pathlib import Path
 
 import pytest
+from fastapi import FastAPI
+from fastapi.responses import Response
 
 from service.commands import banner, doctor
 from service.config.settings import Settings
@@ -88,3 +90,22 @@ def test_postgresql_is_named_without_its_password(address: str) -> None:
 
 def test_an_address_that_is_none_is_said() -> None:
     assert doctor.store_of(Settings(store="mysql://u:secret@h/d")).remedy == "aicvds serve --store FILE"
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [b'{"data": null}', b"[]", b'"text"', b'{"data": [null, 7, {"id": null}, {}]}', b"\xff\xfe", b"[" * 100_000, b"{}"],
+)
+def test_no_list_of_models_ends_in_a_traceback(listed: bytes) -> None:
+    app = FastAPI()
+    app.get("/v1/models")(lambda: Response(listed, media_type="application/json"))
+    with serving(app) as url:
+        [found] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", llm_model="m"))
+    assert str(found)
+
+
+@pytest.mark.parametrize("named", ["socks5://127.0.0.1:1", "gopher://x", "http://x:port", "::::"])
+def test_no_proxy_ends_in_a_traceback(monkeypatch: pytest.MonkeyPatch, named: str) -> None:
+    monkeypatch.setenv("ALL_PROXY", named)
+    [found] = doctor.llm_servers(Settings(llm_url="http://llm.example/v1"))
+    assert found.remedy is not None and ("proxy" in found.found or "port" in found.found)

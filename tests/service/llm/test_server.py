@@ -110,6 +110,104 @@ def test_a_usage_that_makes_no_sense_is_no_usage(edge: Edge, report: Report, pro
     assert [decision["tokens"][key] for key in ("server_prompt", "cached", "completion")] == [None] * 3
 
 
+class Proxied(StubLlm):
+    """Obeys a grammar, and gives its own ``fault`` for every request that has one of these fields.
+
+    So LiteLLM's proxy before llama.cpp was seen to do with ``post_sampling_probs``, by 500; see
+    :mod:`service.llm.probing` for others.
+    """
+
+    def __init__(self, fault: Response, *fields: str) -> None:
+        super().__init__("0 7")
+        self.fault, self.fields = fault, set(fields)
+
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+        if self.fields & body.keys():
+            return self.fault
+        held = "grammar" in body
+        labels = 'root ::= "A"' in body.get("grammar", "") or body["max_tokens"] == 1
+        return said((f"{PROBE} 0" if held else "hello") if probed and not labels else "A" if labels else self.answer)
+
+
+_HELD = ("grammar", "structured_outputs", "response_format")
+_REFUSALS: list[tuple[Response, tuple[str, ...], str]] = [
+    (JSONResponse({"error": "cannot parse"}, 500), ("post_sampling_probs", "top_logprobs"), "grammar"),
+    (JSONResponse({"error": "not implemented"}, 501), ("logprobs",), "grammar"),
+    (JSONResponse({"error": "unknown field"}, 500), _HELD, "none"),
+    (JSONResponse({"error": "forbidden"}, 403), (*_HELD, "logprobs"), "none"),
+    # Nobody named these.
+    (Response("<html>Bad Gateway</html>", 502, media_type="text/html"), (*_HELD, "logprobs"), "none"),
+    (Response("no JSON at all"), ("logprobs", "grammar"), "none"),
+    (JSONResponse({"choices": []}), ("structured_outputs", "logprobs"), "grammar"),
+    (JSONResponse({"choices": [{"message": {"content": None}}]}), _HELD, "none"),
+]
+
+
+@pytest.mark.parametrize("mode", ["llm", "guided"])
+@pytest.mark.parametrize(("fault", "fields", "constraint"), _REFUSALS)
+def test_what_a_server_cannot_do_keeps_it_from_nothing_else(
+    edge: Edge, report: Report, mode: str, fault: Response, fields: tuple[str, ...], constraint: str
+) -> None:
+    with serving(Proxied(fault, *fields).app) as url:
+        client = edge(mode=mode, llm_url=f"{url}/v1", planner="off")
+        assert wait_for(client, "ready")["constraint"] == constraint
+        answer = client.post("/decide", json=report()).json()
+    assert (answer["source"], answer["reason"]) == (mode, None)
+
+
+@pytest.mark.parametrize("mode", ["llm", "guided"])
+@pytest.mark.parametrize(
+    ("status", "said_instead", "quoted"),
+    [
+        (200, "Certainly! I would collect\nfrom", "Certainly! I would collect"),
+        (200, "\x1b[31m<script>" + "x" * 5000, "<script>"),
+        (400, "the prompt is too long", "HTTP 400"),
+    ],
+)
+def test_a_server_whose_answers_cannot_be_used_is_degraded(
+    edge: Edge, report: Report, caplog: pytest.LogCaptureFixture, mode: str, status: int, said_instead: str, quoted: str
+) -> None:
+    model = Model("grammar")
+    answers = model.respond
+    usable = True
+
+    async def respond(body: dict[str, Any], probed: bool) -> Response:
+        if probed or usable:
+            model.answer = "A" if mode == "guided" else "0 7"
+            return await answers(body, probed)
+        return said(said_instead) if status == 200 else JSONResponse({"error": said_instead}, status)
+
+    model.respond = respond  # type: ignore[method-assign]
+    with serving(model.app) as url:
+        client = edge(mode=mode, llm_url=f"{url}/v1", planner="off")
+        wait_for(client, "ready")
+        usable = False
+        for step in range(4):
+            client.post("/decide", json=report(step=step))
+        assert client.get("/readyz").json()["llm"] == "ready"
+        for step in range(4, 12):
+            assert client.post("/decide", json=report(step=step)).json()["source"] != "llm"
+        found = client.get("/readyz").raise_for_status().json()
+        assert found["ready"] and found["llm"] == "degraded" and quoted in found["detail"]
+        assert found["detail"].startswith("12 answers in a row cannot be used") and len(found["detail"]) < 400
+        lines = [line.message for line in caplog.records if "LLM degraded" in line.message]
+        assert len(lines) == 1 and quoted in lines[0] and lines[0].isprintable()
+        usable = True
+        assert client.post("/decide", json=report(step=12)).json()["source"] == mode
+        assert client.get("/readyz").json()["llm"] == "ready"
+
+
+@pytest.mark.parametrize("named", ["socks5://127.0.0.1:1", "gopher://x", "http://x:port"])
+def test_a_proxy_that_cannot_be_used_is_said(
+    edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch, named: str
+) -> None:
+    # In the environment it would be for the test's own client too.
+    monkeypatch.setattr("service.llm.client.getproxies", lambda: {"all": named})
+    client = edge(mode="llm", llm_url="http://llm.example/v1", llm_model="m")
+    assert "proxy of the environment" in wait_for(client, "unavailable")["detail"]
+    assert client.post("/decide", json=report()).status_code == 200
+
+
 @pytest.mark.parametrize("status", [503, 429])
 def test_a_server_that_is_still_loading_is_probed_again(
     edge: Edge, monkeypatch: pytest.MonkeyPatch, status: int
