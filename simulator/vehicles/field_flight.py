@@ -21,7 +21,7 @@ from simulator.flying.pilots import Choice
 from simulator.records.decision import Decision
 from simulator.sites.site import Site
 from simulator.vehicles.field_pilot import FieldPilot
-from simulator.vehicles.field_uav import FieldUav
+from simulator.vehicles.field_uav import LINK_LOST, NO_POSITION, FieldUav
 from simulator.vehicles.heard_beacons import LossCounters
 from simulator.vehicles.mission_clock import Clock, MissionClock
 from simulator.vehicles.radio import Collected, Radio, Spot
@@ -138,7 +138,7 @@ class FieldFlight:
         """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record what came of it."""
         collected = {}
         for leg in legs:
-            if leg.uav.away == "the link is lost":
+            if leg.uav.away in (LINK_LOST, NO_POSITION):
                 leg.uav.expect(leg.choice.velocity, self._scenario.step_s)
             collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
         lost, grown = await self._listen(step + 1)

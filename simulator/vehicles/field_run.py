@@ -100,8 +100,8 @@ async def connected(job: FieldJob, number: int) -> AsyncIterator[FieldUav]:
     """The UAV at one of the job's connections, its mission checked."""
     index = job.first_uav + number
     async with mavlink_vehicle(job.mavlink[number], job.wait_s) as vehicle:
-        check_uploaded(await vehicle.mission(), job.site, index, vehicle.name)
-        yield FieldUav(index, vehicle, job.site)
+        height_m = check_uploaded(await vehicle.mission(), job.site, index, vehicle.name)
+        yield FieldUav(index, vehicle, job.site, height_m)
 
 
 def edge_client(job: FieldJob) -> AsyncEdgeClient:

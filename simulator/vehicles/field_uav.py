@@ -21,6 +21,11 @@ from simulator.world import Observation
 OFF_PATH_M = 100.0
 # Below this height above its take-off place a UAV has not taken off, or lands.
 AIRBORNE_M = 5.0
+# A UAV has begun its path at this share of its height, or so far from where it climbs, metres. On ArduPilot the
+# take-off is a part of mode AUTO already, in which it climbs without a way forward.
+_BEGUN_SHARE, _BEGUN_M = 0.9, 20.0
+LINK_LOST = "the link is lost"
+NO_POSITION = "its heartbeat arrives, but no position, which was asked for"
 # Below this speed a UAV waits in place instead, m/s.
 LEAST_SPEED_M_S = 0.5
 # The mode comes with the heartbeat, once a second: after a command of its own the flight reads the old one so long.
@@ -31,7 +36,10 @@ class FieldUav:
     """A UAV on its mission.
 
     A UAV that somebody else flies is told nothing: the pilot, a failsafe, or an autopilot that has landed it. The same
-    holds for one that is lost, off its path or outside the fence.
+    holds for one that is lost, off its path or outside the fence, and until it has climbed to the height of its path.
+
+    Args:
+        height_m: of its lowest waypoint above the take-off place; infinite where that is unknown.
 
     Attributes:
         index: among the world's trajectories.
@@ -40,7 +48,7 @@ class FieldUav:
         landed: whether it has ended its mission for good.
     """
 
-    def __init__(self, index: int, vehicle: Vehicle, site: Site) -> None:
+    def __init__(self, index: int, vehicle: Vehicle, site: Site, height_m: float = AIRBORNE_M) -> None:
         self.index, self.vehicle = index, vehicle
         self.waits = False
         self.landed = False
@@ -49,6 +57,10 @@ class FieldUav:
         self._follower = PathFollower(trajectories(site.scenario)[index], float(site.scenario.max_velocity))
         self._here: Point = (0.0, 0.0)
         self._degrees: Point = (0.0, 0.0)
+        self._height_m = height_m
+        # Where it was first seen in the air; whether it has begun its path since.
+        self._climbs_at: Point | None = None
+        self._begun = False
         # Since the last position that was near its trajectory.
         self._unseen_s = 0.0
         self._mode_changed_s = -math.inf
@@ -60,7 +72,7 @@ class FieldUav:
         """Take the newest telemetry, that many seconds after the last."""
         self._unseen_s += seconds
         state = await self.vehicle.state()
-        self.away = self._taken(state) or self._misplaced(state.position)
+        self.away = self._taken(state) or self._misplaced(state.position) or self._climbing(state.height_m)
         if self.away is None and state.mode == "mission" and not self._mode_is_old:
             # The pilot may have resumed the mission too.
             self.waits = False
@@ -127,8 +139,10 @@ class FieldUav:
 
     def _taken(self, state: VehicleState) -> str | None:
         """Why the UAV is told nothing wherever it is, or ``None``."""
-        if not state.connected or state.position is None:
-            return "the link is lost"
+        if not state.connected:
+            return LINK_LOST
+        if state.position is None:
+            return NO_POSITION
         if not state.armed or state.mode == "landing":
             self.landed = True
             return "it lands" if state.armed else "it is not armed"
@@ -137,8 +151,18 @@ class FieldUav:
             self.waits = False
             return "it does not fly its mission"
         if state.height_m < AIRBORNE_M:
+            self._begun, self._climbs_at = False, None
             return "it is on the ground"
         return None
+
+    def _climbing(self, height_m: float) -> str | None:
+        """Why the UAV is told nothing before it flies along its path, or ``None``; it was located."""
+        self._climbs_at = self._climbs_at or self._here
+        moved_m = math.dist(self._here, self._climbs_at)
+        self._begun = self._begun or height_m >= _BEGUN_SHARE * self._height_m or moved_m >= _BEGUN_M
+        if self._begun:
+            return None
+        return f"it climbs to {self._height_m:.0f} m" if math.isfinite(self._height_m) else "it climbs"
 
     def _misplaced(self, degrees: Point | None) -> str | None:
         """Why the UAV is told nothing at this position, or ``None``."""

@@ -1,7 +1,7 @@
 """A vehicle over MAVLink, by MAVSDK 4 (extra ``mavlink``).
 
-Three commands are sent: ``MAV_CMD_DO_CHANGE_SPEED``, and ``MAV_CMD_DO_SET_MODE`` with the modes hold and mission. None
-arms, takes off, lands or has a position.
+Three commands fly it: ``MAV_CMD_DO_CHANGE_SPEED``, and ``MAV_CMD_DO_SET_MODE`` with the modes hold and mission. None
+arms, takes off, lands or has a position. ``MAV_CMD_SET_MESSAGE_INTERVAL`` asks for positions while none arrive.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ from simulator.vehicles.vehicle import FlightMode, VehicleState
 
 # MAVSDK notices a lost heartbeat after this time, too.
 STALE_S = 3.0
+# ArduPilot sends no position unasked: its stream rates are 0 until a ground station sets them (GCS_MAVLink_Parameters;
+# MAVSDK-Python 637), and again after it has started anew. So positions are asked for after this time without one.
+_ASK_S = 1.0
+_POSITIONS_HZ = 4.0
 _RELATIVE_FRAMES = {3, 6}
 # The scale of a mission item's latitude and longitude.
 _DEGREES = 1e-7
@@ -61,13 +65,17 @@ async def mavlink_vehicle(url: str, wait_s: float) -> AsyncIterator[MavlinkVehic
                 f"--mavlink {url}: no autopilot was heard for {wait_s:g} s; does it send MAVLink to this address?"
             )
         vehicle = MavlinkVehicle(url, system, await system.autopilot_type() == Autopilot.ARDUPILOT)
-        listening = asyncio.create_task(vehicle.listen())
+        listening, ended = asyncio.create_task(vehicle.listen()), asyncio.Event()
+        asking = asyncio.create_task(vehicle.ask_for_positions(ended))
         try:
             yield vehicle
         finally:
             listening.cancel()
             with suppress(asyncio.CancelledError):
                 await listening
+            # A request under way is in a thread, which needs the connection.
+            ended.set()
+            await asking
 
 
 class MavlinkVehicle:
@@ -93,19 +101,35 @@ class MavlinkVehicle:
         )
         self._position: Any = None
         self._heard_s = -math.inf
+        self._connected_s = time.monotonic()
 
     async def listen(self) -> None:
         """Take the positions as they arrive, until it is cancelled."""
         async for position in self._telemetry.subscribe_position():
             self._position, self._heard_s = position, time.monotonic()
 
+    async def ask_for_positions(self, ended: asyncio.Event) -> None:
+        """Ask for positions whenever none has come for a second, until the flight has ended.
+
+        A denied or unanswered request is no failure: the positions tell whether it was obeyed.
+        """
+        from mavsdk.asyncio import MavsdkError
+
+        while not ended.is_set():
+            with suppress(TimeoutError):
+                await asyncio.wait_for(ended.wait(), _ASK_S)
+            silent_s = time.monotonic() - max(self._heard_s, self._connected_s)
+            if silent_s > _ASK_S and not ended.is_set():
+                with suppress(MavsdkError):
+                    await self._telemetry.set_rate_position(_POSITIONS_HZ)
+
     async def state(self) -> VehicleState:
-        """The newest telemetry. The vehicle counts as lost without a heartbeat or a position for three seconds."""
-        fresh = time.monotonic() - self._heard_s < STALE_S and await self._system.is_connected()
+        """The newest telemetry; a link or a position that was silent for three seconds counts as none."""
+        fresh = time.monotonic() - self._heard_s < STALE_S
         at = self._position
-        fixed = at is not None and math.isfinite(at.latitude_deg) and math.isfinite(at.longitude_deg)
+        fixed = fresh and math.isfinite(at.latitude_deg) and math.isfinite(at.longitude_deg)
         return VehicleState(
-            connected=bool(fresh),
+            connected=bool(await self._system.is_connected()),
             armed=bool(await self._telemetry.armed()),
             mode=_mode(int(await self._telemetry.flight_mode())),
             position=(at.longitude_deg, at.latitude_deg) if fixed else None,

@@ -13,8 +13,11 @@ from simulator.sites.site import Site
 TOLERANCE_M = 2.0
 
 
-def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: str) -> None:
+def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: str) -> float:
     """Compare a vehicle's mission with the trajectory of a UAV.
+
+    Returns:
+        The height of the lowest waypoint above the take-off place, m; infinite where none has one above that.
 
     Raises:
         UsageError: the mission is no path of straight legs, or another path; the text names the waypoint.
@@ -38,3 +41,4 @@ def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: 
             f"{vehicle}: its mission's path has {len(flown)} waypoints, trajectory {uav} of the world has "
             f"{len(route)}; {remedy}"
         )
+    return min((height for height in path.altitudes_m if height is not None), default=math.inf)

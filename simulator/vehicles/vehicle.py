@@ -17,10 +17,10 @@ class VehicleState:
     """The newest telemetry of a vehicle.
 
     Attributes:
-        connected: whether heartbeats and positions arrive.
+        connected: whether heartbeats arrive.
         armed: as the autopilot says.
         mode: the autopilot's flight mode.
-        position: longitude and latitude, degrees; ``None`` without a fix.
+        position: longitude and latitude, degrees; ``None`` without a fix, and while none arrives.
         height_m: above the take-off place.
     """
 

@@ -53,6 +53,8 @@ class Airframe:
         self.length_m = sum(math.dist(*leg) for leg in self._legs)
         self.speed, self.mode, self.armed, self.flown_m = speed, "mission", True, start_m
         self.drift_m = 0.0
+        # It climbs without a way forward, as ArduPilot does in mode AUTO.
+        self.climbs_m: float | None = None
         self.trace: list[tuple[float, float]] = []
         self._speedup, self._at_s = speedup, time.monotonic()
         self._lock = threading.Lock()
@@ -61,7 +63,7 @@ class Airframe:
         """Latitude and longitude now."""
         with self._lock:
             now = time.monotonic()
-            if self.mode == "mission":
+            if self.mode == "mission" and self.climbs_m is None:
                 self.flown_m += self.speed * (now - self._at_s) * self._speedup
             self._at_s = now
             x, y = self._at(self.flown_m % self.length_m)
@@ -69,6 +71,10 @@ class Airframe:
             place = math.degrees(north), math.degrees(self._east + x / (EARTH_M * math.cos(self._north)))
             self.trace.append(place)
             return place
+
+    def height_m(self) -> float:
+        """Above the take-off place."""
+        return HEIGHT_M if self.climbs_m is None else self.climbs_m
 
     def _metres(self, latitude: float, longitude: float) -> tuple[float, float]:
         north, east = math.radians(latitude) - self._north, math.radians(longitude) - self._east

@@ -21,12 +21,19 @@ SPEED, SET_MODE = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.MAV_CMD_DO_SET_MODE
 PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
 # PX4: main mode AUTO, and its sub-modes.
 AUTO, SUB_MODES = 4, {"hold": 3, "mission": 4, "land": 6}
+# ArduCopter's modes LOITER, AUTO and LAND.
+COPTER_MODES = {"hold": 5, "mission": 3, "land": 9}
 
 
 class PymavlinkPeer:
     """A vehicle that sends to a UDP port of loopback, and answers as a PX4 does.
 
+    As an ArduPilot it sends no position until MAV_CMD_SET_MESSAGE_INTERVAL asks for it, whose stream rates are 0 at
+    first (GCS_MAVLink_Parameters; MAVSDK-Python 637).
+
     Attributes:
+        streams: whether it sends positions.
+        obeys_requests, answers_requests: whether it obeys a request for a stream, and acknowledges it.
         received: all messages that came, without heartbeats, with the time.
         silent: it sends nothing while this is set, and goes on flying and listening.
         autopilot: of its heartbeats, a MAV_AUTOPILOT.
@@ -39,6 +46,8 @@ class PymavlinkPeer:
         self.received: list[tuple[float, Any]] = []
         self.silent = threading.Event()
         self.autopilot = autopilot
+        self.streams = autopilot != ARDUPILOT
+        self.obeys_requests = self.answers_requests = True
         self._items = items
         self._link: Any = mavutil.mavlink_connection(
             f"udpout:127.0.0.1:{port}", source_system=system_id, source_component=1
@@ -85,6 +94,8 @@ class PymavlinkPeer:
 
     def _heartbeat(self) -> None:
         mode = AUTO << 16 | SUB_MODES[self.airframe.mode] << 24
+        if self.autopilot == ARDUPILOT:
+            mode = COPTER_MODES[self.airframe.mode]
         armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self.airframe.armed else 0
         self._link.mav.heartbeat_send(
             mavlink.MAV_TYPE_QUADROTOR,
@@ -96,17 +107,23 @@ class PymavlinkPeer:
 
     def _position(self) -> None:
         latitude, longitude = self.airframe.position()
-        if self.silent.is_set():
+        if self.silent.is_set() or not self.streams:
             return
         boot_ms = int((time.monotonic() - self._began) * 1000)
-        altitude, height = int((GROUND_M + HEIGHT_M) * 1000), int(HEIGHT_M * 1000)
+        height = int(self.airframe.height_m() * 1000)
+        altitude = int(GROUND_M * 1000) + height
         place = round(latitude * 1e7), round(longitude * 1e7)
         self._link.mav.global_position_int_send(boot_ms, *place, altitude, height, 0, 0, 0, 0)
 
     def _answer(self, message: Any) -> None:
         sender = message.get_srcSystem(), message.get_srcComponent()
         kind = message.get_type()
-        if kind == "COMMAND_LONG":
+        if kind == "COMMAND_LONG" and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            if message.param1 == mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT and message.param2 > 0:
+                self.streams = self.streams or self.obeys_requests
+            if self.answers_requests:
+                self._link.mav.command_ack_send(message.command, mavlink.MAV_RESULT_ACCEPTED, 0, 0, *sender)
+        elif kind == "COMMAND_LONG":
             self._link.mav.command_ack_send(message.command, self._obey(message), 0, 0, *sender)
             self._heartbeat()
         elif kind == "MISSION_REQUEST_LIST" and message.mission_type == 0:
@@ -126,7 +143,7 @@ class PymavlinkPeer:
         elif message.command == SET_MODE:
             self.airframe.position()
             self.airframe.mode = next(name for name, sub in SUB_MODES.items() if sub == int(message.param3))
-        elif message.command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+        else:
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 

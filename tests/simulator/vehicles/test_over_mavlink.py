@@ -14,6 +14,7 @@ import pytest
 
 from simulator.client import EdgeClient
 from simulator.commands.replay import logged_mission
+from simulator.errors import VehicleError
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
 from simulator.records.summary import Summary
@@ -23,6 +24,7 @@ from simulator.vehicles.field_run import FieldJob, conduct_field
 from simulator.vehicles.field_uav import FieldUav
 from simulator.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
 from simulator.vehicles.simulated_radio import SimulatedRadio
+from simulator.vehicles.take_off import await_missions
 from simulator.vehicles.uploaded_path import check_uploaded
 from tests.conftest import Edge
 from tests.e2e.processes import output_until, run_here, started
@@ -197,6 +199,62 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
             peer.airframe.mode = "land"
             await becomes("it lands")
             assert uav.landed and len(peer.commands()) == count
+
+
+async def becomes(uav: FieldUav, away: str | None) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            await uav.look(0.1)
+            if uav.away == away:
+                return
+            await asyncio.sleep(0.05)
+
+
+@pytest.mark.parametrize("answers", [True, False], ids=["acknowledged", "not answered"])
+async def test_an_ardupilot_is_asked_for_its_position_and_again_after_a_gap(
+    missions: list[list[Item]], port: int, answers: bool
+) -> None:
+    with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT) as peer:
+        peer.answers_requests = answers
+        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
+            uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
+            await becomes(uav, None)
+            # It has started anew, and sends heartbeats alone until it is asked again.
+            peer.streams = peer.obeys_requests = False
+            await becomes(uav, "its heartbeat arrives, but no position, which was asked for")
+            assert not uav.landed
+            peer.obeys_requests = True
+            await becomes(uav, None)
+
+
+async def test_an_autopilot_that_streams_is_asked_for_nothing(missions: list[list[Item]], port: int) -> None:
+    with pymavlink_peer(missions[0], port) as peer:
+        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
+            await becomes(FieldUav(0, vehicle, site_from_folder(EXAMPLE)), None)
+        asked = [m for _, m in peer.received if m.get_type() == "COMMAND_LONG" and m.command == 511]
+        assert all(m.param1 != 33 for m in asked)
+
+
+async def test_decisions_begin_at_the_height_of_the_path_or_on_the_way(missions: list[list[Item]], port: int) -> None:
+    with pymavlink_peer(missions[0], port, autopilot=ARDUPILOT) as peer:
+        peer.airframe.climbs_m = 0.0
+        async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
+            uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=100.0)
+            await becomes(uav, "it is on the ground")
+            peer.airframe.climbs_m = 6.0
+            await becomes(uav, "it climbs to 100 m")
+            with pytest.raises(VehicleError, match="does not fly its mission: it climbs"):
+                await await_missions([uav], wait_s=0.3)
+            peer.airframe.climbs_m = 92.0
+            await becomes(uav, None)
+            # A descent on the way is none to the ground.
+            peer.airframe.climbs_m = 30.0
+            await asyncio.sleep(0.2)
+            await becomes(uav, None)
+            low = FieldUav(0, vehicle, site_from_folder(EXAMPLE), height_m=math.inf)
+            await becomes(low, "it climbs")
+            peer.airframe.climbs_m, peer.airframe.speed = None, 50.0
+            await becomes(low, None)
 
 
 async def test_the_home_of_ardupilot_is_no_part_of_the_mission(missions: list[list[Item]], port: int) -> None:
