@@ -49,8 +49,7 @@ class Fence:
             legs = np.stack((points[:-1], points[1:]), axis=1)[start : start + step]
             found = self._circle_breached(legs) if self.radius else self._ring_breached(legs)
             broken[start + 1 : start + 1 + len(legs)] |= found
-        found = np.flatnonzero(broken)
-        return int(found[0]) if len(found) else None
+        return int(broken.argmax()) if broken.any() else None
 
     def _contains(self, positions: FloatArray) -> NDArray[np.bool_]:
         """Whether each position ``(n, 2)`` is in the area or on its boundary."""
