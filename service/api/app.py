@@ -89,7 +89,7 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
     app.include_router(decisions)
     app.include_router(router)
     app.include_router(live_routes.router)
-    app.mount("/static", live_routes.Assets(directory=live_routes.STATIC), name="static")
+    app.mount("/static", live_routes.ASSETS, name="static")
     if member is not None:
         from service.api.process_routing import Siblings
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
-from contextlib import aclosing
+from contextlib import aclosing, suppress
+from functools import lru_cache
 from pathlib import Path
 
 from fastapi import APIRouter, Depends, Request
@@ -24,8 +24,6 @@ from shared.missions import DecisionPrompt, MissionLine, MissionList
 from shared.reasons import LLM_NOT_ASKED
 from shared.schemas import DecisionId, MissionId
 
-log = logging.getLogger(__name__)
-
 router = APIRouter()
 
 STATIC = Path(live.__file__).parent / "static"
@@ -41,12 +39,26 @@ _KEY_CHECK_S = 1.0
 
 
 class Assets(StaticFiles):
-    """The page's scripts and styles."""
+    """The page, its scripts and styles, sent from memory: a client that does not read keeps no file open."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
+        if isinstance(response, FileResponse):
+            # All clients share one copy of the bytes.
+            whole = Response(_content(str(response.path), response.headers["etag"]), media_type=response.media_type)
+            whole.headers.update({name: response.headers[name] for name in ("etag", "last-modified")})
+            response = whole
         response.headers.update(_SECURITY_HEADERS)
         return response
+
+
+@lru_cache(maxsize=64)
+def _content(path: str, _etag: str) -> bytes:
+    """A file of this size and date."""
+    return Path(path).read_bytes()
+
+
+ASSETS = Assets(directory=STATIC)
 
 
 class EventStream(StreamingResponse):
@@ -64,12 +76,10 @@ class EventStream(StreamingResponse):
             async with self._live.sending():
                 await send(message)
 
-        try:
-            # The events are closed at once, so that none are made for a closed page.
+        # The events are closed at once, so that none are made for a closed page.
+        with suppress(TimeoutError):
             async with aclosing(self._events):
                 await super().stream_response(in_time)
-        except TimeoutError:
-            log.info("a page stopped reading; its stream is closed")
 
     async def _while_known(
         self, events: AsyncGenerator[bytes], still_known: Callable[[], bool]
@@ -91,9 +101,9 @@ async def _listener(engine: TheEngine) -> AsyncIterator[None]:
 
 
 @router.get("/", include_in_schema=False)
-async def page() -> FileResponse:
+async def page(request: Request) -> Response:
     """The page, without data."""
-    return FileResponse(STATIC / "index.html", headers=_SECURITY_HEADERS)
+    return await ASSETS.get_response("index.html", request.scope)
 
 
 @router.get("/missions", tags=["missions"])

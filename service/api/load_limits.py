@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 import zstandard
 from starlette.responses import Response
@@ -34,9 +34,10 @@ class RequestLimits:
     """Pure ASGI middleware: bounds the requests at once, and reads their bodies.
 
     Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics and
-    the streams of pages do not count. It reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip |
-    zstd``. It answers 413 past the limit, 408 for a body that takes longer than 10 s, 415 for another encoding and 400
-    for a damaged body. Each refusal is a problem document.
+    the streams of pages do not count. Nor does a request once its answer begins, which its client may take slowly. It
+    reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``. It answers 413 past the limit, 408
+    for a body that takes longer than 10 s, 415 for another encoding and 400 for a damaged body. Each refusal is a
+    problem document.
     """
 
     def __init__(self, app: ASGIApp, most: int, limit: int) -> None:
@@ -59,9 +60,17 @@ class RequestLimits:
             await response(scope, receive, send)
             return
         self._running += 1
+        counts = True
+
+        def answer(message: Message) -> Awaitable[None]:
+            nonlocal counts
+            self._running -= counts
+            counts = False
+            return send(message)
+
         try:
             if scope["method"] in ("POST", "PUT", "PATCH"):
-                body = await self._body(scope, receive, send)
+                body = await self._body(scope, receive, answer)
                 if body is None:
                     return
                 pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
@@ -69,11 +78,11 @@ class RequestLimits:
                 async def replayed() -> Message:
                     return pending.pop() if pending else await receive()
 
-                await self.app(scope, replayed, send)
+                await self.app(scope, replayed, answer)
             else:
-                await self.app(scope, receive, send)
+                await self.app(scope, receive, answer)
         finally:
-            self._running -= 1
+            self._running -= counts
 
     async def _body(self, scope: Scope, receive: Receive, send: Send) -> bytes | None:
         """The decoded body, which the scope's headers then describe; None where there is nothing to answer any more."""

@@ -16,9 +16,10 @@ from typing import Any
 import httpx
 import psutil
 import pytest
+from starlette.types import Message
 
 from service.api.api_keys import editing
-from service.api.live_routes import STATIC
+from service.api.live_routes import ASSETS, STATIC
 from service.live.broadcaster import MAX_LISTENERS
 from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
@@ -254,6 +255,36 @@ def test_the_page_is_open_and_what_it_shows_needs_a_key(
             known.remove("reader")
         # Its key is known no more.
         assert list(events) == []
+
+
+def test_the_pages_files_are_sent_whole_or_found_unchanged(edge: Edge) -> None:
+    client = edge()
+    for path, name, kind in (
+        ("/", "index.html", "text/html; charset=utf-8"),
+        ("/static/page.css", "page.css", "text/css; charset=utf-8"),
+        ("/static/vendor/uPlot.esm.js", "vendor/uPlot.esm.js", "text/javascript; charset=utf-8"),
+    ):
+        whole = client.get(path)
+        assert whole.content == (STATIC / name).read_bytes()
+        assert (whole.headers["content-type"], whole.headers["cache-control"]) == (kind, "no-cache")
+        assert client.get(path, headers={"If-None-Match": whole.headers["etag"]}).status_code == 304
+    assert client.head("/static/page.css").headers["content-length"] == str((STATIC / "page.css").stat().st_size)
+
+
+def test_no_file_is_open_while_a_client_takes_it() -> None:
+    """A client may take its time, and the process may open few files."""
+    opened: list[str] = []
+
+    async def receive() -> Message:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    async def send(message: Message) -> None:
+        opened.extend(file.path for file in psutil.Process().open_files())
+
+    scope = {"type": "http", "method": "GET", "path": "/vendor/uPlot.esm.js", "headers": []}
+    asyncio.run(ASSETS(scope, receive, send))
+    assert [path for path in opened if path.startswith(str(STATIC))] == []
 
 
 def test_the_library_is_what_its_authors_published() -> None:

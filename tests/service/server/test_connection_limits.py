@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from urllib.parse import urlsplit
 
 import httpx
@@ -19,7 +17,7 @@ from starlette.types import Receive, Scope, Send
 from service.server import connection_limits
 from tests.e2e.processes import serving_edge
 from tests.running import serving
-from tests.waiting import PATIENCE_S, until
+from tests.waiting import PATIENCE_S
 
 Address = tuple[str, int]
 # More than the system keeps between the two ends.
@@ -148,122 +146,3 @@ def test_who_has_asked_may_wait_longer_than_that(monkeypatch: pytest.MonkeyPatch
         assert hung_up(address_of(url), b"")
         may.set()
         assert waiting.result(timeout=PATIENCE_S).text == "alive"
-
-
-LARGE = b"x" * 4_000_000
-
-
-async def disconnected(receive: Receive) -> None:
-    while (await receive())["type"] != "http.disconnect":
-        pass
-
-
-class Answering:
-    """An application with a large answer, a small one and an endless stream, that counts the requests in progress."""
-
-    def __init__(self) -> None:
-        self.running = 0
-        self.begun = 0
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        assert scope["type"] == "http"
-        self.running, self.begun = self.running + 1, self.begun + 1
-        try:
-            await send({"type": "http.response.start", "status": 200, "headers": []})
-            if scope["path"] == "/stream":
-                gone = asyncio.create_task(disconnected(receive))
-                while not gone.done():
-                    await send({"type": "http.response.body", "body": LARGE[:65536], "more_body": True})
-                    await asyncio.sleep(0)
-                return
-            for start in range(0, len(LARGE) if scope["path"] == "/large" else 1, 65536):
-                await send({"type": "http.response.body", "body": LARGE[start : start + 65536], "more_body": True})
-            await send({"type": "http.response.body", "body": b""})
-        finally:
-            self.running -= 1
-
-
-def unread(address: Address, sent: bytes) -> socket.socket:
-    """A connection that has sent something and reads nothing of the answers."""
-    connection = socket.socket()
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    connection.settimeout(PATIENCE_S)
-    connection.connect(address)
-    connection.sendall(sent)
-    return connection
-
-
-@pytest.mark.parametrize("path", ["/large", "/stream"])
-@pytest.mark.parametrize("requests", [1, 50], ids=["one", "pipelined"])
-def test_who_does_not_read_is_cut_off(monkeypatch: pytest.MonkeyPatch, path: str, requests: int) -> None:
-    monkeypatch.setattr(connection_limits, "_READ_S", 0.2)
-    app = Answering()
-    with serving(app) as url, unread(address_of(url), b"GET %s HTTP/1.1\r\n\r\n" % path.encode() * requests) as one:
-        until(lambda: app.begun > 0 and not app.running)
-        # uvicorn would begin the next of them, and wait for the client again.
-        assert app.begun == 1
-        with suppress(ConnectionError):
-            read = 0
-            while some := one.recv(1_000_000):
-                read += len(some)
-            assert read < len(LARGE)
-        assert httpx.get(url, timeout=PATIENCE_S).status_code == 200
-
-
-def test_who_reads_a_byte_now_and_then_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_limits, "_READ_S", 0.2)
-    app = Answering()
-    with serving(app) as url, unread(address_of(url), b"GET /large HTTP/1.1\r\n\r\n") as one:
-
-        def dripped() -> bool:
-            one.recv(1)
-            return app.begun > 0 and not app.running
-
-        with suppress(ConnectionError):
-            until(dripped)
-        until(lambda: not app.running)
-
-
-def test_a_closed_connection_does_not_wait_for_its_client_for_ever(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Small answers that fill no buffer: each is complete, and the connection ends after them."""
-    monkeypatch.setattr(connection_limits, "_READ_S", 0.2)
-    monkeypatch.setattr(connection_limits.BoundedHttpProtocol, "_quiet_until", {})
-    app = Answering()
-    head = b"GET / HTTP/1.1\r\nx: " + b"y" * 50 + b"\r\n\r\n"
-    with serving(app) as url:
-        ones = [unread(address_of(url), head * 40_000) for _ in range(2)]
-        until(lambda: sum("does not read" in line.message for line in caplog.records) == 1)
-        for one in ones:
-            with suppress(ConnectionError):
-                while one.recv(1_000_000):
-                    pass
-            one.close()
-        until(lambda: not app.running)
-    assert sum("does not read" in line.message for line in caplog.records) == 1
-
-
-def test_who_reads_slowly_gets_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection_limits, "_READ_S", 1.0)
-    app = Answering()
-    with serving(app) as url, unread(address_of(url), b"GET /large HTTP/1.0\r\n\r\n") as one:
-        read = 0
-        while some := one.recv(2048):
-            read += len(some)
-    assert read > len(LARGE)
-
-
-def test_who_leaves_amid_an_answer_leaves_no_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    app = Answering()
-    with serving(app) as url:
-        for sent in (
-            b"GET /large HTTP/1.1\r\n\r\n" * 50,
-            b"GET /stream HTTP/1.1\r\n\r\n",
-            b"GET /large HTTP/1.1\r\n\r\nnonsense",
-        ):
-            with unread(address_of(url), sent) as one:
-                one.recv(1)
-            until(lambda: not app.running)
-    assert [line.message for line in caplog.records if line.name == "asyncio"] == []
