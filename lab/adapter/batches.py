@@ -1,0 +1,151 @@
+"""Batches of compact prompts with the teacher's probabilities, for any number of rows, from records on a GPU.
+
+Each time that a decision is drawn, its rows are shuffled, its sensors' signs are drawn anew, and it has a number of
+rows of its own. The targets are those of :mod:`service.distilling.examples`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+LETTERS = "ABCDEFGHIJKLMNOPQRST"
+_MOST_EXPERIENCES = 8
+# The columns of ``vel`` and ``lost`` that a prompt with so many options a row has.
+_COLUMNS = {4: [0, 1, 2, 3], 3: [0, 4, 3], 2: [0, 3], 1: [5]}
+_REFERENCE_SHARE, _AFTER_FAILURE, _HELD_OUT = 0.6, 0.15, 11
+_NINE_OF_FASTEST = 9 / 14
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B prompts of r rows with V options: tokens ``(B, T)``, targets ``(B, r, V)``, the places of the rows' letters.
+
+    ``regret`` ``(B, r, V)`` is what each answer is expected to lose above the best of all sensors and options;
+    ``planned`` ``(B, r, V)`` whether it is the planner's, of which a prompt may have none.
+    """
+
+    tokens: Tensor
+    targets: Tensor
+    letters_at: Tensor
+    regret: Tensor
+    planned: Tensor
+
+
+class Tokens:
+    """The tokens of prompts, as numbers in the model's cut vocabulary; ``tokens.json`` of :mod:`lab.adapter.base`."""
+
+    def __init__(self, file: Path, device: str) -> None:
+        known = json.loads(file.read_text())
+
+        def of(texts: str) -> Tensor:
+            return torch.tensor([known["char"][text] for text in texts], device=device)
+
+        self.digits, self.letters, self.signs = of("0123456789"), of(LETTERS), of(known["signs"])
+        self.uav, self.failed, self.sent = of("U"), of("X"), of("Y")
+        self.before, self.after = (torch.tensor(known[name], device=device) for name in ("before", "after"))
+        self.sign_of = {sign: place for place, sign in enumerate(known["signs"])}
+
+
+class Records:
+    """Records on a device, and batches of them; those of each eleventh world are held out."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], tokens: Tokens, device: str) -> None:
+        self._tokens, self._device = tokens, device
+        kept = arrays["n"] >= 2
+        names = ("fleet", "rows", "vel", "lost", "ref", "refv", "failing", "n")
+        self._of = {name: torch.tensor(arrays[name][kept]).to(device) for name in names}
+        self._of = {name: one if one.is_floating_point() else one.long() for name, one in self._of.items()}
+        self._of["sign"] = torch.tensor(arrays["ids"][kept].astype(np.int64) % len(tokens.signs)).to(device)
+        self._of["best"] = self._of["lost"].flatten(1).min(dim=1).values
+        blocks = [_entries(text, tokens.sign_of)[-_MOST_EXPERIENCES:] for text in arrays["blocks"][kept].tolist()]
+        entries = np.zeros((len(blocks), _MOST_EXPERIENCES, 4), dtype=np.int64)
+        for number, block in enumerate(blocks):
+            entries[number, : len(block)] = np.reshape(block, (-1, 4))
+        self._of["entries"] = torch.tensor(entries).to(device)
+        self.experiences = torch.tensor([len(block) for block in blocks], device=device)
+        held = torch.tensor(arrays["mission"][kept] % _HELD_OUT == 0, device=device)
+        self.training, self.held_out = (~held).nonzero()[:, 0], held.nonzero()[:, 0]
+        self._members = lru_cache(maxsize=None)(self._members_of)
+
+    def groups(self, k: int, experiences: int, *, held_out: bool = False) -> dict[int, Tensor]:
+        """The decisions that have so many experiences, by the rows that a prompt of at most k shows."""
+        return self._members(k, experiences, held_out)
+
+    def _members_of(self, k: int, experiences: int, held_out: bool) -> dict[int, Tensor]:
+        own = self.held_out if held_out else self.training
+        own = own[self.experiences[own] == experiences]
+        shown = self._of["n"][own].clamp(max=k)
+        return {int(rows): own[shown == rows] for rows in shown.unique().tolist()}
+
+    def batch(self, which: Tensor, k: int, rows: int, experiences: int, drawn: torch.Generator) -> Batch:
+        """The prompts of these decisions, all of so many rows and experiences."""
+        own, count, tokens = {name: one[which] for name, one in self._of.items()}, len(which), self._tokens
+        columns = torch.tensor(_COLUMNS[max(1, min(4, len(LETTERS) // k))], device=self._device)
+        order = torch.rand(count, rows, device=self._device, generator=drawn).argsort(1)
+
+        def shuffled(name: str) -> Tensor:
+            values = own[name][:, :rows]
+            places = order.view(count, rows, *[1] * (values.dim() - 2)).expand(count, rows, *values.shape[2:])
+            return values.gather(1, places)
+
+        velocities, lost = shuffled("vel")[..., columns], shuffled("lost")[..., columns]
+        signs = torch.rand(count, len(tokens.signs), device=self._device, generator=drawn).argsort(1)
+        digits, spans = shuffled("rows"), velocities[..., [0, -1]].float() * _NINE_OF_FASTEST
+        first = tokens.letters[torch.arange(rows, device=self._device) * len(columns)].expand(count, rows)
+        lines = torch.cat(
+            (
+                tokens.digits[digits[..., :1]],
+                tokens.signs[signs.gather(1, shuffled("sign"))][..., None],
+                tokens.digits[digits[..., 1:]],
+                tokens.digits[spans.round().long().clamp(0, 9)],
+                first[..., None],
+            ),
+            dim=-1,
+        )
+        read = self._read(own["entries"][:, :experiences], signs)
+        head = torch.cat((tokens.before.expand(count, -1), read, tokens.digits[own["fleet"]]), dim=1)
+        text = torch.cat((head, tokens.uav.expand(count, 1), lines.flatten(1), tokens.after.expand(count, -1)), dim=1)
+        at = head.shape[1] + lines.shape[2] * torch.arange(1, rows + 1, device=self._device)
+        planned = _planned(velocities, order == own["ref"][:, None], own["refv"])
+        targets = _targets(lost, velocities, planned, shuffled("failing"))
+        return Batch(text, targets, at, lost - own["best"][:, None, None], planned)
+
+    def _read(self, entries: Tensor, signs: Tensor) -> Tensor:
+        """The tokens of experiences ``(B, e, 4)``."""
+        tokens, known = self._tokens, signs.gather(1, entries[..., 1])
+        ends = torch.where(entries[..., 3] == 1, tokens.failed, tokens.sent)
+        parts = tokens.digits[entries[..., 0]], tokens.signs[known], tokens.digits[entries[..., 2]], ends
+        return torch.stack(parts, dim=-1).flatten(1)
+
+
+def _planned(velocities: Tensor, is_sensor: Tensor, velocity: Tensor) -> Tensor:
+    """Whether each option is the planner's sensor at the velocity nearest to the planner's."""
+    nearest = (velocities - velocity[:, None, None]).abs().argmin(dim=-1, keepdim=True)
+    return is_sensor[..., None] & (velocities == velocities.gather(2, nearest))
+
+
+def _targets(lost: Tensor, velocities: Tensor, planned: Tensor, failing: Tensor) -> Tensor:
+    times = (velocities[..., :, None] == velocities[..., None, :]).sum(dim=-1)
+    by_regret = torch.exp(-(lost - lost.amin((1, 2), keepdim=True)).clamp(max=60.0)) / times
+    by_regret = by_regret / by_regret.sum((1, 2), keepdim=True)
+    reference = planned / planned.sum((1, 2), keepdim=True).clamp(min=1)
+    shown = planned.any(2).any(1)[:, None, None]
+    targets = torch.where(shown, (1 - _REFERENCE_SHARE) * by_regret + _REFERENCE_SHARE * reference, by_regret)
+    targets = targets * torch.where(failing[..., None] == 1, _AFTER_FAILURE, 1.0)
+    return targets / targets.sum((1, 2), keepdim=True)
+
+
+def _entries(text: str, sign_of: Mapping[str, int]) -> list[list[int]]:
+    """A block's experiences: two digits around the sensor's sign, and whether the transmission failed."""
+    return [
+        [int(text[at]), sign_of[text[at + 1]], int(text[at + 2]), int(text[at + 3] == "X")]
+        for at in range(0, len(text), 4)
+    ]
