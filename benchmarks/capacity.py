@@ -39,8 +39,8 @@ from rich.table import Table
 from sqlalchemy import create_engine
 
 from service.storage.leases import Leases
-from shared.cores import usable_cores
-from simulator.client import EdgeClient
+from shared.client.edge_client import EdgeClient
+from shared.kit.cores import usable_cores
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 
 # What `python` reads at its start: the same edge without the check of its leases in each transaction.
@@ -255,7 +255,15 @@ def modes(folder: Path, args: Capacity) -> dict[str, dict[str, float]]:
             settings = {"STORE": str(edge / "m.db"), "MODE": mode, "PLANNER": planner, "LLM_URL": url}
             environment = {**os.environ, **{f"AICVDS_{key}": value for key, value in settings.items()}}
             process = stack.enter_context(edge_process(port, edge / "log", environment))
-            command = [sys.executable, "-m", "shared.cli", "simulate", "--edge", f"http://{HOST}:{port}", "--no-bound"]
+            command = [
+                sys.executable,
+                "-m",
+                "shared.kit.command_line",
+                "simulate",
+                "--edge",
+                f"http://{HOST}:{port}",
+                "--no-bound",
+            ]
             used, began, decisions = 0.0, 0.0, 0
             # The first flight loads what is loaded late.
             for flight in range(args.flights + 1):

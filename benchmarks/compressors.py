@@ -17,8 +17,8 @@ from torch import nn
 
 from service.learning.initial_weights import initial_weights
 from service.learning.modules import top_k
-from shared.features import FEATURES
-from shared.scenario import Scenario
+from shared.features.augmented_state import FEATURES
+from shared.world.scenario import Scenario
 
 WINDOW = 512
 KEPT = 0.5

@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from simulator.client import EdgeClient
+from shared.client.edge_client import EdgeClient
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 
 UAVS, SENSORS = 3, 10

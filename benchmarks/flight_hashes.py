@@ -36,13 +36,14 @@ from typing import Any, NamedTuple
 import httpx
 import tyro
 
-from simulator.cli.options import chosen_site
-from simulator.client import EdgeClient
-from simulator.client.lossy_transport import LossyTransport
+from shared.client.edge_client import EdgeClient
+from simulator.commands.options import chosen_site
+from simulator.flying.flight import fly
+from simulator.flying.lossy_transport import LossyTransport
+from simulator.flying.pilots import EdgePilot, LocalPilot
 
 # The only internal names: the functions that fly a world, and the radio that loses requests.
-from simulator.flying.flight import Flight, fly
-from simulator.flying.pilots import EdgePilot, LocalPilot
+from simulator.records.flight import Flight
 from simulator.sites.site import Site
 
 SCENARIOS = ("paper", "pipeline", "stress", "dense", "lossy_uplink")
@@ -165,7 +166,7 @@ def serving() -> Iterator[str]:
     folder = tempfile.mkdtemp()
     settings = {"MODE": "value", "STORE": f"{folder}/m.db", "PLANNER_MS": "60000", "LOG_LEVEL": "warning"}
     process = subprocess.Popen(
-        [sys.executable, "-m", "shared.cli", "serve", "--port", "0"],
+        [sys.executable, "-m", "shared.kit.command_line", "serve", "--port", "0"],
         stderr=subprocess.PIPE,
         text=True,
         env=_environment(settings),

@@ -22,14 +22,14 @@ from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
-from shared.actions import Action
-from shared.scenario import Scenario
-from shared.schemas import MissionSpec, Outcome, PromptStyle
-from simulator.client.observation_report import decide_request
+from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
+from shared.world.actions import Action
+from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import Choice, LocalPilot
 from simulator.sites.site import Site
-from simulator.world import Observation
+from simulator.world.observation import Observation
+from simulator.world.observation_report import decide_request
 
 GUIDED, LLM, LLM_ALL, LLM_30, PAPER = "guided", "llm", "llm_no_attention", "llm_30", "paper"
 WAYS = {

@@ -27,12 +27,12 @@ from rich.console import Console
 from rich.progress import track
 from trust import edge
 
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.scenario import Scenario, scenario_named
-from shared.trajectory import trajectories
-from simulator.client import EdgeClient
-from simulator.experiments.intervals import interval, paired
+from lab.experiments.intervals import interval, paired
+from shared.client.edge_client import EdgeClient
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario, scenario_named
+from shared.world.trajectory import trajectories
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot
 from simulator.flying.rollout import rollout
@@ -40,8 +40,8 @@ from simulator.policies.mpc import RecedingHorizon
 from simulator.policies.policy import Policy
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
-from simulator.world import Observation
 from simulator.world.gain_trace import GainTrace
+from simulator.world.observation import Observation
 
 GOAL, GOAL_AHEAD = 0.6, 0.4
 # The traces: between two points, the distance over which the correlation falls to 1/e, and the standard deviations.

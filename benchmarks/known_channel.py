@@ -25,18 +25,18 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.progress import track
 
-from shared.channel import FloatArray, IntArray
-from shared.fleetplan import FleetBelief
-from shared.radio_map import RadioMap
-from shared.scenario import Scenario, scenario_named
-from shared.shadowing import Shadowing
-from simulator.experiments.intervals import interval, paired
-from simulator.flying.informed_planner import InformedPlanner
+from lab.experiments.informed_planner import InformedPlanner
+from lab.experiments.intervals import interval, paired
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.radio_map import RadioMap
+from shared.belief.shadowing import Shadowing
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import Scenario, scenario_named
 from simulator.flying.rollout import rollout
 from simulator.policies.mpc import RecedingHorizon
 from simulator.policies.policy import Policy
 from simulator.sites.site import Site
-from simulator.world import PipelineWorld
+from simulator.world.environment import PipelineWorld
 
 EARLY_STEPS = 10
 # Without any fading a second measurement at one place would leave nothing to divide by.

@@ -36,8 +36,8 @@ from rich.progress import track
 from rich.table import Table
 
 from service.config.settings import Settings
-from shared.cores import usable_cores
-from shared.scenario import Scenario, scenario_named
+from shared.kit.cores import usable_cores
+from shared.world.scenario import Scenario, scenario_named
 
 _NEIGHBOUR = "while True: pass"
 QUIET, BUSY = "quiet", "busy"

@@ -26,12 +26,13 @@ import tyro
 from rich.console import Console
 from rich.progress import Progress
 
-from shared.scenario import SCENARIOS, Scenario
-from shared.schemas import Mode
-from simulator.client import EdgeClient
-from simulator.flying.flight import Flight, fly
+from shared.client.edge_client import EdgeClient
+from shared.wire.schemas import Mode
+from shared.world.scenario import SCENARIOS, Scenario
+from simulator.flying.flight import fly
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 from simulator.flying.pilots import Choice, EdgePilot
+from simulator.records.flight import Flight
 from simulator.sites.site import Site
 
 

@@ -31,8 +31,8 @@ from service.guidance.note_orders import BadOrders, number_of, parse_orders, sim
 from service.llm.answers import NoDecision
 from service.llm.server_pool import ServerPool
 from service.prompting.warm_up import warm_up
-from shared.guidance import Guidance, Impossible
-from shared.scenario import SCENARIOS
+from shared.planning.orders import Guidance, Impossible
+from shared.world.scenario import SCENARIOS
 
 NOTES = Path(__file__).with_name("notes.json")
 FIELDS = ("visit_every", "weight", "min_velocity", "max_velocity", "forbidden_velocities")

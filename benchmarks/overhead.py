@@ -41,7 +41,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from simulator.experiments.intervals import paired
+from lab.experiments.intervals import paired
 from simulator.flying.local_edge import HOST, usable_port
 
 LITELLM = "litellm[proxy]==1.106.2"
@@ -223,7 +223,7 @@ def edge_of(settings: dict[str, str], stack: ExitStack, checkout: Path | None = 
     """Start an edge of this checkout or another, and wait for its LLM; returns its process and its port."""
     port = usable_port(0)
     python = str(checkout / ".venv/bin/python") if checkout else sys.executable
-    serve = [python, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+    serve = [python, "-m", "shared.kit.command_line", "serve", "--host", HOST, "--port", str(port)]
     process = stack.enter_context(running(serve, f"http://{HOST}:{port}/healthz", settings, checkout))
     while httpx.get(f"http://{HOST}:{port}/readyz", timeout=60).json()["llm"] != "ready":
         time.sleep(0.1)
@@ -240,7 +240,7 @@ def start(folder: Path, litellm: str | None, before: Path | None, stack: ExitSta
     forwards = stack.enter_context(running(forwarder, f"http://{HOST}:{bare}/healthz"))
     keys = folder / "keys.json"
     add = ["keys", "add", "load", "--file", str(keys), "--scopes", "decide", "admin", "--per-minute", "1000000"]
-    made = subprocess.run([python, "-m", "shared.cli", *add], check=True, capture_output=True, text=True)
+    made = subprocess.run([python, "-m", "shared.kit.command_line", *add], check=True, capture_output=True, text=True)
     key = made.stdout.split()[-1]
     settings = {**EDGE, "AICVDS_LLM_URL": upstream, "AICVDS_KEYS": str(keys)}
     edge = edge_of({**settings, "AICVDS_STORE": str(folder / "missions.db")}, stack)

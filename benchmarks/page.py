@@ -128,7 +128,7 @@ def main() -> int:
     url = f"http://{HOST}:{port}"
     environment = {**os.environ, "AICVDS_MODE": "value", "AICVDS_STORE": "none", "AICVDS_LOG_LEVEL": "warning"}
     edge = subprocess.Popen(
-        [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)], env=environment
+        [sys.executable, "-m", "shared.kit.command_line", "serve", "--host", HOST, "--port", str(port)], env=environment
     )
     stop = threading.Event()
     flying = threading.Thread(target=fly, args=(url, options, stop))

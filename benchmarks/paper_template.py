@@ -15,9 +15,9 @@ from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt
 from service.prompting.row_formats import UNKNOWN, Cells
 from service.prompting.token_accounting import UnprunedState
-from shared.actions import Action
-from shared.features import State
-from shared.scenario import Scenario
+from shared.features.augmented_state import State
+from shared.world.actions import Action
+from shared.world.scenario import Scenario
 
 EXPERIENCES = 30
 # The paper's number of tokens for ten sensors without attention.

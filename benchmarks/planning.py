@@ -28,11 +28,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from shared.schemas import Mode
-from simulator.cli.options import chosen_site
-from simulator.client import EdgeClient
-from simulator.experiments.intervals import interval, paired
-from simulator.experiments.stand_ins import answering, drawn
+from lab.experiments.intervals import interval, paired
+from lab.experiments.stand_ins import answering, drawn
+from shared.client.edge_client import EdgeClient
+from shared.wire.schemas import Mode
+from simulator.commands.options import chosen_site
 from simulator.flying.flight import fly
 from simulator.flying.local_edge import HOST
 from simulator.flying.pilots import EdgePilot

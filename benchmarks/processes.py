@@ -37,8 +37,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from shared.schemas import MissionSpec
-from simulator.client import EdgeClient
+from shared.client.edge_client import EdgeClient
+from shared.wire.schemas import MissionSpec
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 
 SENSORS = 10

@@ -119,7 +119,9 @@ def measure(options: ProcessorStages, console: Console) -> list[dict[str, float]
         instant = [sys.executable, str(HERE / "instant_llm.py"), "--port", str(llm)]
         stack.enter_context(running(instant, f"{upstream}/models"))
         add = ["keys", "add", "load", "--file", str(keys), "--scopes", "decide", "admin", "--per-minute", "1000000"]
-        made = subprocess.run([sys.executable, "-m", "shared.cli", *add], check=True, capture_output=True, text=True)
+        made = subprocess.run(
+            [sys.executable, "-m", "shared.kit.command_line", *add], check=True, capture_output=True, text=True
+        )
         key = made.stdout.split()[-1]
         settings = {"LLM_URL": upstream, "KEYS": str(keys), "STORE": str(folder / "missions.db")}
         environment = {**EDGE, **{f"AICVDS_{name}": value for name, value in settings.items()}}

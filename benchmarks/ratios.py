@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import bootstrap
 
-from shared.channel import FloatArray
+from shared.world.channel import FloatArray
 
 _RESAMPLES = 5000
 

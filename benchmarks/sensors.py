@@ -39,17 +39,17 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from shared.missions import MissionAttention
-from shared.scenario import Scenario
-from shared.schemas import DecideRequest, MissionSpec, Mode, Outcome, Uplink
-from simulator.client import EdgeClient
-from simulator.client.pruned_reports import PrunedReports
-from simulator.client.report_encoders import DeltaReports
+from shared.client.edge_client import EdgeClient
+from shared.client.pruned_reports import PrunedReports
+from shared.client.report_encoders import DeltaReports
+from shared.wire.missions import MissionAttention
+from shared.wire.schemas import DecideRequest, MissionSpec, Mode, Outcome, Uplink
+from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.local_edge import HOST, edge_process, usable_port
 from simulator.flying.pilots import Choice, EdgePilot
 from simulator.sites.site import Site
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 GOALS = {"share_1000_to_10": 2.0, "share_10000_to_10": 20.0, "memory_mb": 200.0}
 UAVS = 3

@@ -37,7 +37,7 @@ from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
-from simulator.client import EdgeClient
+from shared.client.edge_client import EdgeClient
 from simulator.flying.local_edge import HOST, usable_port
 
 MISSIONS, UAVS, SENSORS = 200, 3, 10
@@ -186,7 +186,7 @@ def main() -> int:
         settings = {"AICVDS_STORE": f"{folder}/missions.db", "AICVDS_LOG_LEVEL": "error"}
         if not options.guided:
             settings["AICVDS_MODE"] = "value"
-        command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port)]
+        command = [sys.executable, "-m", "shared.kit.command_line", "serve", "--host", HOST, "--port", str(port)]
         with subprocess.Popen(command, env={**os.environ, **settings}) as edge:
             try:
                 samples = _fly(url, edge.pid, missions, options, console)

@@ -35,13 +35,13 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from lab.experiments.intervals import interval, paired
 from service.config.settings import Settings
 from service.deciding.rollout_evaluator import evaluate
 from service.llm.answers import NoDecision, check_answer
 from service.prompting.token_accounting import TokenCounter
-from shared.actions import Action
-from shared.scenario import Scenario, scenario_named
-from simulator.experiments.intervals import interval, paired
+from shared.world.actions import Action
+from shared.world.scenario import Scenario, scenario_named
 
 GOAL_PROMPT, GOAL_NEW = 0.5, 0.15
 # The forms with judged answers: an answer is a sensor and a velocity, or a letter for both.

@@ -23,6 +23,7 @@ import uvicorn
 from rich.console import Console
 from rich.progress import track
 
+from lab.experiments.intervals import interval, paired
 from service.api.app import create_app
 from service.config.settings import Settings
 from service.deciding.deliberation import LlmAdvice
@@ -31,15 +32,14 @@ from service.edge.engine import Engine
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
-from shared.scenario import Scenario, scenario_named
-from shared.schemas import Mode
-from simulator.client import EdgeClient
-from simulator.experiments.intervals import interval, paired
+from shared.client.edge_client import EdgeClient
+from shared.wire.schemas import Mode
+from shared.world.scenario import Scenario, scenario_named
 from simulator.flying.flight import fly
 from simulator.flying.pilots import Choice, EdgePilot
 from simulator.policies.mpc import RecedingHorizon
 from simulator.sites.site import Site
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 GOAL = 1.10
 # The probability of all other letters together.

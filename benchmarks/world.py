@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from shared.scenario import Scenario, scenario_named
-from simulator.world import PipelineWorld
+from shared.world.scenario import Scenario, scenario_named
 from simulator.world.batch import Draw, VectorWorld
+from simulator.world.environment import PipelineWorld
 
 GOAL_BATCH, GOAL_SINGLE = 300_000, 5_000
 

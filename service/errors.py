@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from http import HTTPStatus
 
-from shared.problem import INCOMPLETE
+from shared.wire.problem import INCOMPLETE
 
 
 class Refused(Exception):

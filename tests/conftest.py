@@ -22,9 +22,9 @@ from httpx._config import create_ssl_context
 from service.api.app import create_app
 from service.config.settings import Settings
 from service.prompting.tokenizer import encoding
-from tests.running import serving
-from tests.storing import StoreHere
-from tests.waiting import PATIENCE_S
+from tests.support.running import serving
+from tests.support.storing import StoreHere
+from tests.support.waiting import PATIENCE_S
 
 # An edge started as a process has no store unless a test gives one: otherwise all would share the user's store.
 os.environ["AICVDS_STORE"] = "none"

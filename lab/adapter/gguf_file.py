@@ -12,7 +12,7 @@ from pathlib import Path
 import gguf
 import numpy as np
 
-from service.distilling.gguf_adapter import GgufAdapter
+from lab.distilling.gguf_adapter import GgufAdapter
 from service.llm.adapter_version import DECISIONS
 
 _ALPHA = 32.0

@@ -1,6 +1,6 @@
 """The embedded LLM in torch with a LoRA adapter, in llama.cpp's order of rows, cut to the tokens that prompts use.
 
-It is for a machine that has torch and numpy alone. Its logits are those of :class:`service.distilling.student.Student`
+It is for a machine that has torch and numpy alone. Its logits are those of :class:`lab.distilling.student.Student`
 within 6e-6 in float32 (compared on two prompts with the adapter that ships).
 """
 

@@ -2,7 +2,8 @@
 
     python -m lab.adapter.records runs/rollouts/*.jsonl.gz --out runs/records
 
-Each recording of ``aicvds explore --teacher planner`` becomes one ``.npz`` file. With ``--merge`` they become one:
+Each recording of ``python -m lab explore --teacher planner`` becomes one ``.npz`` file. With ``--merge`` they become
+one:
 
     python -m lab.adapter.records --merge runs/records/*.npz --out lab/adapter/decisions.npz
 
@@ -26,18 +27,18 @@ from typing import Any
 
 import numpy as np
 
+from lab.distilling.examples import missions_of
+from lab.exploration.rollouts import Header, Reference, RolloutStep, read_rollouts
+from lab.training.recorded_states import recorded_states
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState
-from service.distilling.examples import missions_of
 from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint, velocity_options
 from service.prompting.compact_prompt import Outlook, failing_signs, fleet_digits, row_digits, sign
-from service.training.recorded_states import recorded_states
-from shared.actions import Action
-from shared.rollouts import Header, Reference, RolloutStep, read_rollouts
-from shared.schemas import MissionSpec
+from shared.wire.schemas import MissionSpec
+from shared.world.actions import Action
 
 ROWS, OPTIONS = 10, 6
 # Belief and experiences of a recording's missions, one after the other: most have a learned belief, as by default.

@@ -32,7 +32,7 @@ _TINY = 1e-9
 
 
 def loss_of(model: Model, tokens: Tokens, batch: Batch) -> Tensor:
-    """The loss of :mod:`service.distilling.loss`: the answer, its sensor, each row's letter and each row's worth."""
+    """The loss of :mod:`lab.distilling.loss`: the answer, its sensor, each row's letter and each row's worth."""
     rows, options = batch.targets.shape[1:]
     states = model(batch.tokens)
     answers = model.logits(states[:, -1], tokens.letters[: rows * options]).log_softmax(1).view(batch.targets.shape)

@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shared.validation_messages import problem_of
+from shared.kit.validation_messages import problem_of
 
 log = logging.getLogger(__name__)
 

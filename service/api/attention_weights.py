@@ -9,7 +9,7 @@ from http import HTTPStatus
 from fastapi import Response
 
 from service.mission.mission import Mission
-from shared.missions import MissionAttention, WeightArray
+from shared.wire.missions import MissionAttention, WeightArray
 
 
 def attention_of(mission: Mission) -> MissionAttention:

@@ -20,9 +20,9 @@ from service.api.problem_details import documented
 from service.api.routes import TheEngine, may_command
 from service.errors import NotFound
 from service.live.broadcaster import Broadcaster
-from shared.missions import DecisionPrompt, MissionLine, MissionList
-from shared.reasons import LLM_NOT_ASKED
-from shared.schemas import DecisionId, MissionId
+from shared.wire.missions import DecisionPrompt, MissionLine, MissionList
+from shared.wire.reasons import LLM_NOT_ASKED
+from shared.wire.schemas import DecisionId, MissionId
 
 router = APIRouter()
 

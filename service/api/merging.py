@@ -10,8 +10,8 @@ from starlette.responses import Response
 from starlette.types import Message, Send
 
 from service.observability.gathered import gathered
-from shared.missions import MissionLine, MissionList
-from shared.schemas import Readiness
+from shared.wire.missions import MissionLine, MissionList
+from shared.wire.schemas import Readiness
 
 # When a process's newest decision was, in its answer to another process.
 DECIDED_AT = "x-decided-at"

@@ -10,7 +10,7 @@ from fastapi.openapi.utils import get_openapi
 from service.api.authentication import is_open, scope_of
 from service.api.openapi_examples import ANSWERS, REQUESTS, problem
 from service.api.problem_details import CONTENT_TYPE, documented
-from shared.problem import Problem
+from shared.wire.problem import Problem
 
 JSON = "application/json"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Any
 
-from shared.problem import Problem
-from shared.scenario import SCENARIOS
+from shared.wire.problem import Problem
+from shared.world.scenario import SCENARIOS
 
 Example = dict[str, Any]
 

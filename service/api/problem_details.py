@@ -15,11 +15,11 @@ from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
 from service.errors import Misdirected, Refused, Unavailable
-from shared.guidance import Guidance, GuidanceAnswer, SensorWish
-from shared.problem import Problem
-from shared.readings import ReadingsRequest, SensorReading
-from shared.scenario import Scenario
-from shared.schemas import (
+from shared.kit.validation_messages import problem_of
+from shared.planning.orders import Guidance, GuidanceAnswer, SensorWish
+from shared.wire.problem import Problem
+from shared.wire.readings import ReadingsRequest, SensorReading
+from shared.wire.schemas import (
     BatchRequest,
     DecideRequest,
     FeedbackRequest,
@@ -27,7 +27,7 @@ from shared.schemas import (
     PromptStyle,
     SensorColumns,
 )
-from shared.validation_messages import problem_of
+from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
 

@@ -20,10 +20,10 @@ from service.edge.engine import Engine
 from service.llm.server_pool import ServerPool
 from service.mission.mission_status import status_of
 from service.observability.metrics import Metrics
-from shared.guidance import GuidanceAnswer, GuidanceStatus
-from shared.missions import MissionAttention, MissionStatus
-from shared.readings import ReadingsRequest, ReadingsResponse
-from shared.schemas import (
+from shared.planning.orders import GuidanceAnswer, GuidanceStatus
+from shared.wire.missions import MissionAttention, MissionStatus
+from shared.wire.readings import ReadingsRequest, ReadingsResponse
+from shared.wire.schemas import (
     BatchRequest,
     BatchResponse,
     DecideRequest,

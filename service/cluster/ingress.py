@@ -22,7 +22,7 @@ from service.api.problem_details import problem_response
 from service.cluster.exchange import Exchanged
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders
-from shared.bounded import BoundedDict
+from shared.kit.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from service.cluster.exchange import Exchanged
 from service.cluster.ingress import OwnersGone
 from service.cluster.owner import Owner
 from service.config.settings import Settings
-from shared.ray_connection import RayUnusable
+from shared.kit.ray_connection import RayUnusable
 
 _NAME = "aicvds-"
 _ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"

@@ -9,7 +9,7 @@ from starlette.applications import Starlette
 from service.cluster.ingress import ingress_application
 from service.config.settings import Settings
 from service.server.server import Server
-from shared.ray_connection import LOCAL, RayUnusable, connected
+from shared.kit.ray_connection import LOCAL, RayUnusable, connected
 
 _LOOPBACK = "127.0.0.1"
 

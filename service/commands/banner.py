@@ -6,7 +6,7 @@ from pathlib import Path
 
 from service.config.settings import Settings
 from service.storage.locks import sqlite_file
-from shared.schemas import LLM_MODES
+from shared.wire.schemas import LLM_MODES
 
 
 def banner(settings: Settings, url: str, missions: int) -> str:

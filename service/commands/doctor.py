@@ -19,8 +19,8 @@ import tyro
 from pydantic import ValidationError
 
 from service.config.settings import Settings, unknown_variables
-from shared.schemas import LLM_MODES
-from shared.validation_messages import problem_of
+from shared.kit.validation_messages import problem_of
+from shared.wire.schemas import LLM_MODES
 
 _ASKED_S = 3.0
 _SUPPORTED = ((3, 11), (3, 13))

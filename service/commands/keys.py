@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from service.api.api_keys import BadKeys, KeyFile, Scope, editing
-from shared.validation_messages import problem_of
+from shared.kit.validation_messages import problem_of
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from pydantic import ValidationError
 
-from shared.schemas import LLM_MODES, Mode
-from shared.validation_messages import problem_of
+from shared.kit.validation_messages import problem_of
+from shared.wire.schemas import LLM_MODES, Mode
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -182,7 +182,7 @@ def _serve(listener: socket.socket, settings: Settings, url: str, member: Member
 def _serve_cluster(listener: socket.socket, settings: Settings, ray: str, least: int, most: int) -> int:
     from service.cluster.serving import serve_cluster
     from service.observability import logs
-    from shared.ray_connection import RayUnusable
+    from shared.kit.ray_connection import RayUnusable
 
     logs.configure(settings.log_level, settings.log_format)
     try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from shared.rendezvous import weight
+from shared.kit.rendezvous import weight
 
 _REMEMBERED = 10_000
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.schemas import Features, PromptFormat
+from shared.wire.schemas import Features, PromptFormat
 
 # Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an
 # experience in each format.

@@ -10,9 +10,9 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.config.prompt_budget import prompt_tokens
-from shared.cores import usable_cores
-from shared.schemas import Mode, Selection
-from shared.validation_messages import suggestion
+from shared.kit.cores import usable_cores
+from shared.kit.validation_messages import suggestion
+from shared.wire.schemas import Mode, Selection
 
 # The adapter that this package ships, if it ships one.
 SHIPPED_ADAPTER = Path(__file__).parents[1] / "checkpoints" / "adapter.gguf"
@@ -71,11 +71,12 @@ class Settings(BaseSettings):
     hedge_ms: int = Field(0, ge=0, le=60_000)
     # Model file of the embedded llama.cpp. Unset: the one of `aicvds model fetch`.
     llm_gguf: Path | None = None
-    # LoRA adapter of the embedded LLM, a GGUF file of `aicvds distill`. Unset: the package's own, if it has one. `off`:
-    # none. `served`: the server of AICVDS_LLM_URL applies it. Missions then have the prompt that it was trained on.
+    # LoRA adapter of the embedded LLM, a GGUF file of `python -m lab distill`. Unset: the package's own, if it has one.
+    # `off`: none. `served`: the server of AICVDS_LLM_URL applies it. Missions then have the prompt that it was trained
+    # on.
     llm_adapter: str | None = None
-    # LoRA adapter with which the embedded LLM reads operators' notes, a GGUF file of `aicvds distill-orders`. Unset:
-    # the package's own, if it has one. `off`: none.
+    # LoRA adapter with which the embedded LLM reads operators' notes, a GGUF file of `python -m lab distill-orders`.
+    # Unset: the package's own, if it has one. `off`: none.
     llm_orders: str | None = None
     # Threads of the embedded llama.cpp. 0: as many as cores, at most 8.
     llm_threads: int = Field(0, ge=0, le=256)

@@ -17,9 +17,9 @@ from scipy.special import softmax
 from service.deciding.attended_state import AttendedState
 from service.guidance.step_guidance import StepGuidance
 from service.learning.trust import PLANNER
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.features import Reach, State
+from shared.features.augmented_state import Reach, State
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
 
 # In units of the value regression's target, minus the cost.
 _VALUE_TEMPERATURE = 0.05

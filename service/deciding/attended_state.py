@@ -18,10 +18,10 @@ from service.learning.modules import Attended, Sample, top_k
 from service.mission.decisions import Pending
 from service.mission.mission import Mission
 from service.prompting.row_formats import cells
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.features import Reach, State, augment
-from shared.schemas import Candidate, UavState
+from shared.features.augmented_state import Reach, State, augment
+from shared.wire.schemas import Candidate, UavState
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from service.deciding.stopwatch import Deadline, Stopwatch
 from service.learning.trust import Advice
 from service.llm.answers import Completion
 from service.mission.mission import Mission
-from shared.actions import Action
-from shared.reasons import Reason
-from shared.schemas import Guided, UavState
+from shared.wire.reasons import Reason
+from shared.wire.schemas import Guided, UavState
+from shared.world.actions import Action
 
 # Kept back of a deadline for the check, the answer and the way through the event loop.
 RESERVE_S = 0.02

@@ -35,10 +35,10 @@ from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.reasons import Reason
-from shared.schemas import Guided, Weighed
+from shared.wire.reasons import Reason
+from shared.wire.schemas import Guided, Weighed
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
 
 # Candidates that a response names.
 _REPORTED = 5

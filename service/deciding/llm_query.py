@@ -18,8 +18,8 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
-from shared.actions import Action
-from shared.reasons import Reason
+from shared.wire.reasons import Reason
+from shared.world.actions import Action
 
 log = logging.getLogger(__name__)
 

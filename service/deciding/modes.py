@@ -18,7 +18,7 @@ from service.deciding.verifier import verify
 from service.llm.answers import Completion, NoDecision
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
-from shared.schemas import Mode as ModeName
+from shared.wire.schemas import Mode as ModeName
 
 log = logging.getLogger(__name__)
 

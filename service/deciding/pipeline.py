@@ -20,10 +20,10 @@ from service.mission.events import AdviserReport
 from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
-from shared.actions import Action
-from shared.cores import usable_cores
-from shared.guidance import Guidance
-from shared.schemas import Tokens
+from shared.kit.cores import usable_cores
+from shared.planning.orders import Guidance
+from shared.wire.schemas import Tokens
+from shared.world.actions import Action
 
 # The initial estimate of a decision's own seconds, and the length of its average.
 _OWN_S, _OWN_MEMORY = 0.03, 20

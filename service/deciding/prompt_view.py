@@ -11,8 +11,8 @@ from service.guidance.orders_as_queues import as_queues
 from service.guidance.step_guidance import StepGuidance
 from service.mission.mission import Mission
 from service.prompting.compact_prompt import CompactTemplate
-from shared.channel import FloatArray
-from shared.features import Reach, State
+from shared.features.augmented_state import Reach, State
+from shared.world.channel import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,10 @@ import numpy as np
 
 from service.deciding.rollout_state import RolloutState
 from service.deciding.sampled_futures import SampledFutures
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.fleetplan import FleetBelief
-from shared.scenario import SCENARIOS
+from shared.belief.fleet_belief import FleetBelief
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
+from shared.world.scenario import SCENARIOS
 
 # Sampled futures. All candidates are flown through the same ones, so that arrivals cause no difference between them. On
 # 8 worlds of scenario `paper`, flying the best candidate of an earlier evaluator lost 38 packets with 8 futures, 33

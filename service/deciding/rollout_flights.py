@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from service.deciding.rollout_state import RolloutState
 from service.deciding.sampled_futures import SampledFutures
-from shared.channel import FloatArray
-from shared.compiled import compiled, inlined
-from shared.features import VELOCITY_BONUS, urgency
-from shared.fleetplan.annealing_arrays import listed
-from shared.guidance import LATE_PACKETS
+from shared.features.augmented_state import VELOCITY_BONUS, urgency
+from shared.kit.compiled import compiled, inlined
+from shared.planning.annealing_arrays import listed
+from shared.planning.orders import LATE_PACKETS
+from shared.world.channel import FloatArray
 
 
 class FlownWorld(NamedTuple):

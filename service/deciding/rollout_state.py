@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.fleetplan import FleetBelief
-from shared.fleetplan.arrivals import Arrivals
-from shared.guidance import NO_GUIDANCE, Guidance
-from shared.scenario import Scenario
+from shared.belief.arrivals import Arrivals
+from shared.belief.fleet_belief import FleetBelief
+from shared.planning.orders import NO_GUIDANCE, Guidance
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
 
 # Steps. Losses after the horizon do not count, because the positions where look-ahead leaves the UAVs are arbitrary.
 # The planner's horizon has four more steps without visits. With these the evaluator rated a planner's action 1.3

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.deciding.rollout_state import RolloutState
-from shared.channel import FloatArray
+from shared.world.channel import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

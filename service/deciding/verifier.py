@@ -12,7 +12,7 @@ import numpy as np
 
 from service.deciding.attended_state import AttendedState
 from service.llm.answers import NoDecision
-from shared.actions import Action
+from shared.world.actions import Action
 
 
 def verify(state: AttendedState, answer: Action) -> None:

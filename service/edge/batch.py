@@ -12,7 +12,7 @@ from service.deciding.llm_query import LlmQueries
 from service.deciding.pipeline import Decided, Pipeline
 from service.deciding.stopwatch import Deadline, Stopwatch
 from service.mission.mission import Mission
-from shared.schemas import BatchRequest
+from shared.wire.schemas import BatchRequest
 
 # A query about all UAVs may take at most the first share of the batch's time, and is not worth sending with less than
 # the second. The rest is for the UAVs' own decisions one after another, with a safety factor of two.

@@ -10,12 +10,13 @@ from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.softmax_means import softmax_means
 from service.prompting.token_accounting import UnprunedState
-from shared.features import FEATURES, augment
-from shared.fleetplan import FleetBelief, annealing
-from shared.learned_channel import ExpectedLinks
-from shared.records import Records, take_report
-from shared.scenario import SCENARIOS
-from shared.schemas import SensorColumns, UavState
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.learned_channel import ExpectedLinks
+from shared.belief.records import Records, take_report
+from shared.features.augmented_state import FEATURES, augment
+from shared.planning import annealing
+from shared.wire.schemas import SensorColumns, UavState
+from shared.world.scenario import SCENARIOS
 
 _PAPER = SCENARIOS["paper"]
 

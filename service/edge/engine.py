@@ -31,9 +31,9 @@ from service.observability.tracing import Traces
 from service.prompting.token_accounting import TokenCounter, with_usage
 from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
-from shared.readings import ReadingsRequest, ReadingsResponse
-from shared.reasons import Reason
-from shared.schemas import (
+from shared.wire.readings import ReadingsRequest, ReadingsResponse
+from shared.wire.reasons import Reason
+from shared.wire.schemas import (
     BatchRequest,
     DecideRequest,
     DecideResponse,

@@ -16,7 +16,7 @@ from service.live.broadcaster import Broadcaster
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
-from shared.schemas import Outcome
+from shared.wire.schemas import Outcome
 
 log = logging.getLogger(__name__)
 

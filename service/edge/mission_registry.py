@@ -17,7 +17,7 @@ from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
-from shared.schemas import BatchRequest, DecideRequest, MissionSpec
+from shared.wire.schemas import BatchRequest, DecideRequest, MissionSpec
 
 AnyRequest = TypeVar("AnyRequest", DecideRequest, BatchRequest)
 

@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from service.guidance.note_numbers import LetteredNote, Number
 from service.guidance.note_orders import BadOrders
-from shared.guidance import Guidance, SensorWish
-from shared.scenario import Scenario
+from shared.planning.orders import Guidance, SensorWish
+from shared.world.scenario import Scenario
 
 STATIC = "Orders of a note."
 SEPARATOR = "; "

@@ -26,8 +26,8 @@ from service.guidance.order_grammar import constrain_orders
 from service.llm.answers import NoDecision
 from service.llm.request_bodies import Rewriting
 from service.llm.server_pool import ServerPool
-from shared.guidance import Guidance, Impossible
-from shared.scenario import Scenario
+from shared.planning.orders import Guidance, Impossible
+from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
 

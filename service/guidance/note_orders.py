@@ -16,7 +16,7 @@ from functools import cache, lru_cache
 from pydantic import ValidationError
 
 from service.guidance.order_examples import EXAMPLES
-from shared.guidance import Guidance, SensorWish
+from shared.planning.orders import Guidance, SensorWish
 
 INSTRUCTION = "Rewrite the operator's note as orders for the UAVs."
 NOTHING = "nothing"

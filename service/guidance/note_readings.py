@@ -16,8 +16,8 @@ from service.guidance.note_orders import BadOrders
 from service.llm.answers import Completion
 from service.llm.request_bodies import Constraint, Rewriting
 from service.llm.server_pool import ServerPool
-from shared.guidance import Impossible
-from shared.scenario import Scenario
+from shared.planning.orders import Impossible
+from shared.world.scenario import Scenario
 
 _READINGS = 3
 # An answer is sure where its tokens together are as likely as this. Of 160 made-up notes of held-out phrasings the

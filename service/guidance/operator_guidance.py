@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from service.errors import Conflict, Refused
-from shared.guidance import NO_GUIDANCE, Guidance, GuidanceAnswer, GuidanceState, GuidanceStatus, Impossible
-from shared.scenario import Scenario
+from shared.planning.orders import NO_GUIDANCE, Guidance, GuidanceAnswer, GuidanceState, GuidanceStatus, Impossible
+from shared.world.scenario import Scenario
 
 
 class OperatorGuidance:

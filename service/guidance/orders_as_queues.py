@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.features import Reach, State, overflow_probability, urgency_of
-from shared.guidance import Guidance
-from shared.scenario import Scenario
+from shared.features.augmented_state import Reach, State, overflow_probability, urgency_of
+from shared.planning.orders import Guidance
+from shared.world.scenario import Scenario
 
 
 def as_queues(

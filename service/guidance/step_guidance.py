@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray
-from shared.features import Reach, State
-from shared.guidance import Guidance
-from shared.scenario import Scenario
+from shared.features.augmented_state import Reach, State
+from shared.planning.orders import Guidance
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
 
 
 @dataclass(frozen=True, slots=True)

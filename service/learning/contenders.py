@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from service.learning.softmax_means import Array, softmax
-from shared.channel import IntArray
+from shared.world.channel import IntArray
 
 # Centres are the means of so many groups of queries: by one dimension, and in each of these by another.
 _GROUPS, _PARTS = 32, 4

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from service.learning.modules import Modules, Weights
-from shared.schemas import Features, Init
+from shared.wire.schemas import Features, Init
 
 # The weights that preset `paper` has for each velocity level; preset `reach` has none.
 _LEVEL_TENSORS = ("velocity.out.weight", "velocity.out.bias")

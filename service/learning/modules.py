@@ -18,9 +18,9 @@ from torch.nn import functional
 
 from service.learning.contenders import contenders
 from service.learning.softmax_means import Array, softmax, softmax_means
-from shared.channel import IntArray
-from shared.features import FEATURES, LEVEL_FEATURES
-from shared.schemas import Features
+from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
+from shared.wire.schemas import Features
+from shared.world.channel import IntArray
 
 WIDTH = 32
 # Fewer sensors are scored in numpy, with an n x n array. Of very many, those are scored that may be among the best, if

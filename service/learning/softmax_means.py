@@ -13,8 +13,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.compiled import compiled, inlined
-from shared.cores import usable_cores
+from shared.kit.compiled import compiled, inlined
+from shared.kit.cores import usable_cores
 
 Array = NDArray[np.float32]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from service.learning.modules import Parameters, Sample
 from service.learning.softmax_means import Array
-from shared.compiled import compiled, inlined
+from shared.kit.compiled import compiled, inlined
 
 _BETA1, _BETA2, _EPS = 0.9, 0.999, 1e-8
 

@@ -34,7 +34,7 @@ from collections.abc import Mapping
 from math import exp
 from typing import Any, NamedTuple
 
-from shared.bounded import BoundedDict
+from shared.kit.bounded import BoundedDict
 
 # Share of the weight at each decision: an adviser that improves after a bad time is back in some ten decisions.
 _SHARE = 0.01

@@ -19,7 +19,7 @@ from service.live.fleet_watch import FleetWatch, Watched
 from service.live.recent_decisions import RecentDecisions
 from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
-from shared.schemas import DecideResponse, Outcome, UavState
+from shared.wire.schemas import DecideResponse, Outcome, UavState
 
 log = logging.getLogger(__name__)
 

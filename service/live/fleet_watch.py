@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from service.mission.mission import Mission
-from shared.bounded import BoundedDict
-from shared.channel import FloatArray
-from shared.features import overflow_probability
-from shared.fleetplan import FleetBelief
-from shared.scenario import Scenario
-from shared.schemas import UavState
+from shared.belief.fleet_belief import FleetBelief
+from shared.features.augmented_state import overflow_probability
+from shared.kit.bounded import BoundedDict
+from shared.wire.schemas import UavState
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
 
 # Missions that are watched, and the steps that are remembered of each.
 _MOST_MISSIONS = 1000

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.prompting.prompt import Prompt
-from shared.schemas import DecideResponse, Outcome
+from shared.wire.schemas import DecideResponse, Outcome
 
 _MOST = 600
 # Characters of the prompts without their static blocks, which a mission's prompts share.

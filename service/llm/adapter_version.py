@@ -1,4 +1,4 @@
-"""The embedded LLM's adapters: a file of ``aicvds distill`` for decisions, one of ``aicvds distill-orders`` for notes.
+"""The embedded LLM's adapters: one for decisions (``lab distill``), one for operators' notes (``lab distill-orders``).
 
 Each is bound to one version of the prompt that it was trained on.
 """
@@ -23,9 +23,9 @@ class Version(NamedTuple):
 PROMPT_VERSION = 3
 # The sensors of each prompt in training: the service's default ``top_k``.
 TRAINED_ROWS = 5
-DECISIONS = Version("aicvds.prompt_version", PROMPT_VERSION, "AICVDS_LLM_ADAPTER", "aicvds distill")
+DECISIONS = Version("aicvds.prompt_version", PROMPT_VERSION, "AICVDS_LLM_ADAPTER", "python -m lab distill")
 # The version of the form in which the adapter reads notes and writes orders.
-ORDERS = Version("aicvds.orders_version", 1, "AICVDS_LLM_ORDERS", "aicvds distill-orders")
+ORDERS = Version("aicvds.orders_version", 1, "AICVDS_LLM_ORDERS", "python -m lab distill-orders")
 _UINT32 = 4
 # The metadata comes first in the file.
 _METADATA_BYTES = 4096

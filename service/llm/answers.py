@@ -7,8 +7,8 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from shared.actions import Action
-from shared.reasons import Reason
+from shared.wire.reasons import Reason
+from shared.world.actions import Action
 
 _TWO_INTEGERS = re.compile(r"([0-9]{1,5}) ([0-9]{1,2})")
 

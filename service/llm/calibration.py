@@ -15,7 +15,7 @@ import logging
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
 from service.llm.answers import Completion, NoDecision
-from shared.bounded import BoundedDict
+from shared.kit.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 

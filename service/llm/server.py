@@ -30,8 +30,8 @@ from service.llm.request_bodies import (
     warm_up_body,
 )
 from service.llm.usability import Usability
-from shared.reasons import Reason
-from shared.schemas import Readiness
+from shared.wire.reasons import Reason
+from shared.wire.schemas import Readiness
 
 if TYPE_CHECKING:
     from service.llm.client import LLMClient

@@ -19,9 +19,9 @@ from service.llm.answers import Completion, NoDecision
 from service.llm.embedded import Embed, embedded
 from service.llm.request_bodies import Rewriting, WarmUp
 from service.llm.server import EARLIER_CALL_ANSWERED, LlmServer
-from shared.reasons import LLM_FAILURES
-from shared.rendezvous import weight
-from shared.schemas import Readiness
+from shared.kit.rendezvous import weight
+from shared.wire.reasons import LLM_FAILURES
+from shared.wire.schemas import Readiness
 
 Answer = Coroutine[Any, Any, Completion]
 Call = Callable[[LlmServer], Answer]

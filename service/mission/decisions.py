@@ -9,9 +9,9 @@ from typing import Any, Literal, NamedTuple
 from service.errors import Conflict, NotFound, Refused
 from service.learning.modules import Sample
 from service.prompting.row_formats import Cells
-from shared.bounded import BoundedDict
-from shared.scenario import Scenario
-from shared.schemas import Outcome
+from shared.kit.bounded import BoundedDict
+from shared.wire.schemas import Outcome
+from shared.world.scenario import Scenario
 
 # UAVs of one fleet may be this many steps apart.
 MAX_STEPS_APART = 64

@@ -9,7 +9,7 @@ from service.learning.trust import Advice
 from service.mission.decisions import Pending
 from service.mission.idempotency import Answered
 from service.mission.sensor_readings import Reading
-from shared.schemas import Outcome, UavState
+from shared.wire.schemas import Outcome, UavState
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.errors import Refused, Unavailable
-from shared.bounded import BoundedDict
+from shared.kit.bounded import BoundedDict
 
 # JSON escapes quotes within a text, so only the field's name matches.
 _DECISION_FIELD = '"decision_id":'

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from shared.fleetplan import FleetBelief
-from shared.missions import LearnedWorld
+from shared.belief.fleet_belief import FleetBelief
+from shared.wire.missions import LearnedWorld
 
 # A sensor whose measurements are on the mean within this of the formula is not named, dB.
 _TOLD_DB = 1.0

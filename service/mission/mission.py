@@ -26,15 +26,15 @@ from service.mission.resolved_spec import ResolvedSpec
 from service.mission.sensor_readings import Reading, Readings
 from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
-from shared.actions import Action
-from shared.fleetplan import FleetBelief
-from shared.fleetplan.gain_measurements import Measured
-from shared.guidance import Guidance, GuidanceAnswer
-from shared.missions import VisitDeadline
-from shared.readings import ReadingResult, SensorReading
-from shared.records import Records, take_report
-from shared.scenario import Scenario, scenario_named
-from shared.schemas import Belief, Features, MissionSpec, Mode, Outcome, UavState
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.gain_measurements import Measured
+from shared.belief.records import Records, take_report
+from shared.planning.orders import Guidance, GuidanceAnswer
+from shared.wire.missions import VisitDeadline
+from shared.wire.readings import ReadingResult, SensorReading
+from shared.wire.schemas import Belief, Features, MissionSpec, Mode, Outcome, UavState
+from shared.world.actions import Action
+from shared.world.scenario import Scenario, scenario_named
 
 log = logging.getLogger(__name__)
 

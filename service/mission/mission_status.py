@@ -6,7 +6,7 @@ import numpy as np
 
 from service.mission.learned_world_status import learned_world
 from service.mission.mission import Mission
-from shared.missions import MissionStatus
+from shared.wire.missions import MissionStatus
 
 
 def status_of(mission: Mission) -> MissionStatus:

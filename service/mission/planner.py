@@ -7,9 +7,11 @@ import logging
 from collections.abc import Collection
 from concurrent.futures import Executor
 
-from shared.fleetplan import Draft, FleetBelief, Found, RecedingHorizon
-from shared.guidance import Guidance
-from shared.scenario import Scenario
+from shared.belief.fleet_belief import FleetBelief
+from shared.planning.fleet_problem import Found
+from shared.planning.orders import Guidance
+from shared.planning.receding import Draft, RecedingHorizon
+from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from service.prompting.experiences import NEAREST
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import note_block
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 
 
 def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Template:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from service.errors import Incomplete, Refused
 from service.mission.decisions import MAX_STEPS_APART, PendingDecisions
-from shared.channel import FloatArray
-from shared.features import arrays_of
-from shared.fleetplan import FleetBelief
-from shared.scenario import Scenario
-from shared.schemas import SensorColumns, UavState
+from shared.belief.fleet_belief import FleetBelief
+from shared.wire.schemas import SensorColumns, UavState
+from shared.wire.sensor_arrays import arrays_of
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
 
 AnyReport = TypeVar("AnyReport", bound=UavState)
 

@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import Field
 
 from service.config.settings import Settings
-from shared.schemas import LLM_MODES, Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
+from shared.wire.schemas import LLM_MODES, Belief, Features, MissionSpec, Mode, PromptFormat, PromptStyle, Selection
 
 
 class ResolvedPromptStyle(PromptStyle):

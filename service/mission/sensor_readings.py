@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.errors import Refused
-from shared.fleetplan import FleetBelief
-from shared.readings import ReadingResult, SensorReading
-from shared.records import Records, take_readings
-from shared.scenario import Scenario
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.records import Records, take_readings
+from shared.wire.readings import ReadingResult, SensorReading
+from shared.world.scenario import Scenario
 
 
 class Reading(NamedTuple):

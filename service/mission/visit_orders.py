@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from shared.guidance import Guidance
-from shared.missions import VisitDeadline
-from shared.visit_deadlines import judged
+from shared.planning.orders import Guidance
+from shared.planning.visit_deadlines import judged
+from shared.wire.missions import VisitDeadline
 
 # Ended orders that are remembered.
 _MOST_ENDED = 100

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import structlog
 from structlog.typing import Processor
 
-from shared.schemas import DecideResponse
+from shared.wire.schemas import DecideResponse
 
 log = logging.getLogger(__name__)
 

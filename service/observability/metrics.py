@@ -11,9 +11,9 @@ from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
 
 from service.observability.array_histogram import ArrayHistogram
-from shared.fleetplan.gain_measurements import Measured
-from shared.readings import ReadingResult
-from shared.schemas import DecideResponse
+from shared.belief.gain_measurements import Measured
+from shared.wire.readings import ReadingResult
+from shared.wire.schemas import DecideResponse
 
 _DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
 _OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)

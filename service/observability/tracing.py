@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.config.settings import Settings
-from shared.reasons import LLM_FAILURES
-from shared.schemas import DecideResponse
+from shared.wire.reasons import LLM_FAILURES
+from shared.wire.schemas import DecideResponse
 
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider

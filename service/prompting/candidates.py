@@ -16,9 +16,9 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from shared.actions import Action
-from shared.features import Reach, State
-from shared.fleetplan import FleetBelief
+from shared.belief.fleet_belief import FleetBelief
+from shared.features.augmented_state import Reach, State
+from shared.world.actions import Action
 
 # OpenAI and vLLM return the probabilities of at most 20 tokens.
 _MOST_LABELS = 20

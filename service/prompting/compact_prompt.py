@@ -23,11 +23,11 @@ from numpy.typing import ArrayLike, NDArray
 from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.row_formats import UNKNOWN, Cells
-from shared.actions import Action
-from shared.channel import FloatArray
-from shared.features import Reach, State
-from shared.learned_channel import LIKELY, ExpectedLinks
-from shared.scenario import Scenario
+from shared.belief.learned_channel import LIKELY, ExpectedLinks
+from shared.features.augmented_state import Reach, State
+from shared.world.actions import Action
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
 
 STATIC = "Collect packets. Answer with one letter."
 # A sensor's sign: the one at its ID, modulo their number. Between digits each is one token of the embedded model.

@@ -1,7 +1,7 @@
 """Worked examples for the static block: decisions of training worlds, each with a teacher's answer.
 
 The file has the edge's knowledge at each decision, not text. So one file serves every prompt format, feature preset and
-k: a mission shows each example in the format of its own rows. ``aicvds demonstrate`` makes the file.
+k: a mission shows each example in the format of its own rows. ``python -m lab demonstrate`` makes the file.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 
 from service.learning.modules import Weights, top_k
 from service.prompting.row_formats import Cells, cells
-from shared.features import State, augment
-from shared.scenario import Scenario
-from shared.schemas import Features, MissionSpec, SensorId, Step, UavState, Wire
+from shared.features.augmented_state import State, augment
+from shared.wire.schemas import Features, MissionSpec, SensorId, Step, UavState, Wire
+from shared.world.scenario import Scenario
 
 PACKAGED = "demonstrations.json"
 

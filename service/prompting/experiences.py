@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.schemas import Selection
+from shared.wire.schemas import Selection
 
 # Experiences to select from: three missions of the paper's length.
 _REMEMBERED = 270

@@ -10,9 +10,9 @@ from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt, note_block
 from service.prompting.row_formats import FORMATS, Cells, cells
 from service.prompting.token_accounting import UnprunedState
-from shared.actions import Action
-from shared.features import Reach, State
-from shared.scenario import Scenario
+from shared.features.augmented_state import Reach, State
+from shared.world.actions import Action
+from shared.world.scenario import Scenario
 
 _STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
 At each waypoint you choose{each} one sensor to collect from and the velocity for the next {step_s:g} seconds.

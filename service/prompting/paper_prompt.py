@@ -8,10 +8,10 @@ from service.prompting.demonstrations import Solved
 from service.prompting.prompt import Prompt, note_block
 from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
 from service.prompting.token_accounting import UnprunedState
-from shared.actions import Action
-from shared.features import State
-from shared.scenario import Scenario
-from shared.schemas import Features, PromptStyle
+from shared.features.augmented_state import State
+from shared.wire.schemas import Features, PromptStyle
+from shared.world.actions import Action
+from shared.world.scenario import Scenario
 
 _STATIC = """You direct a fleet of UAVs that collect data packets from ground sensors along a pipeline. \
 At each waypoint you choose one sensor to collect from and the velocity for the next {step_s:g} seconds.

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.features import State
-from shared.schemas import Features, PromptFormat
+from shared.features.augmented_state import State
+from shared.wire.schemas import Features, PromptFormat
 
 # The text of each column, by name: a whole number or UNKNOWN.
 Cells = Mapping[str, str]

@@ -1,12 +1,12 @@
-"""What the tokens of many rows depend on, compiled by numba as :mod:`shared.kriging` is."""
+"""What the tokens of many rows depend on, compiled by numba as :mod:`shared.belief.kriging` is."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, IntArray
-from shared.compiled import compiled
+from shared.kit.compiled import compiled
+from shared.world.channel import FloatArray, IntArray
 
 
 @compiled

@@ -23,8 +23,8 @@ from service.llm.answers import Completion
 from service.prompting.row_formats import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
 from service.prompting.row_kinds import count_kinds
 from service.prompting.tokenizer import ENCODING, encoding
-from shared.features import State
-from shared.schemas import Tokens
+from shared.features.augmented_state import State
+from shared.wire.schemas import Tokens
 
 if TYPE_CHECKING:
     from service.prompting.prompt import Prompt

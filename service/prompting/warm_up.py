@@ -7,7 +7,7 @@ from service.llm.request_bodies import WarmUp
 from service.prompting.compact_prompt import CompactTemplate
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
-from shared.scenario import SCENARIOS
+from shared.world.scenario import SCENARIOS
 
 
 def warm_up(settings: Settings) -> WarmUp:

@@ -11,7 +11,7 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol, RequestResponseCycle
 
-from shared.problem import Problem
+from shared.wire.problem import Problem
 
 log = logging.getLogger(__name__)
 

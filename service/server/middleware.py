@@ -15,7 +15,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.problem import Problem
+from shared.wire.problem import Problem
 
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",

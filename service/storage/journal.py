@@ -21,7 +21,7 @@ from service.storage.group_commit import GroupCommit
 from service.storage.operations import Checkpoint, Deleted, Entry, Made
 from service.storage.rows import pack
 from service.storage.store import Store
-from shared.bounded import BoundedDict
+from shared.kit.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 

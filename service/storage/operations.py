@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
-from shared.schemas import MissionSpec
+from shared.wire.schemas import MissionSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from service.mission.idempotency import Answered
 from service.mission.sensor_readings import Reading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, leases, missions
-from shared.schemas import Outcome, SensorColumns, UavState
+from shared.wire.schemas import Outcome, SensorColumns, UavState
 
 # The first size of a packer's buffer, which grows as it must.
 PACK_BYTES = 4096

@@ -24,7 +24,7 @@ from service.storage.schema import SCHEMA, checkpoints, journal, missions
 from service.storage.sqlite_process import BUSY_MS, PRAGMAS
 from service.storage.thread_writer import ThreadWriter
 from service.storage.writer import Writer
-from shared.schemas import MissionSpec
+from shared.wire.schemas import MissionSpec
 
 # Time limits of PostgreSQL: to connect; for a statement, and for a network without an answer; for an edge that is
 # paused, or cut off, in the midst of a transaction, which keeps its leases from other edges.

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 from tyro.conf import arg
 
-from simulator.cli.options import check_between, check_seed, chosen_site
-from simulator.cli.running import command_main
-from simulator.flying.clairvoyant_bound import clairvoyant, confirmed
+from simulator.bound.clairvoyant_bound import clairvoyant, confirmed
+from simulator.commands.options import check_between, check_seed, chosen_site
+from simulator.commands.running import command_main
 from simulator.records.record import Record
 from simulator.records.run_folder import naming_out
 
 # The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
-    from shared.fleetplan import News
+    from simulator.bound.solver import News
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _run(options: BoundOptions, console: Console) -> int:
         with naming_out(options.out):
             options.out.parent.mkdir(parents=True, exist_ok=True)
             options.out.touch()
-    from shared.fleetplan import Interrupted
+    from simulator.bound.solver import Interrupted
     from simulator.flying.rollout import rollout
     from simulator.policies.registry import policy_named
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from simulator.cli.running import command_main
+from simulator.commands.running import command_main
 from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
 

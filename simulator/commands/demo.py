@@ -11,10 +11,11 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
-from simulator.cli.options import check_between, check_seed, check_wait, chosen_site
-from simulator.cli.running import command_main
+from simulator.commands.options import check_between, check_seed, check_wait, chosen_site
+from simulator.commands.running import command_main
+from simulator.flying.job import BOUND_S, Job, new_mission_id
 from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
-from simulator.flying.run import BOUND_S, Job, conduct, new_mission_id
+from simulator.flying.run import conduct
 from simulator.records.run_folder import REPORT, fresh_folder, refuse_old_result
 
 EDGE_LOG = "edge.log"

@@ -12,10 +12,11 @@ from typing import Annotated, Any
 from rich.console import Console
 from tyro.conf import arg
 
-from shared.schemas import DecideRequest, MissionSpec, Mode
-from simulator.cli.options import check_mission, check_note, check_seed, checked_edge, chosen_site
-from simulator.cli.running import command_main
-from simulator.flying.run import API_KEY, new_mission_id
+from shared.client.edge_client import API_KEY
+from shared.wire.schemas import DecideRequest, MissionSpec, Mode
+from simulator.commands.options import check_mission, check_note, check_seed, checked_edge, chosen_site
+from simulator.commands.running import command_main
+from simulator.flying.job import new_mission_id
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,8 @@ def create(options: Create, console: Console) -> int:
     check_mission(options.mission)
     check_note(options.note)
     site = chosen_site(options.scenario, options.world, options.steps)
-    from simulator.client import EdgeClient
-    from simulator.client.observation_report import decide_request
+    from shared.client.edge_client import EdgeClient
+    from simulator.world.observation_report import decide_request
 
     mission_id = options.mission or new_mission_id(site.scenario, options.seed)
     spec = MissionSpec(scenario=site.scenario, mode=options.mode, seed=options.seed, note=options.note)

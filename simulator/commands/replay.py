@@ -16,12 +16,15 @@ from rich.console import Console
 from rich.progress import track
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from shared.schemas import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
-from simulator.cli.options import check_deadline, check_wait, checked_edge
-from simulator.cli.running import INTERRUPTED, command_main
-from simulator.client import EdgeClient, Exchange
-from simulator.errors import EdgeError, UsageError
-from simulator.flying.run import API_KEY, DEFAULT_TIMEOUT_S, NETWORK_SLACK_S, await_edge, new_mission_id
+from shared.client.edge_client import API_KEY, EdgeClient
+from shared.client.errors import EdgeError
+from shared.client.retries_and_redirects import Exchange
+from shared.wire.schemas import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
+from simulator.commands.options import check_deadline, check_wait, checked_edge
+from simulator.commands.running import command_main
+from simulator.errors import INTERRUPTED, UsageError
+from simulator.flying.edge_session import DEFAULT_TIMEOUT_S, NETWORK_SLACK_S, await_edge
+from simulator.flying.job import new_mission_id
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
 from simulator.records.request_log import read_requests
@@ -254,7 +257,7 @@ def _replay_all(replayer: Replayer, logged: Logged, out: Path, console: Console)
 
 
 def _decision(flown: Decision, exchange: Exchange) -> Decision:
-    from simulator.flying.flight import exchange_fields
+    from simulator.records.flight import exchange_fields
 
     answer = exchange.response
     return Decision(

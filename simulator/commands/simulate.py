@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
-from shared.schemas import Mode, Uplink
-from simulator.cli.options import (
+from shared.wire.schemas import Mode, Uplink
+from simulator.commands.options import (
     check_between,
     check_deadline,
     check_mission,
@@ -22,9 +22,10 @@ from simulator.cli.options import (
     checked_edge,
     chosen_site,
 )
-from simulator.cli.running import INTERRUPTED, command_main
-from simulator.errors import UsageError
-from simulator.flying.run import BOUND_S, Job, conduct, new_mission_id
+from simulator.commands.running import command_main
+from simulator.errors import INTERRUPTED, UsageError
+from simulator.flying.job import BOUND_S, Job, new_mission_id
+from simulator.flying.run import conduct
 from simulator.records.run_folder import refuse_old_result
 
 
@@ -79,7 +80,7 @@ class Simulate:
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
     (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a planner, extra `planner`),
-    mpc_formula (the same without learning), madqn or mappo (trained networks, extra `marl`)."""
+    mpc_formula (the same without learning), madqn or mappo (trained networks, extra `service`)."""
     mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None
     """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or
     policy (the planner). Default: the edge's."""

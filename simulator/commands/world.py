@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from simulator.cli.running import command_main
+from simulator.commands.running import command_main
 from simulator.errors import UsageError
 
 

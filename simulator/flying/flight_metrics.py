@@ -16,8 +16,8 @@ from prometheus_client.process_collector import ProcessCollector
 from simulator.errors import UsageError
 
 if TYPE_CHECKING:
-    from simulator.flying.flight import Flight
     from simulator.flying.pilots import Choice
+    from simulator.records.flight import Flight
 
 LONGEST_LAST_SCRAPE_S = 20.0
 _ROUND_TRIP_BUCKETS = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)

@@ -9,7 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from simulator.errors import EdgeError, UsageError
+from shared.client.errors import EdgeError
+from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
 
 STOP_S = 10.0
@@ -29,7 +30,7 @@ def edge_process(
 
     ``environment`` has its settings; ``None`` inherits this process's environment. ``options`` are of ``aicvds serve``.
     """
-    command = [sys.executable, "-m", "shared.cli", "serve", "--host", HOST, "--port", str(port), *options]
+    command = [sys.executable, "-m", "shared.kit.command_line", "serve", "--host", HOST, "--port", str(port), *options]
     with naming_out(log.parent):
         output = log.open("wb")
     with output:

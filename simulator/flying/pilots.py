@@ -7,15 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from shared.scenario import Scenario
-from shared.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
-from simulator.client import EdgeClient, Exchange
-from simulator.client.observation_report import decide_request
-from simulator.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from shared.client.edge_client import EdgeClient
+from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from shared.client.retries_and_redirects import Exchange
+from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
+from shared.world.scenario import Scenario
 from simulator.policies.policy import Learner, Policy
 from simulator.policies.registry import policy_named
 from simulator.records.decision import DecidedBy
-from simulator.world import Observation
+from simulator.world.observation import Observation
+from simulator.world.observation_report import decide_request
 
 FALLBACK = "eof"
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from simulator.policies.policy import Learner, Policy
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
-from simulator.world import PipelineWorld, StepTally
+from simulator.world.environment import PipelineWorld
+from simulator.world.observation import StepTally
 
 BASELINES = ("eof", "wqcs")
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
-# Torch takes seconds to import, and is not installed without the extra `marl`.
+# Torch takes seconds to import, and is not installed without the extra `service`.
 if TYPE_CHECKING:
     from torch import nn
 
 
 class Learned:
-    """The greedy policy of a network trained by `aicvds train`; it draws no random number.
+    """The greedy policy of a network trained by `python -m lab train`; it draws no random number.
 
-    Its input is :func:`simulator.marl.observation.view` of the UAV's observation. It chooses among the free sensors
-    heard at least once, or among all free sensors if there is none.
+    Its input is :func:`simulator.policies.network_inputs.view` of the UAV's observation. It chooses among the free
+    sensors heard at least once, or among all free sensors if there is none.
 
     Args:
         scheme: ``madqn`` or ``mappo``.
@@ -33,11 +33,11 @@ class Learned:
 
     def __init__(self, scheme: str, checkpoint: Path | None = None) -> None:
         try:
-            from simulator.marl.checkpoint import Checkpoint, shipped
+            from simulator.policies.checkpoint import Checkpoint, shipped
         except ModuleNotFoundError as missing:
             raise UsageError(
                 f"policy {scheme} needs {missing.name}, which is not installed. "
-                "Install the extra: pip install 'aic-vds[marl]'"
+                "Install the extra: pip install 'aic-vds[service]'"
             ) from None
         self._checkpoint = shipped(scheme) if checkpoint is None else Checkpoint.load(checkpoint)
         self._network: nn.Module
@@ -49,8 +49,8 @@ class Learned:
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
-        from simulator.marl.networks import greedy
-        from simulator.marl.observation import taken_by, view, without
+        from simulator.policies.network_inputs import taken_by, view, without
+        from simulator.policies.networks import greedy
 
         own = view(self._scenario, uav, observation)
         mask = without(own, taken_by(taken, self._scenario.sensors))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 from simulator.policies.reach import best_in_reach, cruise_velocity
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 
 class MaximumGain:

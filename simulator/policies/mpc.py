@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.actions import Action
-from shared.fleetplan import Draft, FleetBelief
-from shared.fleetplan import RecedingHorizon as Planner
-from shared.scenario import Scenario
+from shared.belief.fleet_belief import FleetBelief
+from shared.planning.receding import Draft
+from shared.planning.receding import RecedingHorizon as Planner
+from shared.world.actions import Action
+from shared.world.scenario import Scenario
 from simulator.policies.reach import longest_silent
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 
 class RecedingHorizon:
-    """The planner of :mod:`shared.fleetplan.receding`; every decision of a UAV plans for the whole fleet again.
+    """The planner of :mod:`shared.planning.receding`; every decision of a UAV plans for the whole fleet again.
 
     Each decision adds the UAV's observation to the fleet's belief, and its action is fixed in the later plans.
     """

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from shared.channel import FloatArray, IntArray
-from shared.drift import Drift
-from shared.fleetplan import FleetBelief
-from shared.fleetplan.arrivals import Arrivals
-from shared.fleetplan.gain_measurements import NOTHING_MEASURED, Measured
-from shared.scenario import Scenario
-from shared.trajectory import Trajectory
+from shared.belief.arrivals import Arrivals
+from shared.belief.drift import Drift
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.gain_measurements import NOTHING_MEASURED, Measured
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import Scenario
+from shared.world.trajectory import Trajectory
 from simulator.policies.mpc import RecedingHorizon
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 from simulator.policies.reach import cruise_velocity, free_sensors, in_reach
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 
 class NearestNeighbour:

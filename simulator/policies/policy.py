@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol, runtime_checkable
 
-from shared.scenario import Scenario
-from simulator.world import Observation
+from shared.world.scenario import Scenario
+from simulator.world.observation import Observation
 
 
 class Policy(Protocol):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.scenario import Scenario
-from simulator.world import Observation
+from shared.world.scenario import Scenario
+from simulator.world.observation import Observation
 
 
 def cruise_velocity(scenario: Scenario) -> int:

@@ -26,7 +26,7 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "mpc": RecedingHorizon,
     "mpc_formula": FormulaPlanner,
 }
-# They need the extra `marl`, and fly only scenarios of the size of their training.
+# They need torch (extra `service`), and fly only scenarios of the size of their training.
 LEARNED_NAMES = ("madqn", "mappo")
 _POLICIES |= {name: partial(Learned, name) for name in LEARNED_NAMES}
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)

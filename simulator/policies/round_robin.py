@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 from simulator.policies.reach import cruise_velocity, free_sensors
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 
 class RoundRobin:

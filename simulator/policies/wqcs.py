@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.channel import path_loss_db
-from shared.scenario import Scenario
+from shared.world.channel import path_loss_db
+from shared.world.scenario import Scenario
 from simulator.policies.reach import best_in_reach, cruise_velocity
-from simulator.world import Observation
+from simulator.world.observation import Observation
 
 
 class WeightedQueueChannel:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from shared.reasons import LLM_FAILURES
-from shared.schemas import Candidate, Tokens
+from shared.wire.reasons import LLM_FAILURES
+from shared.wire.schemas import Candidate, Tokens
 from simulator.records.record import Record
 
 DecidedBy = Literal["llm", "guided", "value", "policy", "onboard"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from shared.missions import VisitDeadline
-from shared.visit_deadlines import judged
+from shared.planning.visit_deadlines import judged
+from shared.wire.missions import VisitDeadline
 from simulator.records.decision import Decision
 from simulator.records.record import Record
 

@@ -13,8 +13,8 @@ from typing import IO, Self
 
 from pydantic import TypeAdapter
 
-from shared.missions import MissionStatus
-from shared.schemas import DecideRequest, MissionSpec
+from shared.wire.missions import MissionStatus
+from shared.wire.schemas import DecideRequest, MissionSpec
 from simulator.records.json_lines import read_lines
 
 _LINE: TypeAdapter[MissionSpec | DecideRequest] = TypeAdapter(MissionSpec | DecideRequest)

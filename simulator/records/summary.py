@@ -9,7 +9,7 @@ from typing import Protocol
 
 from pydantic import Field
 
-from shared.schemas import Tokens, Uplink
+from shared.wire.schemas import Tokens, Uplink
 from simulator.records.decision import Decision, queried_llm
 from simulator.records.operator import Operator
 from simulator.records.real_uavs import RealUavs

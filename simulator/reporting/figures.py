@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from shared.scenario import Scenario
-from shared.trajectory import trajectories
+from shared.world.scenario import Scenario
+from shared.world.trajectory import trajectories
 from simulator.records.decision import Decision
 from simulator.records.statistics import visits_per_sensor
 from simulator.records.summary import Tally

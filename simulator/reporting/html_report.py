@@ -9,7 +9,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 from simulator.policies.reach import cruise_velocity
 from simulator.records.decision import Decision
 from simulator.records.run_folder import FIGURES

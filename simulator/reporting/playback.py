@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from shared.scenario import Scenario
-from shared.trajectory import trajectories
+from shared.world.scenario import Scenario
+from shared.world.trajectory import trajectories
 from simulator.records.decision import Decision
 from simulator.records.track import Instant
 

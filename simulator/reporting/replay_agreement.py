@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from shared.schemas import MissionSpec
+from shared.wire.schemas import MissionSpec
 from simulator.records.decision import Decision, queried_llm
 from simulator.records.record import Record
 from simulator.records.statistics import mean

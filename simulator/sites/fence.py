@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray
-from shared.scenario import Point
+from shared.world.channel import FloatArray
+from shared.world.scenario import Point
 
 FenceRole = Literal["fence", "no_fly"]
 # What is this near to a boundary touches it, metres: a world's places are rounded to a millimetre.

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 
 # The world takes a second to import, and pyproj a tenth: commands answer `--help` and bad use without them.
 if TYPE_CHECKING:
-    from shared.channel import IntArray
+    from shared.world.channel import IntArray
     from simulator.sites.fence import Fence
     from simulator.sites.files.projection import Frame
-    from simulator.world import Cost, PipelineWorld
+    from simulator.world.environment import PipelineWorld
     from simulator.world.gain_trace import GainTrace
+    from simulator.world.observation import Cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ class Site:
 
     def world(self, cost: Cost = "default", render_mode: str | None = None) -> PipelineWorld:
         """A new world on this site."""
-        from simulator.world import PipelineWorld
+        from simulator.world.environment import PipelineWorld
 
         return PipelineWorld(
             self.scenario, arrivals=self.arrivals, gains=self.gains, cost=cost, render_mode=render_mode

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.channel import IntArray
-from shared.scenario import Scenario
+from shared.world.channel import IntArray
+from shared.world.scenario import Scenario
 
 
 def checked_actions(actions: Mapping[str, ArrayLike], agents: Mapping[str, int], scenario: Scenario) -> IntArray:

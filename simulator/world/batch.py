@@ -9,11 +9,11 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.channel import FloatArray, IntArray
-from shared.scenario import SCENARIOS, Scenario
-from simulator.world import Cost
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
+from simulator.world.observation import Cost
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth
 

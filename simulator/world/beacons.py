@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.channel import FloatArray, IntArray, Links
+from shared.world.channel import FloatArray, IntArray, Links
 from simulator.world.sensors import Sensors
 
 

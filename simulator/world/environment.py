@@ -3,68 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, TypedDict
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
-from shared.channel import FloatArray, IntArray, Links
-from shared.scenario import SCENARIOS, Scenario
-from shared.trajectory import trajectories
+from shared.world.channel import FloatArray, IntArray, Links
+from shared.world.scenario import SCENARIOS, Scenario
+from shared.world.trajectory import trajectories
 from simulator.world.actions import checked_actions
 from simulator.world.beacons import Beacons
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
+from simulator.world.observation import Cost, Info, Observation, StepTally
 from simulator.world.observation_space import observation_space
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth
-
-Cost = Literal["default", "paper"]
-
-
-class Observation(TypedDict):
-    """The observation of one UAV; shapes and units are in :class:`PipelineWorld`."""
-
-    step: IntArray
-    position: FloatArray
-    progress: FloatArray
-    sensor_position: FloatArray
-    queue: FloatArray
-    battery: FloatArray
-    channel_gain: FloatArray
-    last_heard: IntArray
-
-
-class Info(TypedDict):
-    """The outcome of one UAV's last action; see :class:`PipelineWorld`."""
-
-    action_mask: NDArray[np.int8]
-    failed: bool
-    collected: int
-    lost_packets: int
-    cost: float
-
-
-@dataclass(frozen=True, eq=False)
-class StepTally:
-    """One step of the whole fleet: the two losses of Eq. 5, the packets lost, and those collected.
-
-    ``failures`` is the sum of f over UAVs, ``overflows`` the sum of g over sensors, ``collected`` has shape ``(J,)``.
-    """
-
-    step: int
-    failures: int
-    overflows: int
-    lost_packets: int
-    collected: IntArray
-
-    @property
-    def events(self) -> int:
-        """Eq. 5's loss of the step: failed transmissions plus overflowing sensors."""
-        return self.failures + self.overflows
 
 
 class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]
@@ -111,7 +67,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
 
     ## What the model leaves out
     An edge plans with the mean path loss, steady rates and ``velocity x step_s``. The fields of
-    :class:`shared.unmodelled.Unmodelled`, all off by default, make a world differ from that:
+    :class:`shared.world.unmodelled.Unmodelled`, all off by default, make a world differ from that:
 
     - **Links.** The path loss is ``mean + own_j + way_j(x, y) + fade_ijt + trace_ij``, within 0..400 dB. The normal
       ``own_j`` is a sensor's own (``shadowing_db``). ``way_j`` is a Gaussian random field over the UAVs' places with

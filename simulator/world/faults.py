@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.channel import FloatArray, IntArray
-from shared.scenario import Scenario
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import Scenario
 
 
 @dataclass(frozen=True, eq=False)

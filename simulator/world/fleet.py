@@ -8,9 +8,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.channel import FloatArray
-from shared.scenario import Scenario
-from shared.trajectory import Trajectory, trajectories
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
+from shared.world.trajectory import Trajectory, trajectories
 
 
 class Fleet:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.channel import FloatArray
-from shared.trajectory import Trajectory
+from shared.world.channel import FloatArray
+from shared.world.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

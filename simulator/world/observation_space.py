@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
-from shared.channel import path_loss_db
-from shared.scenario import Scenario
-from shared.trajectory import Trajectory
+from shared.world.channel import path_loss_db
+from shared.world.scenario import Scenario
+from shared.world.trajectory import Trajectory
 from simulator.world.true_channel import LOSS_BOUNDS_DB, mean_only
 from simulator.world.truth import LARGEST_ERROR
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from simulator.world import PipelineWorld
+    from simulator.world.environment import PipelineWorld
 
 
 def render_map(world: PipelineWorld) -> NDArray[np.uint8]:

@@ -8,8 +8,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from shared.channel import FloatArray, IntArray, Links
-from shared.scenario import Scenario
+from shared.world.channel import FloatArray, IntArray, Links
+from shared.world.scenario import Scenario
 
 
 class Streams(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from shared.channel import FloatArray
+from shared.world.channel import FloatArray
 
 
 @dataclass(frozen=True)

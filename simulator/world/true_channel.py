@@ -8,9 +8,9 @@ from typing import Self
 
 import numpy as np
 
-from shared.channel import FloatArray, Links
-from shared.scenario import Scenario
-from shared.trajectory import Trajectory, trajectories
+from shared.world.channel import FloatArray, Links
+from shared.world.scenario import Scenario
+from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.faults import Faults
 from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Streams

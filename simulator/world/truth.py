@@ -8,8 +8,8 @@ from typing import Self
 
 import numpy as np
 
-from shared.channel import FloatArray
-from shared.scenario import Scenario
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
 from simulator.world.faults import Faults
 from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Streams

@@ -9,9 +9,9 @@ from typing import Self
 
 import numpy as np
 
-from shared.channel import FloatArray, IntArray
-from shared.scenario import Scenario
-from shared.trajectory import Trajectory
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import Scenario
+from shared.world.trajectory import Trajectory
 from simulator.world.step_noise import StepNoise
 
 # Half of the chord, in metres, whose direction is that of the way.

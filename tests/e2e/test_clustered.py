@@ -14,7 +14,7 @@ import pytest
 from tests.e2e.processes import output_until, run_here, started
 from tests.e2e.shared_out import Report, drained, first_event
 from tests.faults.shared_store import Database
-from tests.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("made_on_decide")]
 

@@ -17,14 +17,14 @@ import httpx
 import pytest
 import tyro
 
-from shared import cli
-from simulator.client import EdgeClient
-from simulator.experiments.catalogue import EXPERIMENTS
+from lab.experiments.catalogue import EXPERIMENTS
+from shared.client.edge_client import EdgeClient
+from shared.kit import command_line as cli
 from tests.e2e.processes import serving_edge
-from tests.simulator.edge_stub import free_port
-from tests.waiting import PATIENCE_S
+from tests.support.edge_stub import free_port
+from tests.support.places import ROOT
+from tests.support.waiting import PATIENCE_S
 
-ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md")), *sorted(ROOT.glob("examples/*/README.md"))]
 EDGE = "http://localhost:8000"
 BIN = ".venv/bin/"
@@ -57,16 +57,16 @@ KEYED = [
 ]
 # Their command lines are parsed and no more; by how they begin.
 PARSED = {
-    "aicvds doctor": "its result is this machine's; tests/service/commands/test_doctor.py runs it",
+    "aicvds doctor": "its result is this machine's; tests/unit/service/commands/test_doctor.py runs it",
     "aicvds serve --ray": "it needs a PostgreSQL; tests/faults/test_ray.py runs it",
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
     "aicvds fly": "it waits for vehicles; tests/simulator/vehicles and tests/e2e/test_fly.py fly it",
-    "aicvds experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
-    "aicvds explore": "minutes; tests/e2e/test_pretrain.py runs it small",
-    "aicvds distill": "an hour; tests/service/distilling/test_distill.py runs it small",
-    "aicvds distill-orders": "an hour; tests/service/distilling/test_distill_orders.py runs it small",
-    "aicvds pretrain": "minutes; tests/e2e/test_pretrain.py runs it small",
-    "aicvds demonstrate": "minutes; tests/e2e/test_pretrain.py runs it small",
+    "python -m lab experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
+    "python -m lab explore": "minutes; tests/e2e/test_pretrain.py runs it small",
+    "python -m lab distill": "an hour; tests/lab/distilling/test_distill.py runs it small",
+    "python -m lab distill-orders": "an hour; tests/lab/distilling/test_distill_orders.py runs it small",
+    "python -m lab pretrain": "minutes; tests/e2e/test_pretrain.py runs it small",
+    "python -m lab demonstrate": "minutes; tests/e2e/test_pretrain.py runs it small",
     "python benchmarks/": "minutes to hours, and they measure",
 }
 # `make --dry-run` finds their targets.
@@ -78,9 +78,9 @@ MADE = {
     "make compose": "it needs a Docker engine; CI runs it",
     "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
-    "make fuzz": "some minutes; tests/service/api/test_fuzz.py is a short one",
+    "make fuzz": "some minutes; tests/unit/service/api/test_fuzz.py is a short one",
     "make soak": "ten minutes",
-    "make docs": "tests/test_docs.py builds the pages",
+    "make docs": "tests/unit/test_docs.py builds the pages",
     "make release": "minutes; it tries what it builds",
 }
 # Programs that this package does not bring.

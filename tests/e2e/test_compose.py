@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import yaml
 
-ROOT = Path(__file__).parents[2]
+from tests.support.places import ROOT
+
 TEXT = (ROOT / "docker-compose.yml").read_text()
 SERVICES = yaml.safe_load(TEXT)["services"]
 LINES = dict(re.findall(r"^#(\w+)=(.*?)(?:  # .*)?$", (ROOT / ".env.example").read_text(), re.MULTILINE))

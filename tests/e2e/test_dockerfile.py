@@ -17,7 +17,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.places import ROOT
+
 SITE = sysconfig.get_path("purelib")
 
 # `-S` leaves the .pth files of site-packages unread. One of them is the editable installation of this checkout, which
@@ -61,7 +62,7 @@ class Absent:
             raise ModuleNotFoundError(f"the image has no module {{name!r}}", name=name)
 
 sys.meta_path.insert(0, Absent({extras!r}))
-from shared.cli import main
+from shared.kit.command_line import main
 sys.exit(main())
 """
 
@@ -87,7 +88,7 @@ def copy(stage: str, folder: Path) -> None:
 def fetch_model(folder: Path) -> subprocess.CompletedProcess[str]:
     """`aicvds model fetch` by the modules in this folder and by no others."""
     return subprocess.run(
-        [sys.executable, "-S", "-m", "shared.cli", "model", "fetch"],
+        [sys.executable, "-S", "-m", "shared.kit.command_line", "model", "fetch"],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join((str(folder), SITE))},
         capture_output=True,

@@ -1,4 +1,4 @@
-"""``aicvds experiment`` as a user starts it: real processes, real edges, kills and interrupts."""
+"""``python -m lab experiment`` as a user starts it: real processes, real edges, kills and interrupts."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from simulator.experiments.catalogue import EXPERIMENTS
-from simulator.experiments.result import Result
-from simulator.experiments.stand_ins import answering, drawn
+from lab.experiments.catalogue import EXPERIMENTS
+from lab.experiments.result import Result
+from lab.experiments.stand_ins import answering, drawn
 from tests.e2e.processes import AICVDS, run, run_here, serving_edge
-from tests.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, until
 
 
 def result_in(out: Path, name: str) -> Result:
@@ -153,7 +153,7 @@ def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:
 
 def test_the_page_is_a_command_of_its_own() -> None:
     shown = run_here("experiment", "page", "--help")
-    assert shown.returncode == 0 and "aicvds experiment page" in shown.stdout
+    assert shown.returncode == 0 and "python -m lab experiment page" in shown.stdout
 
 
 def test_help_comes_without_the_heavy_imports() -> None:
@@ -187,5 +187,5 @@ def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: 
     assert result.model == "SmolLM2-135M-Instruct.Q8_0"
     assert not any("not the LLM's" in note for note in result.notes)
     assert json.loads((tmp_path / "llm-models" / "results.json").read_text())["command"] == (
-        f"aicvds experiment llm-models --steps 1 --seeds 1 --out {tmp_path}"
+        f"python -m lab experiment llm-models --steps 1 --seeds 1 --out {tmp_path}"
     )

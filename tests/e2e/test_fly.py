@@ -11,19 +11,19 @@ from typing import Any
 
 import pytest
 
+from field.vehicles.field_uav import LEAST_SPEED_M_S
 from simulator.commands.replay import logged_mission
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
 from simulator.records.real_uavs import sums_by_uav
 from simulator.records.summary import Summary
 from simulator.sites.plans.plan_folder import export_plans
-from simulator.vehicles.field_uav import LEAST_SPEED_M_S
 from tests.e2e.processes import serving_edge, started
-from tests.simulator.edge_stub import free_port
-from tests.simulator.vehicles.airframe import once
-from tests.simulator.vehicles.pymavlink_peer import SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
-from tests.simulator.vehicles.worlds import mission_in, pipeline_folder, starts_m
-from tests.waiting import PATIENCE_S
+from tests.support.edge_stub import free_port
+from tests.support.waiting import PATIENCE_S
+from tests.unit.field.vehicles.airframe import once
+from tests.unit.field.vehicles.pymavlink_peer import SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
+from tests.unit.field.vehicles.worlds import mission_in, pipeline_folder, starts_m
 
 SEED, STEPS, UAVS = 0, 30, 3
 OUTAGE_S = 20.0

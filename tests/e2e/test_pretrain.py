@@ -5,21 +5,21 @@ from pathlib import Path
 import pytest
 import torch
 
+from lab.exploration.exploration import explore
+from lab.exploration.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
+from lab.training.reward import Reward
+from lab.training.rollout_examples import Batch, Example, replay
+from lab.training.teacher_agreement import recall, references
+from lab.training.training_loop import losses
 from service.learning import initial_weights as checkpoints
 from service.learning.initial_weights import initial_modules, initial_weights, save
 from service.learning.modules import Modules
-from service.training.reward import Reward
-from service.training.rollout_examples import Batch, Example, replay
-from service.training.teacher_agreement import recall, references
-from service.training.training_loop import losses
-from shared.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
-from shared.scenario import SCENARIOS, Scenario
-from shared.schemas import Features
-from simulator.flying.exploration import explore
+from shared.wire.schemas import Features
+from shared.world.scenario import SCENARIOS, Scenario
 from tests.e2e.processes import run, run_here
 
 PAPER = SCENARIOS["paper"]
-# Far past the training worlds that `aicvds explore` records by default.
+# Far past the training worlds that `python -m lab explore` records by default.
 HELD_OUT = range(50_000, 50_004)
 
 

@@ -13,8 +13,8 @@ import pytest
 from service.storage.locks import FileLock, StoreUnusable
 from tests.e2e.processes import output_until, run, run_here, started
 from tests.e2e.shared_out import NAMES, Report, first_event, outlive_a_kill, serving, sockets
-from tests.service.stub_llm import wait_for
-from tests.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, until
+from tests.unit.service.stub_llm import wait_for
 
 pytestmark = pytest.mark.usefixtures("made_on_decide")
 

@@ -25,11 +25,12 @@ from grafana_foundation_sdk.cog.encoder import JSONEncoder
 from grafana_foundation_sdk.models.dashboard import Dashboard
 
 from tests.e2e.processes import serving_edge, started
-from tests.simulator.edge_stub import free_port
+from tests.support.edge_stub import free_port
+from tests.support.places import ROOT
 
 pytestmark = pytest.mark.needs("prometheus")
 
-DOCKER = Path(__file__).parents[2] / "docker"
+DOCKER = ROOT / "docker"
 ALERTS = DOCKER / "alerts.yml"
 BOARD: dict[str, Any] = json.loads((DOCKER / "grafana" / "dashboards" / "aicvds.json").read_text())
 # What an alert must be, so that its number can be asked for whether it fires or not.

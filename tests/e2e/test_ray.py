@@ -14,19 +14,19 @@ from pathlib import Path
 
 import pytest
 
-from shared import executors
-from shared.executors import executor
-from shared.ray_connection import RayUnusable
-from shared.rollouts import read_rollouts
-from shared.scenario import SCENARIOS
-from simulator.commands import explore
-from simulator.experiments.flight import FlightRecord, FlightStore
-from simulator.experiments.result import Result
-from simulator.experiments.runner import FLIGHTS, RESULT
-from simulator.experiments.schemes import local
+from lab.commands import explore
+from lab.experiments.flight import FlightRecord, FlightStore
+from lab.experiments.result import Result
+from lab.experiments.runner import FLIGHTS, RESULT
+from lab.experiments.schemes import local
+from lab.exploration.rollouts import read_rollouts
+from shared.kit import executors
+from shared.kit.executors import executor
+from shared.kit.ray_connection import RayUnusable
+from shared.world.scenario import SCENARIOS
 from simulator.sites.site import Site
-from tests.simulator.experiments.tiny_flights import declared, run_in
-from tests.waiting import PATIENCE_S, until
+from tests.lab.experiments.tiny_flights import declared, run_in
+from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.long
 

@@ -3,20 +3,19 @@
 import json
 import re
 import subprocess
-from pathlib import Path
 
 import httpx
 import pytest
 
 from service.config.settings import Settings
-from shared.guidance import GuidanceStatus
-from shared.reasons import Reason
-from shared.schemas import DecideResponse
+from shared.planning.orders import GuidanceStatus
+from shared.wire.reasons import Reason
+from shared.wire.schemas import DecideResponse
 from tests.conftest import Edge
 from tests.e2e.processes import serving_edge
-from tests.waiting import until
+from tests.support.places import ROOT
+from tests.support.waiting import until
 
-ROOT = Path(__file__).parents[2]
 README, DECIDING, GUIDANCE, OPERATIONS = (
     (ROOT / page).read_text() for page in ("README.md", "docs/deciding.md", "docs/guidance.md", "docs/operations.md")
 )

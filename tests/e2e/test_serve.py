@@ -17,9 +17,9 @@ import httpx
 import pytest
 
 from tests.e2e.processes import output_until, run, run_here, serving_edge, started
-from tests.running import listening
-from tests.service.stub_llm import misbehaving, wait_for
-from tests.waiting import PATIENCE_S, Gate, until
+from tests.support.running import listening
+from tests.support.waiting import PATIENCE_S, Gate, until
+from tests.unit.service.stub_llm import misbehaving, wait_for
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_help_imports_nothing_that_takes_long(words: list[str], without: set[str
     shown = run(*words, PYTHONPROFILEIMPORTTIME="1")
     assert shown.returncode == 0 and shown.stdout
     imported = set(re.findall(r"^import time:.*\| +(\S+)$", shown.stderr, re.MULTILINE))
-    assert "shared.cli" in imported
+    assert "shared.kit.command_line" in imported
     assert not imported & without
 
 

@@ -1,4 +1,4 @@
-"""``aicvds train`` as a user runs it: killed, resumed, misused."""
+"""``python -m lab train`` as a user runs it: killed, resumed, misused."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from simulator.marl.checkpoint import Checkpoint
-from simulator.marl.curve import read_csv
+from lab.marl.curve import read_csv
+from simulator.policies.checkpoint import Checkpoint
 from tests.e2e.processes import run, run_here
-from tests.waiting import until
+from tests.support.waiting import until
 
 EPISODES = ("--episodes", "120")
 # A training that goes no further than its first save.
 STANDS_STILL = """
 import signal, sys
 from simulator.commands import train
-from simulator.marl import training
+from lab.marl import training
 
 save = training.Training.save
 

@@ -12,18 +12,19 @@ from typing import Any
 import httpx
 import pytest
 
-from shared.scenario import SCENARIOS
-from shared.schemas import FeedbackRequest, Uplink
-from simulator.client import EdgeClient
-from simulator.client.lossy_transport import LossyTransport
-from simulator.flying.flight import Flight, fly
+from shared.client.edge_client import EdgeClient
+from shared.wire.schemas import FeedbackRequest, Uplink
+from shared.world.scenario import SCENARIOS
+from simulator.flying.flight import fly
+from simulator.flying.lossy_transport import LossyTransport
 from simulator.flying.pilots import Choice, EdgePilot
+from simulator.records.flight import Flight
 from simulator.sites.site import Site
-from simulator.world import Observation
+from simulator.world.observation import Observation
 from tests.conftest import Edge
 from tests.e2e.processes import output_until, run_here, serving_edge, started
-from tests.simulator.edge_stub import free_port
-from tests.waiting import PATIENCE_S, until
+from tests.support.edge_stub import free_port
+from tests.support.waiting import PATIENCE_S, until
 
 SCENARIO = SCENARIOS["paper"].model_copy(update={"steps": 12})
 

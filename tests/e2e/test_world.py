@@ -13,9 +13,10 @@ import pytest
 from simulator.records.decision_log import read_decisions
 from tests.conftest import Edge
 from tests.e2e.processes import run, run_here
-from tests.simulator.undrawn import reports_undrawn
+from tests.support.places import ROOT
+from tests.support.undrawn import reports_undrawn
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "pipeline_world"
+EXAMPLE = ROOT / "examples" / "pipeline_world"
 
 
 def summary_in(out: Path) -> dict[str, Any]:

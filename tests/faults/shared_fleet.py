@@ -15,7 +15,7 @@ import httpx
 from tests.faults.fleet import Report
 from tests.faults.shared_store import DEADLINE_MS, GIVEN_UP_MS
 from tests.faults.table import Tables
-from tests.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, until
 
 MISSIONS, LEASE_S = 4, 2.0
 # An answer may be so late.

@@ -14,8 +14,8 @@ from pathlib import Path
 import httpx
 
 from tests.e2e.processes import AICVDS
-from tests.simulator.edge_stub import free_port
-from tests.waiting import PATIENCE_S, until
+from tests.support.edge_stub import free_port
+from tests.support.waiting import PATIENCE_S, until
 
 # A UAV's deadline, and when the proxy gives an edge up: an edge answers within the deadline and 50 ms.
 DEADLINE_MS, GIVEN_UP_MS = 3000, 3200

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import subprocess
 from datetime import UTC, datetime
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.places import ROOT
+
 PAGE = ROOT / "docs" / "faults.md"
 
 _INTRODUCTION = """# What goes wrong, and what the edge does

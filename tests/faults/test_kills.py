@@ -23,8 +23,8 @@ from service.storage.store import Store
 from tests.e2e.processes import serving_edge
 from tests.faults.fleet import UAVS, Report
 from tests.faults.table import Tables
-from tests.running import serving
-from tests.service.keeping import writers
+from tests.support.running import serving
+from tests.unit.service.keeping import writers
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(600)]
 

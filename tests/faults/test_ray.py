@@ -20,7 +20,7 @@ from tests.faults.fleet import Report
 from tests.faults.shared_fleet import LEASE_S, flying
 from tests.faults.shared_store import DEADLINE_MS, Database
 from tests.faults.table import Tables
-from tests.waiting import PATIENCE_S, until
+from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(900)]
 

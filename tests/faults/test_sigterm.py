@@ -15,8 +15,8 @@ import pytest
 from tests.e2e.processes import serving_edge
 from tests.faults.fleet import Report
 from tests.faults.table import Tables
-from tests.running import listening
-from tests.service.stub_llm import misbehaving, saying, wait_for
+from tests.support.running import listening
+from tests.unit.service.stub_llm import misbehaving, saying, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 

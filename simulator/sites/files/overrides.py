@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from shared.scenario import Scenario
+from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 from simulator.sites.files.reading import quoted, text_of
 
@@ -72,6 +72,6 @@ def read_overrides(path: Path) -> Overrides:
             raise UsageError(f"{overrides.at(key)}: a world with routes and sites does not use {key}; take it out")
         if key not in Scenario.model_fields:
             close = get_close_matches(key, set(Scenario.model_fields) - FROM_FEATURES - UNUSED, n=1)
-            hint = f"did you mean {close[0]}?" if close else "its fields are those of shared/scenario.py"
+            hint = f"did you mean {close[0]}?" if close else "its fields are those of shared/world/scenario.py"
             raise UsageError(f"{overrides.at(key)}: a scenario has no field {quoted(key)}; {hint}")
     return overrides

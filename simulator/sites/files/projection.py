@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pyproj import Proj
 
-from shared.channel import FloatArray
+from shared.world.channel import FloatArray
 
 
 @dataclass(frozen=True)

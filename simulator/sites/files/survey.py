@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, from_json
 
-from shared.scenario import Point
+from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence, FenceRole
 from simulator.sites.files.reading import quoted, text_of

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.channel import IntArray
+from shared.world.channel import IntArray
 from simulator.errors import UsageError
 from simulator.sites.files.reading import quoted, text_of
 

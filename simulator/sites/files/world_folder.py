@@ -10,8 +10,8 @@
 | ``fence`` (at most one) | Polygon, or Point with ``radius_m`` | an area that no trajectory may leave |
 | ``no_fly`` | Polygon, or Point with ``radius_m`` | an area that no trajectory may enter |
 
-``scenario.toml`` (optional): any field of :class:`shared.scenario.Scenario` that does not follow from the features,
-such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are those of scenario ``paper``.
+``scenario.toml`` (optional): any field of :class:`shared.world.scenario.Scenario` that does not follow from the
+features, such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are those of scenario ``paper``.
 
 ``arrivals.csv`` (optional): a trace, ``step,<sensor ID>,<sensor ID>,...``, whole packets, one line a step from step 0,
 for at least the mission's steps. Without it arrivals are Poisson with the scenario's rates.
@@ -31,9 +31,9 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.channel import FloatArray, link_holds
-from shared.scenario import Point, Scenario
-from shared.trajectory import trajectories
+from shared.world.channel import FloatArray, link_holds
+from shared.world.scenario import Point, Scenario
+from shared.world.trajectory import trajectories
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
 from simulator.sites.files.gains import read_gains

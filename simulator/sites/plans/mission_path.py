@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from shared.scenario import Point
+from shared.world.scenario import Point
 
 # MAV_CMD numbers, https://mavlink.io/en/messages/common.html
 WAYPOINT, RETURN_TO_LAUNCH, LAND, TAKEOFF, JUMP = 16, 20, 21, 22, 177

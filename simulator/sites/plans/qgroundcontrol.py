@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from shared.scenario import Point
+from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
 from simulator.sites.files.reading import quoted, text_of

@@ -1,0 +1,9 @@
+"""The errors of a call to a vehicle."""
+
+from __future__ import annotations
+
+from simulator.errors import RunFailed
+
+
+class VehicleError(RunFailed):
+    """A vehicle cannot be reached, or did not do what it was told; the text says which and what to do."""

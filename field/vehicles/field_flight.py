@@ -1,0 +1,202 @@
+"""The flight of real UAVs: telemetry in, decisions out as speeds along their missions' paths, outcomes back.
+
+All UAVs of a flight are at the same waypoint: every ``step_s`` seconds of the mission each reports, decides, and gets
+the speed that brings it to its next waypoint in time. There it collects from the decided sensor.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from field.errors import VehicleError
+from field.vehicles.field_pilot import FieldPilot
+from field.vehicles.field_uav import LINK_LOST, NO_POSITION, FieldUav
+from field.vehicles.heard_beacons import LossCounters
+from field.vehicles.mission_clock import Clock, MissionClock
+from field.vehicles.radio import Collected, Radio, Spot
+from shared.wire.schemas import Mode
+from simulator.flying.pilots import Choice
+from simulator.records.decision import Decision
+from simulator.records.flight import Flight, exchange_fields
+from simulator.sites.site import Site
+from simulator.world.observation import StepTally
+
+
+@dataclass
+class Flown(Flight):
+    """A flight so far. Its ``tally`` counts a sensor's losses once, when a UAV hears of them; its ``track`` is empty.
+
+    Attributes:
+        mode: the mission's at the edge; ``None`` where neither the command nor the edge said it.
+        late: decisions that came after their step.
+        untold: waypoints at which a UAV was told nothing, by the reason.
+        disobeyed: texts of the commands that a vehicle did not carry out.
+    """
+
+    mode: Mode | None = None
+    late: int = 0
+    untold: Counter[str] = field(default_factory=Counter)
+    disobeyed: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """A decision that is being flown."""
+
+    uav: FieldUav
+    choice: Choice
+    spot: Spot
+
+
+class FieldFlight:
+    """Flies UAVs on their missions for a world's steps.
+
+    Args:
+        site: a world on the globe.
+        uavs: in the air, on their missions.
+        radio: of all of them.
+        pilot: decides for them.
+        clock: of the mission.
+        on_decision: called with each decision once its outcome is known.
+        on_event: called with a UAV's index and a text when it is told nothing, is told something again, or disobeys.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        uavs: Sequence[FieldUav],
+        radio: Radio,
+        pilot: FieldPilot,
+        clock: Clock | None = None,
+        on_decision: Callable[[Decision], None] = lambda decision: None,
+        on_event: Callable[[int, str], None] = lambda uav, text: None,
+    ) -> None:
+        self.flown = Flown(site.scenario, None, sensor_xy=np.array(site.scenario.sites))
+        self._scenario, self._uavs, self._radio, self._pilot = site.scenario, uavs, radio, pilot
+        self._clock = clock or MissionClock()
+        self._on_decision, self._on_event = on_decision, on_event
+        self._away: dict[int, str | None] = {}
+        self._counters = LossCounters()
+
+    async def fly(self) -> Flown:
+        """Fly the steps, or until every UAV has landed. A cancelled flight ends like a flown one, and then raises."""
+        legs: list[_Leg] = []
+        took_off = time.monotonic()
+        step_s, began = self._scenario.step_s, self._clock.now()
+        try:
+            await self._look(step_s)
+            for step in range(self._scenario.steps):
+                if step == 0:
+                    await self._listen(0)
+                legs = await self._decide(step, began + step * step_s)
+                if self._clock.now() > began + (step + 1) * step_s:
+                    self.flown.late += len(legs)
+                await self._clock.until(began + (step + 1) * step_s)
+                await self._look(step_s)
+                await self._collect(legs, step)
+                legs = []
+                if all(uav.landed for uav in self._uavs):
+                    break
+        finally:
+            # If the flight is cut short, the outcomes of its last decisions stay unknown.
+            await self._end()
+            self.flown.mode = self._pilot.mode
+            self.flown.duration_s = time.monotonic() - took_off
+        return self.flown
+
+    async def _look(self, seconds: float) -> None:
+        await asyncio.gather(*(uav.look(seconds) for uav in self._uavs))
+
+    async def _decide(self, step: int, since_s: float) -> list[_Leg]:
+        """Decide for the UAVs that fly their missions, and tell them; their waypoint was at ``since_s``."""
+        flying = {uav.index: uav for uav in self._uavs if uav.away is None}
+        for uav in self._uavs:
+            if uav.away is not None:
+                self.flown.untold[uav.away] += 1
+            if uav.away != self._away.get(uav.index):
+                self._on_event(uav.index, uav.away or "it flies its mission")
+            self._away[uav.index] = uav.away
+        choices = await self._pilot.decide({index: uav.observation(step) for index, uav in flying.items()})
+        legs = [_Leg(flying[index], choice, flying[index].spot(step)) for index, choice in choices.items()]
+        await asyncio.gather(*(self._command(leg, self._clock.now() - since_s) for leg in legs))
+        return legs
+
+    async def _command(self, leg: _Leg, decided_s: float) -> None:
+        try:
+            await leg.uav.command(leg.choice.velocity, decided_s)
+        except VehicleError as error:
+            self.flown.disobeyed.append(str(error))
+            self._on_event(leg.uav.index, str(error))
+
+    async def _collect(self, legs: Sequence[_Leg], step: int) -> None:
+        """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record what came of it."""
+        collected = {}
+        for leg in legs:
+            if leg.uav.away in (LINK_LOST, NO_POSITION):
+                leg.uav.expect(leg.choice.velocity, self._scenario.step_s)
+            collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
+        lost, grown = await self._listen(step + 1)
+        for leg in legs:
+            got, index = collected[leg.uav.index], leg.uav.index
+            cost = float(got.failed) + lost[index] / self._scenario.queue_capacity
+            self._pilot.learn(index, leg.choice, cost, got.failed)
+            decision = Decision(
+                step=step,
+                uav_id=index,
+                position=leg.spot.position,
+                sensor_id=leg.choice.sensor,
+                velocity=leg.choice.velocity,
+                source=leg.choice.source,
+                reason=leg.choice.reason,
+                failed=got.failed,
+                collected=got.packets,
+                lost_packets=lost[index],
+                cost=cost,
+                **exchange_fields(leg.choice.exchange),
+            )
+            self.flown.decisions.append(decision)
+            self._on_decision(decision)
+        self.flown.tally.append(self._tally(step, legs, collected, grown))
+
+    def _tally(
+        self, step: int, legs: Sequence[_Leg], collected: Mapping[int, Collected], lost: Mapping[int, int]
+    ) -> StepTally:
+        packets = np.zeros(self._scenario.sensors, dtype=np.int64)
+        for leg in legs:
+            packets[leg.choice.sensor] += collected[leg.uav.index].packets
+        return StepTally(
+            step=step,
+            failures=sum(got.failed for got in collected.values()),
+            overflows=sum(count > 0 for count in lost.values()),
+            lost_packets=sum(lost.values()),
+            collected=packets,
+        )
+
+    async def _listen(self, step: int) -> tuple[dict[int, int], dict[int, int]]:
+        """Hear the sensors in range of each UAV.
+
+        Returns the packets that they lost: by UAV, since that UAV last heard them; by sensor, since any UAV did.
+        """
+        heard = {uav.index: await self._radio.beacons(uav.spot(step)) for uav in self._uavs}
+        counters: dict[int, int] = {}
+        for beacons in heard.values():
+            for sensor, beacon in beacons.items():
+                counters[sensor] = max(beacon.lost, counters.get(sensor, 0))
+        own = {uav.index: uav.heard.hear(step, heard[uav.index]) for uav in self._uavs}
+        return own, self._counters.grow(counters)
+
+    async def _end(self) -> None:
+        """Let the UAVs go on with their missions, and send the last outcomes."""
+        for uav in self._uavs:
+            if uav.away is None:
+                try:
+                    await uav.hand_back()
+                except VehicleError as error:
+                    self.flown.disobeyed.append(str(error))
+        await self._pilot.land()

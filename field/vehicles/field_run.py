@@ -1,0 +1,161 @@
+"""One command's flight of real UAVs: connect, check, wait for the missions, fly, write the log."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from field.vehicles.field_flight import FieldFlight, Flown
+from field.vehicles.field_pilot import FieldPilot
+from field.vehicles.field_uav import FieldUav
+from field.vehicles.mavlink_vehicle import mavlink_vehicle
+from field.vehicles.mission_clock import MissionClock
+from field.vehicles.radio import Radio
+from field.vehicles.take_off import await_missions
+from field.vehicles.uploaded_path import check_uploaded
+from shared.client.edge_client import API_KEY, AsyncEdgeClient
+from shared.client.errors import EdgeError
+from shared.wire.schemas import Mode
+from simulator.records.decision import Decision
+from simulator.records.decision_log import DecisionLog
+from simulator.records.request_log import RequestLog, resolved
+from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
+from simulator.sites.site import Site
+
+
+@dataclass(frozen=True)
+class FieldJob:
+    """A flight to conduct.
+
+    ``mavlink`` has the connections of UAVs ``first_uav`` and the ones after it. ``seed`` is the simulated sensors';
+    ``None`` for real ones.
+    """
+
+    site: Site
+    radio: Radio
+    mavlink: Sequence[str]
+    first_uav: int
+    edge: str
+    mission_id: str
+    out: Path
+    seed: int | None
+    mode: Mode | None
+    deadline_ms: int
+    patience_s: float
+    speedup: float
+    wait_s: float
+
+
+class FlightCut(Exception):
+    """The flight was ended by a signal; ``flown`` is what had been flown, ``None`` before the first waypoint."""
+
+    def __init__(self, flown: Flown | None) -> None:
+        super().__init__()
+        self.flown = flown
+
+
+async def conduct_field(job: FieldJob) -> Flown:
+    """Connect to the vehicles, wait until they fly their missions, fly, and write the log as it happens.
+
+    SIGINT and SIGTERM end the flight after the present commands; vehicles that wait are sent on.
+
+    Raises:
+        UsageError: a connection, a vehicle's mission or the folder is unusable.
+        VehicleError: a vehicle is not heard, or does not fly its mission.
+        FlightCut: a signal ended the flight.
+    """
+    flight: FieldFlight | None = None
+    try:
+        with signals_cancel():
+            async with AsyncExitStack() as stack:
+                uavs = [await stack.enter_async_context(connected(job, number)) for number in range(len(job.mavlink))]
+                client = await stack.enter_async_context(edge_client(job))
+                pilot = FieldPilot(client, job.mission_id, job.site.scenario, job.patience_s, job.mode, job.deadline_ms)
+                await join(pilot, job)
+                logs = stack.enter_context(opened_logs(job, pilot))
+                await await_missions(uavs, job.wait_s, lambda uav, why: tell(f"waiting for UAV {uav}: {why}"))
+                flight = FieldFlight(
+                    job.site, uavs, job.radio, pilot, MissionClock(job.speedup),
+                    lambda decision: record(decision, logs), lambda uav, text: tell(f"UAV {uav}: {text}"),
+                )  # fmt: skip
+                flown = await flight.fly()
+                if pilot.last_error is not None:
+                    tell(f"the edge's last failure: {pilot.last_error}")
+                return flown
+    except asyncio.CancelledError:
+        if flight is not None:
+            flight.flown.interrupted = True
+        raise FlightCut(None if flight is None else flight.flown) from None
+
+
+@asynccontextmanager
+async def connected(job: FieldJob, number: int) -> AsyncIterator[FieldUav]:
+    """The UAV at one of the job's connections, its mission checked."""
+    index = job.first_uav + number
+    async with mavlink_vehicle(job.mavlink[number], job.wait_s) as vehicle:
+        height_m = check_uploaded(await vehicle.mission(), job.site, index, vehicle.name)
+        yield FieldUav(index, vehicle, job.site, height_m)
+
+
+def edge_client(job: FieldJob) -> AsyncEdgeClient:
+    """A client that gives up before the UAVs do."""
+    return AsyncEdgeClient(job.edge, timeout_s=job.patience_s, attempts=2, api_key=os.environ.get(API_KEY) or None)
+
+
+async def join(pilot: FieldPilot, job: FieldJob) -> None:
+    """Make or find the mission at the edge; without an edge the UAVs begin on board."""
+    try:
+        status = await pilot.join()
+        pilot.spec = resolved(pilot.spec, status)
+        tell(f"mission {job.mission_id}, mode {status.mode}; watch it at {job.edge}/?mission={job.mission_id}")
+    except EdgeError as error:
+        tell(f"{error}; the UAVs decide on board until it answers")
+
+
+@contextmanager
+def opened_logs(job: FieldJob, pilot: FieldPilot) -> Iterator[DecisionLog]:
+    """The log of decisions; requests are logged as they are sent."""
+    fresh_folder(job.out)
+    with ExitStack() as stack:
+        with naming_out(job.out):
+            requests = stack.enter_context(RequestLog(job.out / REQUESTS, pilot.spec))
+            decisions = stack.enter_context(DecisionLog(job.out / DECISIONS))
+        pilot.on_request = requests.append
+        yield decisions
+
+
+def record(decision: Decision, log: DecisionLog) -> None:
+    """Write and show a decision."""
+    log.append(decision)
+    d = decision
+    by = d.source if d.reason is None else f"{d.source}, {d.reason}"
+    tell(
+        f"step {d.step}, UAV {d.uav_id}: sensor {d.sensor_id} at {d.velocity} m/s ({by}), "
+        f"{'failed' if d.failed else f'{d.collected} packets'}, cost {d.cost:.2f}"
+    )
+
+
+def tell(text: str) -> None:
+    """Print a line of the flight to stderr, at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def signals_cancel() -> Iterator[None]:
+    """Within the context SIGINT and SIGTERM cancel the present task."""
+    loop, task = asyncio.get_running_loop(), asyncio.current_task()
+    assert task is not None, "a coroutine runs in a task"
+    cancel: Callable[[], object] = task.cancel
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, cancel)
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)

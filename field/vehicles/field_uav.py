@@ -1,0 +1,179 @@
+"""One UAV of a flight: its vehicle, its path, what it heard, and whether it may be told anything now."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from field.errors import VehicleError
+from field.vehicles.heard_beacons import HeardBeacons
+from field.vehicles.path_follower import PathFollower
+from field.vehicles.radio import Spot
+from field.vehicles.vehicle import Vehicle, VehicleState
+from shared.world.scenario import Point
+from shared.world.trajectory import trajectories
+from simulator.sites.site import Site
+from simulator.world.observation import Observation
+
+# Farther from its trajectory than this a UAV is told nothing.
+OFF_PATH_M = 100.0
+# Below this height above its take-off place a UAV has not taken off, or lands.
+AIRBORNE_M = 5.0
+# A UAV has begun its path at this share of its height, or so far from where it climbs, metres. On ArduPilot the
+# take-off is a part of mode AUTO already, in which it climbs without a way forward.
+_BEGUN_SHARE, _BEGUN_M = 0.9, 20.0
+LINK_LOST = "the link is lost"
+NO_POSITION = "its heartbeat arrives, but no position, which was asked for"
+# Below this speed a UAV waits in place instead, m/s.
+LEAST_SPEED_M_S = 0.5
+# The mode comes with the heartbeat, once a second: after a command of its own the flight reads the old one so long.
+MODE_LAG_S = 2.5
+
+
+class FieldUav:
+    """A UAV on its mission.
+
+    A UAV that somebody else flies is told nothing: the pilot, a failsafe, or an autopilot that has landed it. The same
+    holds for one that is lost, off its path or outside the fence, and until it has climbed to the height of its path.
+
+    Args:
+        height_m: of its lowest waypoint above the take-off place; infinite where that is unknown.
+
+    Attributes:
+        index: among the world's trajectories.
+        waits: whether it was told to wait in place, by this flight.
+        away: why it is told nothing now; ``None`` while it flies its mission.
+        landed: whether it has ended its mission for good.
+    """
+
+    def __init__(self, index: int, vehicle: Vehicle, site: Site, height_m: float = AIRBORNE_M) -> None:
+        self.index, self.vehicle = index, vehicle
+        self.waits = False
+        self.landed = False
+        self.away: str | None = "no telemetry yet"
+        self._site = site
+        self._follower = PathFollower(trajectories(site.scenario)[index], float(site.scenario.max_velocity))
+        self._here: Point = (0.0, 0.0)
+        self._degrees: Point = (0.0, 0.0)
+        self._height_m = height_m
+        # Where it was first seen in the air; whether it has begun its path since.
+        self._climbs_at: Point | None = None
+        self._begun = False
+        # Since the last position that was near its trajectory.
+        self._unseen_s = 0.0
+        self._mode_changed_s = -math.inf
+        # The last commanded ground speed, m/s; unknown before the first command.
+        self._speed: float | None = None
+        self.heard = HeardBeacons(np.array(site.scenario.sites))
+
+    async def look(self, seconds: float) -> None:
+        """Take the newest telemetry, that many seconds after the last."""
+        self._unseen_s += seconds
+        state = await self.vehicle.state()
+        self.away = self._taken(state) or self._misplaced(state.position) or self._climbing(state.height_m)
+        if self.away is None and state.mode == "mission" and not self._mode_is_old:
+            # The pilot may have resumed the mission too.
+            self.waits = False
+
+    def spot(self, step: int) -> Spot:
+        """Where it is, as far as its telemetry goes."""
+        return Spot(self.index, step, self._here, self._degrees)
+
+    def observation(self, step: int) -> Observation:
+        """What it knows."""
+        return self.heard.observation(step, self._here, self._follower.progress_m or 0.0)
+
+    def expect(self, velocity: int, seconds: float) -> None:
+        """Reckon with the position that it should have now; for a UAV whose telemetry has stopped."""
+        assert self._site.frame is not None, "a site with vehicles has a place on the globe"
+        self._here = self._follower.ahead(velocity * seconds)
+        longitude, latitude = self._site.frame.degrees([self._here])[0].tolist()
+        self._degrees = longitude, latitude
+
+    async def command(self, velocity: int, decided_s: float = 0.0) -> None:
+        """Be ``velocity x step_s`` metres past the waypoint at the next one, as far as the speed limit allows.
+
+        Args:
+            velocity: decided, m/s.
+            decided_s: seconds since the waypoint. Meanwhile the UAV has flown on at its last commanded speed, and the
+                commanded speed makes up for the difference. A speed below ``LEAST_SPEED_M_S`` is a wait in place.
+
+        Raises:
+            VehicleError: the vehicle did not do it, or is not to be told: somebody took it over during the decision.
+        """
+        speed = self._speed_for(velocity, decided_s)
+        why = self._taken(await self.vehicle.state())
+        if why is not None:
+            raise VehicleError(f"{self.vehicle.name} was not told to fly at {speed:g} m/s: {why}")
+        if speed < LEAST_SPEED_M_S:
+            if not self.waits:
+                await self.vehicle.hold()
+                self.waits, self._mode_changed_s = True, time.monotonic()
+            return
+        # Some autopilots forget the speed when the mode changes.
+        await self.hand_back()
+        await self.vehicle.set_speed(speed)
+        self._speed = speed
+
+    def _speed_for(self, velocity: int, decided_s: float) -> float:
+        """``(v dt - u s) / (dt - s)`` for the last speed u and s seconds since the waypoint, rounded to cm/s."""
+        world = self._site.scenario
+        left_s = world.step_s - decided_s
+        last = 0.0 if self.waits else self._speed
+        if velocity == 0 or last is None or left_s <= 0:
+            return float(velocity)
+        speed = (velocity * world.step_s - last * decided_s) / left_s
+        return round(min(max(speed, 0.0), float(world.max_velocity)), 2)
+
+    async def hand_back(self) -> None:
+        """Let it go on with its mission if this flight made it wait; raises :class:`VehicleError`."""
+        if self.waits:
+            await self.vehicle.resume()
+            self.waits, self._mode_changed_s = False, time.monotonic()
+
+    @property
+    def _mode_is_old(self) -> bool:
+        return time.monotonic() - self._mode_changed_s < MODE_LAG_S
+
+    def _taken(self, state: VehicleState) -> str | None:
+        """Why the UAV is told nothing wherever it is, or ``None``."""
+        if not state.connected:
+            return LINK_LOST
+        if state.position is None:
+            return NO_POSITION
+        if not state.armed or state.mode == "landing":
+            self.landed = True
+            return "it lands" if state.armed else "it is not armed"
+        if state.mode != "mission" and not (state.mode == "hold" and (self.waits or self._mode_is_old)):
+            # Whoever flies it now decides when its mission goes on.
+            self.waits = False
+            return "it does not fly its mission"
+        if state.height_m < AIRBORNE_M:
+            self._begun, self._climbs_at = False, None
+            return "it is on the ground"
+        return None
+
+    def _climbing(self, height_m: float) -> str | None:
+        """Why the UAV is told nothing before it flies along its path, or ``None``; it was located."""
+        self._climbs_at = self._climbs_at or self._here
+        moved_m = math.dist(self._here, self._climbs_at)
+        self._begun = self._begun or height_m >= _BEGUN_SHARE * self._height_m or moved_m >= _BEGUN_M
+        if self._begun:
+            return None
+        return f"it climbs to {self._height_m:.0f} m" if math.isfinite(self._height_m) else "it climbs"
+
+    def _misplaced(self, degrees: Point | None) -> str | None:
+        """Why the UAV is told nothing at this position, or ``None``."""
+        assert self._site.frame is not None, "a site with vehicles has a place on the globe"
+        assert degrees is not None, "without a position the link counts as lost"
+        x, y = self._site.frame.metres([degrees])[0].tolist()
+        self._here, self._degrees = (x, y), degrees
+        if not all(fence.allows(self._here) for fence in self._site.fences):
+            return "it is outside the fence"
+        gap = self._follower.follow(self._here, self._unseen_s)
+        if gap > OFF_PATH_M:
+            return "it is off its path"
+        self._unseen_s = 0.0
+        return None

@@ -1,0 +1,86 @@
+"""The data link to the ground sensors, which MAVLink does not have: what an operator's own radio has to do."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from shared.world.scenario import Point
+from simulator.errors import UsageError
+from simulator.sites.site import Site
+
+SIMULATED = "simulated"
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where and when a UAV uses its radio.
+
+    Attributes:
+        uav: its index among the world's trajectories.
+        step: the waypoint, from 0; all UAVs of a flight are at the same one.
+        position: x and y in the world's plane, metres.
+        degrees: longitude and latitude.
+    """
+
+    uav: int
+    step: int
+    position: Point
+    degrees: Point
+
+
+@dataclass(frozen=True)
+class Beacon:
+    """A sensor's beacon. ``lost`` counts the packets that it has dropped since it was set up."""
+
+    queue: int
+    battery_j: float
+    channel_gain_db: float
+    lost: int
+
+
+@dataclass(frozen=True)
+class Collected:
+    """The result of collecting from a sensor: packets, and whether the transmission failed."""
+
+    packets: int
+    failed: bool
+
+
+class Radio(Protocol):
+    """The radios of a flight's UAVs. A sensor's index is its place in ``world.geojson``."""
+
+    async def beacons(self, spot: Spot) -> Mapping[int, Beacon]:
+        """The newest beacon of each sensor in range; called once a UAV and step."""
+        ...
+
+    async def collect(self, spot: Spot, sensor: int) -> Collected:
+        """Fetch a sensor's waiting packets, as many as the link carries in one step; called at the step's end."""
+        ...
+
+
+def radio_named(name: str, site: Site, seed: int) -> Radio:
+    """The radio of the option ``--radio``: ``simulated``, or ``MODULE:NAME``, a callable that takes the site.
+
+    Raises:
+        UsageError: there is no such module or callable.
+    """
+    from field.vehicles.simulated_radio import SimulatedRadio
+
+    if name == SIMULATED:
+        return SimulatedRadio(site, seed)
+    module, _, attribute = name.partition(":")
+    if not attribute:
+        raise UsageError(f"--radio {name}: write simulated, or MODULE:NAME of your own, such as my_radio:Radio")
+    # A console script does not have the working directory on its path.
+    sys.path.insert(0, "")
+    try:
+        make: Callable[[Site], Radio] = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"--radio {name}: {error}; it is looked for in the working directory and PYTHONPATH") from None
+    finally:
+        sys.path.remove("")
+    return make(site)

@@ -1,0 +1,71 @@
+"""Simulated sensors and their radios, for trials: the vehicles are real, what they collect is not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from field.vehicles.radio import Beacon, Collected, Spot
+from shared.world.channel import FloatArray, channel_gain_db, link_holds, packets_per_step, rate_bps
+from shared.world.scenario import Point
+from simulator.sites.site import Site
+from simulator.world.sensors import Sensors, Streams
+
+
+class SimulatedRadio:
+    """The sensors of a site over the scenario's mean path loss; the same queues and arrivals as a simulated mission's.
+
+    A sensor serves one UAV a step. Packets arrive between two steps. What the model leaves out
+    (:class:`shared.world.unmodelled.Unmodelled`) is not simulated, except bursts.
+
+    Attributes:
+        lost: packets that all sensors have lost so far.
+    """
+
+    def __init__(self, site: Site, seed: int) -> None:
+        self._scenario = site.scenario
+        self._sensors = Sensors(site.scenario, Streams.of(np.random.SeedSequence(seed)), site.arrivals)
+        self._step = 0
+        self._served: set[int] = set()
+
+    @property
+    def lost(self) -> int:
+        """Packets that all sensors have lost so far."""
+        return int(self._sensors.lost.sum())
+
+    async def beacons(self, spot: Spot) -> Mapping[int, Beacon]:
+        """The sensors within the radio radius."""
+        self._arrive(spot.step)
+        distance = self._distances(spot.position)
+        gain = channel_gain_db(distance, self._scenario)
+        heard = np.flatnonzero(distance <= self._scenario.radio_radius_m).tolist()
+        return {j: self._beacon(j, float(gain[j])) for j in heard}
+
+    async def collect(self, spot: Spot, sensor: int) -> Collected:
+        """One step's packets, if the link holds and the sensor served nobody in this step."""
+        self._arrive(spot.step)
+        distance = self._distances(spot.position)[sensor]
+        moved = None
+        if sensor not in self._served and link_holds(distance, self._scenario):
+            budget, rate = packets_per_step(distance, self._scenario), rate_bps(distance, self._scenario)
+            moved = self._sensors.transmit(sensor, int(budget), float(rate))
+        if moved is None:
+            return Collected(0, failed=True)
+        self._served.add(sensor)
+        return Collected(moved, failed=False)
+
+    def _arrive(self, step: int) -> None:
+        """Let the packets arrive that a later step finds."""
+        while self._step < min(step, self._scenario.steps):
+            self._sensors.arrive(self._step)
+            self._step += 1
+            self._served.clear()
+
+    def _beacon(self, sensor: int, gain_db: float) -> Beacon:
+        now = self._sensors
+        return Beacon(int(now.queue[sensor]), float(now.battery[sensor]), gain_db, int(now.lost[sensor]))
+
+    def _distances(self, position: Point) -> FloatArray:
+        offset = self._sensors.positions - position
+        return np.hypot(offset[:, 0], offset[:, 1])

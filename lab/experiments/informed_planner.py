@@ -1,0 +1,66 @@
+"""The planner that is told the true links: a reference for what learning a channel could reach at most."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from shared.planning.receding import Draft
+from simulator.bound.true_problem import course, true_links
+from simulator.flying.pilots import Choice, LocalPilot
+from simulator.policies.mpc import RecedingHorizon
+from simulator.sites.site import Site
+from simulator.world.environment import PipelineWorld
+from simulator.world.observation import Observation
+
+
+class InformedPlanner(RecedingHorizon):
+    """The planner of ``mpc`` with the true links of every step of its horizon.
+
+    They have shadowing, fading, dead radios, the links' share and the mean wind. Queues, arrivals and later gusts are
+    expected from what the UAVs have reported, as ``mpc`` does. No UAV could fly it: it reads the world's hidden state.
+
+    Args:
+        world: in the state that the decisions are for.
+    """
+
+    def __init__(self, world: PipelineWorld) -> None:
+        self._world = world
+
+    def draft(self, uav: int, taken: frozenset[int]) -> Draft | None:
+        """The problem with the true links."""
+        draft = super().draft(uav, taken)
+        if draft is None or not self._world.truth.differs:
+            return draft
+        world, horizon = self._world, draft.problem.horizon
+        ahead = course(world, horizon * world.scenario.max_velocity + 1)[:, None]
+        # Past the scenario's last step the world has no links, and no decisions either.
+        links = true_links(world, len(world.tally) + horizon, ahead)
+        nowhere = ((0, 0), (0, 0), (0, 1))
+        told = [np.pad(links[index][:, :, draft.kept], nowhere) for index in draft.uavs]
+        return replace(draft, problem=replace(draft.problem, links=told, chances=None))
+
+
+class InformedPilot(LocalPilot):
+    """The pilot of :class:`InformedPlanner`; it flies a twin of the world beside it, to read the twin's state.
+
+    Args:
+        site: of the world.
+        seed: of the world.
+    """
+
+    def __init__(self, site: Site, seed: int) -> None:
+        self._twin = site.world()
+        self._twin.reset(seed=seed)
+        self._actions: dict[str, tuple[int, int]] = {}
+        super().__init__("informed", site.scenario, seed, InformedPlanner(self._twin))
+
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+        """The plan's choice."""
+        if int(observation["step"][0]) > len(self._twin.tally):
+            self._twin.step(self._actions)
+            self._actions = {}
+        choice = super().decide(uav, observation, taken)
+        self._actions[f"uav_{uav}"] = choice.sensor, choice.velocity
+        return choice

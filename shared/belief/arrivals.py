@@ -1,0 +1,113 @@
+"""The arrivals at the sensors as a fleet has seen them: rates, their uncertainty, and bursts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import Scenario
+
+# A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
+_ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
+# The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least dispersion that
+# is no chance.
+_POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
+# The probability that a burst lasts into the next step, and its powers until they are 0.
+GOES_ON = 0.7
+_POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
+_ARRAYS = ("arrived", "watched")
+_NEWER_ARRAYS = ("recent", "recent_at")
+
+
+class Arrivals:
+    """Each sensor's arrivals.
+
+    The rate of each sensor has a Gamma prior with the mean and variance of the scenario's range (uniform). The packets
+    that come between successive beacons of queues that are not full update it. If those vary more than a Poisson's
+    with these rates, arrivals come in bursts: a sensor that has just had more than its rate expects some more.
+
+    Attributes:
+        arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
+        rate: shape ``(J,)``, expected packets a step, ``arrived / watched``.
+        dispersion: the variance of arrivals over a Poisson's, at least 1; 1 until many intervals show that it is more.
+        recent: shape ``(J,)``, packets a step in the last interval, which ended in step ``recent_at``, -1 for none.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        count, mean = scenario.sensors, scenario.mean_arrival_rate
+        spread = (scenario.arrival_rate_max - scenario.arrival_rate_min) ** 2 / 12
+        # A range without width makes the rate certain: its prior counts as very many steps. So does a rate of zero.
+        prior_steps = mean / max(spread, 1e-3) if mean > _ZERO_RATE else _CERTAIN_STEPS
+        self.arrived: FloatArray = np.full(count, mean * prior_steps)
+        self.watched: FloatArray = np.full(count, prior_steps)
+        self.rate: FloatArray = self.arrived / self.watched
+        self.recent: FloatArray = np.zeros(count)
+        self.recent_at: IntArray = np.full(count, -1)
+        self._surprise, self._intervals = 0.0, 0
+        self.dispersion = 1.0
+
+    def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
+        """Take the packets ``(n,)`` that came to sensors ``(n,)``, each once, in so many steps, until these steps."""
+        from shared.belief.beacon_updates import take_arrivals
+
+        surprises = np.empty(len(ids))
+        arrays = self.arrived, self.watched, self.rate, self.recent, self.recent_at
+        take_arrivals(*arrays, ids, came, steps, at, surprises)
+        self._surprise += float(np.add.reduce(surprises))
+        self._intervals += len(ids)
+        self._estimate_dispersion()
+
+    def _estimate_dispersion(self) -> None:
+        found = (_POISSON_INTERVALS + self._surprise) / (_POISSON_INTERVALS + self._intervals)
+        self.dispersion = found if found > _LEAST_DISPERSION else 1.0
+
+    @property
+    def in_bursts(self) -> bool:
+        """Whether arrivals come in bursts."""
+        return self.dispersion > 1.0
+
+    @property
+    def burst_arrays(self) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+        """``rate``, ``recent``, ``recent_at`` and the powers of ``GOES_ON``, for compiled functions."""
+        return self.rate, self.recent, self.recent_at, _POWERS
+
+    def burst(self, step: int, ids: IntArray | None = None) -> FloatArray:
+        """Packets above the rate that are still to come of the bursts seen, from this step on, ``(J,)`` or ``(n,)``."""
+        from shared.belief.expected_queues import bursts_to_come
+
+        which = np.arange(len(self.rate)) if ids is None else np.array(ids)
+        packets = np.empty(len(which))
+        bursts_to_come(*self.burst_arrays, self.in_bursts, which, step, packets)
+        return packets
+
+    def coming(self, step: int, horizon: float, ids: IntArray) -> FloatArray:
+        """Packets a step that sensors ``(n,)`` are expected to get in the steps from this one to the horizon."""
+        rate = self.rate[ids]
+        if not self.in_bursts:
+            return rate
+        return rate + self.burst(step, ids) * float(self.burst_over(horizon)) / horizon
+
+    @staticmethod
+    def burst_over(steps: ArrayLike) -> FloatArray:
+        """The share of a burst's coming packets that come in the next steps ``(n,)``."""
+        return np.asarray(1.0 - GOES_ON ** np.asarray(steps, dtype=np.float64))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The arrivals, as copies."""
+        arrays = {name: getattr(self, name).copy() for name in (*_ARRAYS, *_NEWER_ARRAYS)}
+        return {**arrays, "surprise": self._surprise, "intervals": self._intervals}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state; one of an earlier version knows rates alone."""
+        for name in _ARRAYS:
+            setattr(self, name, state[name])
+        self.rate = self.arrived / self.watched
+        if "surprise" in state:
+            for name in _NEWER_ARRAYS:
+                setattr(self, name, state[name])
+            self._surprise, self._intervals = state["surprise"], state["intervals"]
+            self._estimate_dispersion()

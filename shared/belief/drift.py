@@ -1,0 +1,84 @@
+"""The drift of a fleet: the metres that its UAVs really fly, learned from their reported progress."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from shared.world.channel import FloatArray
+from shared.world.trajectory import Trajectory
+
+# A share of the way that is no drift, the weight of the prior (no drift) in steps, and the weight older steps keep.
+_NOTHING = 1e-6
+_PRIOR_STEPS = 1.0
+_KEPT = 0.97
+# Metres of still air of one step of the integration.
+_STRIDE_M = 50.0
+_SLOWEST, _FASTEST = 0.1, 2.0
+
+
+class Drift:
+    """The wind's part of a UAV's way: it flies ``v dt (1 + w . h)`` along the heading h, a unit vector.
+
+    ``w``, ``(2,)``, is the least-squares estimate of all UAVs' steps, shrunk towards 0; older steps count less.
+    """
+
+    def __init__(self) -> None:
+        self._normal: FloatArray = np.eye(2) * _PRIOR_STEPS
+        self._moment: FloatArray = np.zeros(2)
+        self.none = True
+
+    @property
+    def wind(self) -> FloatArray:
+        """``w``, shape ``(2,)``: east and north, as a share of the commanded way."""
+        return np.asarray(np.linalg.solve(self._normal, self._moment))
+
+    def learn(self, path: Trajectory, start_m: float, still_m: float, end_m: float) -> None:
+        """Take one step of a UAV.
+
+        Args:
+            start_m: progress at its start, metres.
+            still_m: the commanded way ``v dt``, metres.
+            end_m: progress at its end, metres.
+        """
+        if still_m <= 0:
+            return
+        # A progress may begin anew with every lap.
+        flown_m = end_m - start_m + (path.length_m if end_m < start_m else 0.0)
+        share = min(max(flown_m / still_m, 0.0), _FASTEST) - 1.0
+        if self.none and abs(share) <= _NOTHING:
+            return
+        self.none = False
+        heading = _headings(path, np.array([start_m + still_m / 2]))[0]
+        self._normal = _KEPT * self._normal + (1 - _KEPT) * np.eye(2) * _PRIOR_STEPS + np.outer(heading, heading)
+        self._moment = _KEPT * self._moment + heading * share
+
+    def flown_step(self, path: Trajectory, start_m: float, still_m: float) -> float:
+        """The metres flown for one commanded way."""
+        return float(self.flown(path, start_m, np.array([still_m]))[0])
+
+    def flown(self, path: Trajectory, start_m: float, still_m: FloatArray) -> FloatArray:
+        """The metres flown, shape ``(n,)``, for commanded ways ``(n,)`` from a progress on."""
+        if self.none or not len(still_m):
+            return still_m
+        wind, at = self.wind, [0.0]
+        strides = int(np.ceil(float(still_m.max()) / _STRIDE_M)) + 1
+        for _ in range(strides):
+            heading = _headings(path, np.array([start_m + at[-1] + _STRIDE_M / 2]))[0]
+            at.append(at[-1] + _STRIDE_M * min(max(1.0 + float(heading @ wind), _SLOWEST), _FASTEST))
+        return np.asarray(np.interp(still_m, np.arange(strides + 1) * _STRIDE_M, at))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The estimate, as copies."""
+        return {"normal": self._normal.copy(), "moment": self._moment.copy(), "none": self.none}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore it."""
+        self._normal, self._moment, self.none = state["normal"], state["moment"], state["none"]
+
+
+def _headings(path: Trajectory, progress_m: FloatArray) -> FloatArray:
+    """Unit vectors along a trajectory at progresses ``(n,)``: ``(n, 2)``."""
+    chord = path.at(progress_m + 0.5) - path.at(progress_m - 0.5)
+    return np.asarray(chord / np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-9)[:, None])

@@ -1,0 +1,286 @@
+"""A fleet's belief: the reports of all its UAVs merged, and rolled forward to the present step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shared.belief.arrivals import Arrivals
+from shared.belief.drift import Drift
+from shared.belief.gain_measurements import NOTHING_MEASURED, Measured
+from shared.belief.learned_channel import ExpectedLinks, LearnedChannel
+from shared.belief.whereabouts import Visit, Whereabouts
+from shared.world.channel import FloatArray, IntArray
+from shared.world.scenario import Scenario
+from shared.world.trajectory import Trajectory, progress_of, trajectories
+
+# A distance out of every reach.
+FAR_M = 1e9
+# A position further off the reported progress has an error, and the place on the trajectory counts, metres.
+_POSITION_ERROR_M = 0.01
+# The arrays of a belief.
+_ARRAYS = ("base", "since", "heard", "battery", "places", "visited")
+
+
+class FleetBelief:
+    """The newest beacon of each sensor that any UAV heard, rolled forward, and the position of each UAV.
+
+    A sensor never heard is assumed to have started with the mean of the scenario's initial queues.
+
+    Attributes:
+        places: shape ``(J, 2)``, metres; NaN for a sensor that no report has named.
+        base: shape ``(J,)``, packets at the start of step ``since``, less the packets collected in that step.
+        since: shape ``(J,)``, steps; negative for a queue that was read before the mission's first step.
+        heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
+        battery: shape ``(J,)``, joules.
+        visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
+        uavs: by index, the UAVs that were ever located.
+        arrivals, channel, drift: learned from queues, from gains and outcomes, and from the UAVs' progress.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        count, capacity, fewest = scenario.sensors, scenario.queue_capacity, scenario.initial_queue_min
+        self._scenario = scenario
+        self._paths = trajectories(scenario)
+        self._drawn_variance = ((1 - fewest) * capacity) ** 2 / 12
+        self.base: FloatArray = np.full(count, (1 + fewest) / 2 * capacity)
+        self.since: IntArray = np.zeros(count, dtype=np.int64)
+        self.heard: IntArray = np.full(count, -1)
+        self.battery: FloatArray = np.full(count, scenario.battery_j)
+        self.places: FloatArray = np.full((count, 2), np.nan)
+        self.visited: IntArray = np.full(count, -1)
+        self.uavs: dict[int, Whereabouts] = {}
+        self.arrivals = Arrivals(scenario)
+        self.channel = LearnedChannel(scenario)
+        self.drift = Drift()
+
+    @property
+    def newest(self) -> int | None:
+        """The newest step in which a UAV was located, ``None`` before the first."""
+        return max((last.step for last in self.uavs.values()), default=None)
+
+    @property
+    def base_variance(self) -> FloatArray:
+        """The variance of ``base``, shape ``(J,)``: 0 for a sensor that was heard, or read before the first step."""
+        return np.where((self.heard < 0) & (self.since >= 0), self._drawn_variance, 0.0)
+
+    def hear(self, ids: IntArray, places: FloatArray, beacon: IntArray, queue: FloatArray, battery: FloatArray) -> None:
+        """Take the beacons that are newer than the known ones.
+
+        Args:
+            ids: shape ``(n,)``, the reported sensors, each once.
+            places: shape ``(n, 2)``, metres.
+            beacon: shape ``(n,)``, the step of the last beacon, -1 for none.
+            queue: shape ``(n,)``, packets at the start of that step.
+            battery: shape ``(n,)``, joules.
+        """
+        from shared.belief.beacon_updates import take_beacons
+
+        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        self.places[ids] = places
+        if not len(ids) == len(beacon) == len(queue) == len(battery):
+            raise ValueError(
+                f"{len(ids)} sensors with {len(beacon)} beacons, {len(queue)} queues, {len(battery)} batteries"
+            )
+        # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
+        heard = np.array(ids, dtype=np.int64), np.array(beacon, dtype=np.int64)
+        told = np.array(queue, dtype=np.float64), np.array(battery, dtype=np.float64)
+        (which, steps, at), came = np.empty((3, len(ids)), dtype=np.int64), np.empty(len(ids))
+        known = self.base, self.since, self.heard, self.battery, self.visited, self.arrivals.rate
+        count = take_beacons(*known, float(self._scenario.queue_capacity), *heard, *told, which, came, steps, at)
+        if count:
+            self.arrivals.take(which[:count], came[:count], steps[:count], at[:count])
+
+    def begin(self, ids: IntArray, step: IntArray, queue: FloatArray, battery: FloatArray) -> None:
+        """Take the queues ``(n,)`` that sensors ``(n,)`` had in steps ``(n,)`` before the mission's first one."""
+        self.base[ids], self.since[ids], self.battery[ids] = queue, step, battery
+
+    def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
+        """Set a UAV's position at the start of a step; ``reported_m`` is its own report of its progress, metres."""
+        here = (float(position[0]), float(position[1]))
+        last = self.uavs.get(uav)
+        visit, taught = (None, -1) if last is None else (last.visit, last.taught)
+        path = self._paths[uav]
+        progress = progress_of(path, here, reported_m)
+        if reported_m is not None and progress == reported_m:
+            x, y = path.at(reported_m).tolist()
+            if math.hypot(x - here[0], y - here[1]) > _POSITION_ERROR_M:
+                here = x, y
+            if taught != step and visit is not None and visit.step == step - 1 and visit.start_m is not None:
+                self.drift.learn(path, visit.start_m, visit.velocity * self._scenario.step_s, reported_m)
+        self.uavs[uav] = Whereabouts(step, here, progress, visit=visit, taught=taught)
+
+    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:
+        """Take the gains ``(n,)`` of the beacons that a UAV hears where it was located.
+
+        A transmission of the UAV's last step was over the same link as the beacon now. If it failed although that link
+        is good, the sensor's radio failed.
+        """
+        from shared.belief.beacon_updates import in_range
+
+        last = self.uavs[uav]
+        if last.taught == last.step:
+            return NOTHING_MEASURED
+        last.taught = last.step
+        rows, distance = np.empty(len(ids), dtype=np.int64), np.empty(len(ids))
+        count = in_range(self.places[ids], *last.position, self._scenario.radio_radius_m, rows, distance)
+        rows, distance = rows[:count], distance[:count]
+        near, gain_db = ids[rows], gain_db[rows]
+        excess_db = self.channel.measure(near, last.position, distance, gain_db)
+        visit = last.visit
+        if visit is None or visit.failed is None or visit.step != last.step - 1:
+            return Measured(excess_db)
+        row = np.flatnonzero(near == visit.sensor)
+        others = (other.visit for index, other in self.uavs.items() if index != uav)
+        contested = any(o is not None and (o.sensor, o.step) == (visit.sensor, visit.step) for o in others)
+        # A sensor serves one UAV in a step, whatever its radio does.
+        if not len(row) or contested:
+            return Measured(excess_db)
+        return Measured(excess_db, radio_failed=self._learn_of_visit(visit, -float(gain_db[row[0]])))
+
+    def _learn_of_visit(self, visit: Visit, loss_db: float) -> bool:
+        """Learn from the outcome of a UAV's last visit, over a link of this loss; whether the sensor's radio failed."""
+        packet_j, packets = self.channel.transfer(loss_db)
+        if self.battery[visit.sensor] < packet_j:
+            return False
+        failed = bool(visit.failed)
+        radio_failed = self.channel.transmitted(visit.sensor, failed, loss_db)
+        if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
+            # The queue was known before and after: it tells what the link moved.
+            rate = float(self.arrivals.coming(visit.step, 1, np.array([visit.sensor]))[0])
+            moved = visit.base + rate - float(self.base[visit.sensor])
+            slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
+            self.channel.moved(moved, visit.base, packets, slack)
+        return radio_failed
+
+    def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
+        """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
+        if uav in self.uavs and self.uavs[uav].step == step:
+            self.uavs[uav].action, self.uavs[uav].failed = (sensor, velocity), None
+
+    def settle(self, uav: int, step: int, failed: bool) -> None:
+        """Take the outcome of a UAV's decision of a step; only that of its last one counts."""
+        if uav not in self.uavs:
+            return
+        last = self.uavs[uav]
+        if last.step == step and last.action is not None:
+            last.failed = failed
+            return
+        visit = last.visit
+        if visit is None or visit.step != step or visit.failed is not None:
+            return
+        visit.failed = failed
+        untouched = self.heard[visit.sensor] <= step
+        if failed and visit.collected and untouched and self.since[visit.sensor] == step:
+            self.base[visit.sensor], self.since[visit.sensor] = visit.base, visit.since
+            self.visited[visit.sensor] = visit.visited
+        elif not failed and not visit.collected and untouched:
+            place = self.places[visit.sensor]
+            self.collect(visit.sensor, self.channel.packets(last.position, place, visit.sensor, held=True), step)
+
+    def advance(self, step: int) -> None:
+        """Fly the decisions of the steps before this one: move the UAVs, and subtract the packets they collected."""
+        flying = sorted(uav for uav, last in self.uavs.items() if last.step < step and last.action is not None)
+        visits = (last.visit for last in self.uavs.values())
+        served = {(visit.sensor, visit.step) for visit in visits if visit is not None and visit.collected}
+        for uav in flying:
+            self._fly(uav, served)
+        if step > self.channel.failures.step:
+            self.channel.failures.advance(step)
+
+    def _fly(self, uav: int, served: set[tuple[int, int]]) -> None:
+        """Fly one UAV's decision; ``served`` has the sensors and steps of the fleet's successful visits."""
+        last = self.uavs[uav]
+        sensor, velocity = last.action or (0, 0)
+        start = last.progress_m
+        if start is not None:
+            path, still_m = self._paths[uav], velocity * self._scenario.step_s
+            last.progress_m = start + (still_m if self.drift.none else self.drift.flown_step(path, start, still_m))
+            x, y = path.at(last.progress_m)
+            last.position = float(x), float(y)
+        base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])
+        collected = False
+        if (sensor, last.step) not in served and not last.failed:
+            held = last.failed is False
+            packets = self.channel.packets(last.position, self.places[sensor], sensor, held=held)
+            if collected := packets > 0:
+                served.add((sensor, last.step))
+                self.collect(sensor, packets, last.step)
+        last.visit = Visit(last.step, sensor, base, since, visited, collected, last.failed, velocity, start)
+        last.step, last.action, last.failed = last.step + 1, None, None
+
+    def collect(self, sensor: int, packets: int, step: int) -> None:
+        """Subtract the packets that a UAV collects in a step, unless something newer is known of the queue."""
+        self.visited[sensor] = max(int(self.visited[sensor]), step)
+        if self.since[sensor] > step:
+            return
+        self.base[sensor] = max(0.0, float(self.queue(step, np.array([sensor]))[0]) - packets)
+        self.since[sensor] = step
+
+    def copy(self) -> Self:
+        """The belief as it is now, for another thread: nothing that this one learns later changes the copy."""
+        constant = (self._scenario, self._paths)
+        return deepcopy(self, {id(one): one for one in constant})
+
+    def state_dict(self) -> dict[str, Any]:
+        """The whole belief, as copies."""
+        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
+        uavs = {uav: last.state() for uav, last in self.uavs.items()}
+        learned = {"channel": self.channel.state_dict(), "drift": self.drift.state_dict()}
+        return {**arrays, **self.arrivals.state_dict(), "uavs": uavs, **learned}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a belief. One of an earlier version has neither visits nor a channel."""
+        for name in _ARRAYS:
+            setattr(self, name, state[name])
+        self.arrivals.load_state_dict(state)
+        self.uavs = {uav: Whereabouts.of(told) for uav, told in state["uavs"].items()}
+        if "channel" in state:
+            self.channel.load_state_dict(state["channel"])
+            self.drift.load_state_dict(state["drift"])
+
+    def queue(self, step: int, ids: IntArray | None = None) -> FloatArray:
+        """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``ids``."""
+        from shared.belief.expected_queues import expected_queues
+
+        which = np.arange(len(self.base)) if ids is None else np.array(ids)
+        queue, capacity, bursts = np.empty(len(which)), float(self._scenario.queue_capacity), self.arrivals.in_bursts
+        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        base, since = self.base[which], self.since[which]
+        expected_queues(*self.arrivals.burst_arrays, bursts, base, since, which, capacity, step, queue)
+        return queue
+
+    def present(self, step: int) -> list[int]:
+        """The UAVs located in this step or the one before."""
+        return sorted(uav for uav, last in self.uavs.items() if step - 1 <= last.step <= step)
+
+    def decided(self, step: int) -> dict[int, tuple[int, int]]:
+        """The UAVs' decisions in this step: sensor and velocity by index."""
+        return {uav: last.action for uav, last in self.uavs.items() if last.step == step and last.action is not None}
+
+    def trajectory(self, uav: int) -> Trajectory:
+        """The UAV's trajectory."""
+        return self._paths[uav]
+
+    def links(self, uav: int, metres: ArrayLike) -> ExpectedLinks:
+        """The links to the UAV after it has flown ``metres`` ``(n,)`` on, ``(n, J)``."""
+        ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
+        return self.channel.links(ahead, self._distances_from(ahead))
+
+    def distances(self, uav: int, metres: ArrayLike) -> FloatArray:
+        """Horizontal distances, metres, ``(n, J)``, after the UAV has flown ``metres`` ``(n,)`` on.
+
+        A sensor of unknown position is far away.
+        """
+        return self._distances_from(self.uavs[uav].ahead(self._paths[uav], self.drift, metres))
+
+    def _distances_from(self, places: FloatArray) -> FloatArray:
+        offset = places[:, None, :] - self.places
+        metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
+        metres_off[np.isnan(metres_off)] = FAR_M
+        return metres_off

@@ -1,0 +1,148 @@
+"""The visiting record and the arrival rate of each sensor, from visits and beacons of a fleet or of one UAV."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.gain_measurements import Measured
+from shared.wire.schemas import UavState
+from shared.wire.sensor_arrays import arrays_of
+from shared.world.channel import FloatArray
+from shared.world.scenario import Scenario
+
+# The weight, in steps, of the scenario's mean arrival rate against the observations.
+_PRIOR_STEPS = 2.0
+NEVER = -1
+
+
+class Records:
+    """The records of every sensor.
+
+    Attributes:
+        visits: TVR_j, shape ``(J,)``: the step of the latest visit that is confirmed, or still open and presumed to
+            succeed; -1 for none.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        count = scenario.sensors
+        self._capacity = scenario.queue_capacity
+        self.visits: NDArray[np.int64] = np.full(count, NEVER, dtype=np.int64)
+        self._confirmed = np.full(count, NEVER, dtype=np.int64)
+        self._open: dict[int, dict[str, int]] = {}
+        self._seen = np.full(count, NEVER, dtype=np.int64)
+        self._queue = np.zeros(count)
+        self._arrivals = np.full(count, scenario.mean_arrival_rate * _PRIOR_STEPS)
+        self._exposure = np.full(count, _PRIOR_STEPS)
+
+    @property
+    def rates(self) -> FloatArray:
+        """Observed arrival rates lambda_hat, packets a step, shape ``(J,)``."""
+        rates: FloatArray = self._arrivals / self._exposure
+        return rates
+
+    def hear(self, ids: NDArray[np.int64], seen: NDArray[np.int64], queue: FloatArray) -> None:
+        """Take the beacons that are newer than the known ones, ``(n,)`` each.
+
+        Between two beacons of a sensor without a visit or an overflow, the queue grows by the arrivals.
+        """
+        from shared.belief.record_updates import record_beacons
+
+        arrays = self.visits, self._seen, self._queue, self._arrivals, self._exposure
+        # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
+        which, steps, queues = (
+            np.array(ids, dtype=np.int64),
+            np.array(seen, dtype=np.int64),
+            np.array(queue, dtype=np.float64),
+        )
+        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        before = self._seen[which]
+        if not len(which) == len(steps) == len(queues):
+            raise ValueError(f"{len(which)} sensors with {len(steps)} steps and {len(queues)} queues")
+        record_beacons(*arrays, float(self._capacity), which, before, steps, queues)
+
+    def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
+        """Count a decision as a visit until its outcome is known."""
+        self._open.setdefault(sensor_id, {})[decision_id] = step
+        self._update(sensor_id)
+
+    def confirm(self, sensor_id: int, decision_id: str, step: int) -> None:
+        """Count the visit for good: it succeeded, or its outcome will never be known."""
+        self._confirmed[sensor_id] = max(self._confirmed[sensor_id], step)
+        self.withdraw(sensor_id, decision_id)
+
+    def withdraw(self, sensor_id: int, decision_id: str) -> None:
+        """Drop the visit: the record returns to the latest remaining one."""
+        waiting = self._open.get(sensor_id, {})
+        waiting.pop(decision_id, None)
+        if not waiting:
+            self._open.pop(sensor_id, None)
+        self._update(sensor_id)
+
+    def _update(self, sensor_id: int) -> None:
+        presumed = max(self._open.get(sensor_id, {}).values(), default=NEVER)
+        self.visits[sensor_id] = max(int(self._confirmed[sensor_id]), presumed)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The whole state, as copies."""
+        return {
+            "visits": self.visits.copy(),
+            "confirmed": self._confirmed.copy(),
+            "open": {sensor: dict(waiting) for sensor, waiting in self._open.items()},
+            "seen": self._seen.copy(),
+            "queue": self._queue.copy(),
+            "arrivals": self._arrivals.copy(),
+            "exposure": self._exposure.copy(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state."""
+        self.visits, self._confirmed, self._open = state["visits"], state["confirmed"], state["open"]
+        self._seen, self._queue = state["seen"], state["queue"]
+        self._arrivals, self._exposure = state["arrivals"], state["exposure"]
+
+
+def take_readings(
+    ids: NDArray[np.int64],
+    steps: NDArray[np.int64],
+    queue: FloatArray,
+    battery: FloatArray,
+    records: Records,
+    belief: FleetBelief,
+) -> NDArray[np.bool_]:
+    """Add readings that sensors sent by another network to their records and to the belief; returns which are news.
+
+    A reading is news if it is newer than the sensor's last beacon, reading and visit: the belief has taken a visit's
+    packets from an older queue.
+
+    Args:
+        ids: shape ``(n,)``, each sensor once.
+        steps: shape ``(n,)``, negative before the mission's first step.
+        queue: shape ``(n,)``, packets at the start of that step.
+        battery: shape ``(n,)``, joules; NaN where the reading does not tell.
+    """
+    latest = np.maximum(belief.heard[ids], belief.visited[ids])
+    since = belief.since[ids]
+    before = steps < 0
+    news = np.where(before, (latest < 0) & ((since >= 0) | (steps > since)), steps > latest)
+    battery = np.where(np.isnan(battery), belief.battery[ids], battery)
+    first, now = news & before, news & ~before
+    belief.begin(ids[first], steps[first], queue[first], battery[first])
+    belief.hear(ids[now], belief.places[ids[now]], steps[now], queue[now], battery[now])
+    records.hear(ids[now], steps[now], queue[now])
+    return np.asarray(news)
+
+
+def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
+    """Add a UAV's full report to the sensors' records and to the belief; returns what its gains show."""
+    reported = arrays_of(uav.sensors)
+    belief.advance(step)
+    belief.locate(uav.uav_id, step, uav.position, uav.progress_m)
+    belief.hear(reported.ids, reported.places, reported.beacon, reported.queue, reported.battery)
+    fresh = reported.beacon == step
+    measured = belief.measure(uav.uav_id, reported.ids[fresh], reported.gain[fresh])
+    records.hear(reported.ids, reported.beacon, reported.queue)
+    return measured

@@ -1,0 +1,189 @@
+"""Pruning on board: a UAV scores the sensors with its mission's attention, in numpy, and reports the k best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.records import Records, take_report
+from shared.client.report_encoders import Fetch, FullReports, Report, without_positions
+from shared.features.augmented_state import FEATURES, State, augment
+from shared.wire.missions import MissionAttention, MissionStatus
+from shared.wire.schemas import DecideResponse, Outcome, UavState
+from shared.world.scenario import Scenario
+
+# Steps between a UAV's checks that its weights are still current.
+REFRESH_STEPS = 10
+# Queries a block: the full matrix of 10,000 sensors would take 400 MB.
+_BLOCK = 256
+
+FloatMatrix = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Attention:
+    """``W_q``, ``W_k``, ``W_v`` ``(d', d)``, and the score's ``w`` ``(1, d')`` and ``b`` ``(1,)``."""
+
+    query: FloatMatrix
+    key: FloatMatrix
+    value: FloatMatrix
+    score: FloatMatrix
+    bias: FloatMatrix
+
+    @classmethod
+    def of(cls, published: MissionAttention) -> Self:
+        """The weights that the edge publishes; raises ``ValueError`` for shapes that do not fit the feature preset."""
+        arrays = {w.name: np.array(w.values, dtype=np.float32).reshape(w.shape) for w in published.weights}
+        width, d = len(arrays.get("query", ())), FEATURES[published.features]
+        shapes = {"query": (width, d), "key": (width, d), "value": (width, d), "score": (1, width), "bias": (1,)}
+        if not width or {name: array.shape for name, array in arrays.items()} != shapes:
+            got = [(w.name, w.shape) for w in published.weights]
+            raise ValueError(f"no attention of preset {published.features}: {got}")
+        return cls(**arrays)
+
+    def scores(self, features: FloatMatrix) -> FloatMatrix:
+        """Scores ``(n,)`` of n sensors' features ``(n, d)``: ``softmax(Q K^T / sqrt(d')) V w + b``."""
+        q, k, v = (features @ w.T for w in (self.query, self.key, self.value))
+        scores = np.empty(len(features), dtype=np.float32)
+        for start in range(0, len(features), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            logits = q[rows] @ k.T / np.sqrt(np.float32(len(self.query)))
+            weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+            contexts = weights @ v / weights.sum(axis=1, keepdims=True)
+            scores[rows] = contexts @ self.score[0] + self.bias
+        return scores
+
+
+class OnBoard:
+    """One UAV's own knowledge of its mission: the beacons that it heard and the answers to it, not other UAVs'."""
+
+    def __init__(self, mission_id: str, scenario: Scenario) -> None:
+        self.mission_id = mission_id
+        self.scenario = scenario
+        self.published: MissionAttention | None = None
+        self.etag: str | None = None
+        self.checked_at = 0
+        # Sensors and positions of the last answered report: the edge has them.
+        self.surveyed: tuple[list[int], list[float], list[float]] | None = None
+        self._attention: Attention | None = None
+        self._records = Records(scenario)
+        self._belief = FleetBelief(scenario)
+        self._sent: tuple[str, int, int] | None = None
+
+    def refreshed(self, published: MissionAttention, etag: str | None) -> None:
+        """Score by these weights from now on; raises ``ValueError`` for invalid ones."""
+        self._attention = Attention.of(published)
+        self.published, self.etag = published, etag
+
+    def observe(self, uav: UavState, step: int) -> None:
+        """Record the UAV's report and the outcome of its last decision."""
+        if uav.outcome is not None:
+            self._apply(uav.uav_id, uav.outcome)
+        take_report(uav, step, self._records, self._belief)
+
+    def decided(self, response: DecideResponse) -> None:
+        """Record the edge's decision for the UAV."""
+        if self._sent is not None:
+            # The previous decision has no outcome: its presumed visit is confirmed.
+            self._records.confirm(self._sent[1], self._sent[0], self._sent[2])
+        self._sent = response.decision_id, response.sensor_id, response.step
+        self._records.presume(response.sensor_id, response.decision_id, response.step)
+        self._belief.tell(response.uav_id, response.step, response.sensor_id, response.velocity)
+
+    def _apply(self, uav_id: int, outcome: Outcome) -> None:
+        if self._sent is None or self._sent[0] != outcome.decision_id:
+            return
+        name, sensor, step = self._sent
+        self._belief.settle(uav_id, step, outcome.failed)
+        if outcome.failed:
+            self._records.withdraw(sensor, name)
+        else:
+            self._records.confirm(sensor, name, step)
+        self._sent = None
+
+    def selected(self, uav: UavState, step: int) -> list[int]:
+        """Rows of the report to send, best first: the k with the highest attention scores.
+
+        With fewer than k admissible sensors, the nearest others follow, since the edge needs some sensors.
+        """
+        assert self.published is not None and self._attention is not None
+        state = augment(
+            uav,
+            step,
+            self.scenario,
+            visits=self._records.visits,
+            rates=self._records.rates,
+            reserved=(),
+            preset=self.published.features,
+            belief=self._belief if self.published.belief == "fleet" else None,
+        )
+        return _best(state, self._attention.scores(state.features(self.scenario)), self.published.top_k)
+
+
+def _best(state: State, scores: FloatMatrix, k: int) -> list[int]:
+    admissible = np.flatnonzero(state.admissible)
+    best = admissible[np.argsort(-scores, kind="stable")[:k]]
+    others = np.setdiff1d(np.arange(len(state.ids)), admissible)
+    nearest = others[np.argsort(state.distance[others], kind="stable")[: k - len(best)]]
+    rows: list[int] = np.concatenate((best, nearest)).tolist()
+    return rows
+
+
+class PrunedReports(FullReports):
+    """Uplink ``pruned``: the sensors that the mission's attention selects, from the UAV's own knowledge.
+
+    A UAV's first report has all sensors and their positions. The UAV fetches the weights before its first report and
+    every ten steps, and stores those of its latest mission. Without weights it reports in full.
+    """
+
+    def __init__(self) -> None:
+        self._uavs: dict[int, OnBoard] = {}
+
+    def _of(self, mission_id: str, uav_id: int) -> OnBoard | None:
+        on_board = self._uavs.get(uav_id)
+        return on_board if on_board is not None and on_board.mission_id == mission_id else None
+
+    def missing(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
+        """The mission's scenario, once; then its weights, every ``REFRESH_STEPS`` steps."""
+        on_board = self._of(mission_id, uav_id)
+        if on_board is None:
+            return Fetch(f"/missions/{mission_id}", MissionStatus)
+        if on_board.published is None or not on_board.checked_at <= step < on_board.checked_at + REFRESH_STEPS:
+            return Fetch(f"/missions/{mission_id}/attention", MissionAttention, on_board.etag)
+        return None
+
+    def take(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
+        """Begin a mission with this scenario, or score by these weights."""
+        if isinstance(fetched, MissionStatus):
+            self._uavs[uav_id] = OnBoard(fetched.mission_id, fetched.scenario)
+            return
+        if isinstance(fetched, MissionAttention):
+            self._uavs[uav_id].refreshed(fetched, etag)
+        self._uavs[uav_id].checked_at = step
+
+    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+        """The selected rows without their positions; the full report the first time."""
+        on_board = self._of(mission_id, uav.uav_id)
+        if on_board is None:
+            return uav
+        on_board.observe(uav, step)
+        if on_board.published is None or on_board.surveyed != (uav.sensors.id, uav.sensors.x, uav.sensors.y):
+            return uav
+        return uav.model_copy(update={"sensors": without_positions(uav.sensors, on_board.selected(uav, step))})
+
+    def answered(self, uav: UavState, response: DecideResponse) -> None:
+        """The edge has the positions of these sensors from now on."""
+        on_board = self._of(response.mission_id, uav.uav_id)
+        if on_board is not None:
+            on_board.surveyed = uav.sensors.id, uav.sensors.x, uav.sensors.y
+            on_board.decided(response)
+
+    def forget(self, uav_id: int) -> None:
+        """The edge lacks the sensors' positions: the next report is sent in full."""
+        if uav_id in self._uavs:
+            self._uavs[uav_id].surveyed = None

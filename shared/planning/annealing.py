@@ -1,0 +1,301 @@
+"""Simulated annealing of a fleet's actions, compiled: the search of :class:`shared.planning.receding.RecedingHorizon`.
+
+Kirkpatrick, Gelatt and Vecchi, Science 220, 1983. The cost is the exact expectation over links and arrivals of
+:class:`shared.planning.queue_chains.QueueChains`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from shared.kit.compiled import compiled, inlined
+from shared.planning.annealing_arrays import LEVELS, Course, Proposal, Tables
+from shared.planning.annealing_costs import (
+    accept,
+    begin,
+    copy,
+    dot,
+    gain,
+    know_behind,
+    know_odds,
+    lateness,
+    moving,
+    total,
+    visited,
+)
+from shared.planning.fleet_problem import FleetProblem, Found
+from shared.planning.queue_chains import Arriving, queue_chains
+from shared.world.channel import IntArray
+from shared.world.scenario import Scenario
+from shared.world.trajectory import trajectories
+
+# The cumulative shares of the kinds of changes: another sensor at one step; one velocity for several steps; another
+# velocity at one step; the same with the opposite change at a later step; the rest exchange two sensors.
+_SENSOR, _RUN, _ALONE, _SHIFT = 0.4, 0.5, 0.65, 0.9
+# The cumulative shares of new velocities: any one; the highest one, because some sensors are reached only if every
+# velocity is the highest; the rest are one or two levels from the old one.
+_ANY_VELOCITY, _HIGHEST_VELOCITY, _NEAR_VELOCITY = 0.4, 0.6, 2
+# The share of changes of velocity that draw sensors anew which are still in reach, and the share of these sensors.
+_ANEW = 0.5
+# What a collected level of a queue is worth where it saves no loss: enough to choose, packets.
+_PACKET = 1e-4
+# Changes of a run, of these at one temperature, and between two looks at the clock; the last temperature, packets.
+_CHANGES, _SAME_TEMPERATURE, _AT_ONCE, _COLD = 5000, 32, 1000, 0.01
+
+
+@inlined
+def _within(tables: Tables, new: Proposal, step: int, uav: int, j: int) -> bool:
+    """Whether a UAV may collect from a sensor in this step: it is in reach, and no other UAV names it."""
+    at = min(step, tables.moved.shape[1] - 1)
+    if not tables.usable[step, j] or tables.moved[uav, at, new.place[step, uav], j] == 0:
+        return False
+    named = False
+    for other in range(new.sensor.shape[1]):
+        named = named or (other != uav and new.sensor[step, other] == j)
+    return not named
+
+
+@inlined
+def _below(count: int) -> int:
+    """A number drawn from 0 to ``count - 1``."""
+    return int(np.random.random() * count)
+
+
+@inlined
+def _redraw(
+    tables: Tables, course: Course, new: Proposal, step: int, uav: int, temperature: float, packet: float
+) -> None:
+    """Draw the sensor of a UAV's step from all that it may collect from, as likely as at this temperature.
+
+    Each has a Gumbel-distributed number added to its saving and to the price of its packets, and the highest sum wins.
+    """
+    at = min(step, tables.moved.shape[1] - 1)
+    place, nowhere = new.place[step, uav], len(tables.start) - 1
+    drawn, highest = nowhere, -np.log(-np.log(np.random.random()))
+    for k in range(tables.reached.shape[3]):
+        j = tables.reached[uav, at, place, k]
+        if j < 0:
+            break
+        if not _within(tables, new, step, uav, j):
+            continue
+        know_odds(tables, course, new, j, step)
+        know_behind(tables, course, new, j, step)
+        odds, behind = course.odds[j, step, LEVELS:], course.behind[j, step]
+        idle = dot(odds, behind[LEVELS:], new.terms)
+        levels, chance = tables.moved[uav, at, place, j], tables.chance[uav, at, place, j]
+        served = visited(new, odds, behind, idle, levels, chance)
+        saved = float(idle - served)
+        if len(tables.late):
+            new.sensor[step, uav] = nowhere
+            saved += float(lateness(tables, new.sensor, new.place, j))
+            new.sensor[step, uav] = j
+            saved -= float(lateness(tables, new.sensor, new.place, j))
+        if packet > 0.0:
+            saved += packet * moving(odds, levels, chance)
+        value = saved / temperature - np.log(-np.log(np.random.random()))
+        if value > highest:
+            drawn, highest = j, value
+    new.sensor[step, uav] = drawn
+
+
+@inlined
+def _propose(
+    tables: Tables, course: Course, new: Proposal, step: int, uav: int, temperature: float, kind: float
+) -> bool:
+    """Draw a change that begins with a UAV's step; returns whether there is one."""
+    steps = len(course.sensor)
+    if kind < _SHIFT:
+        return _propose_velocity(tables, course, new, step, uav, temperature, kind)
+    # Two UAVs exchange their sensors of a step, or one UAV those of two steps.
+    other, then = uav, step
+    if np.random.random() < 0.5:
+        other = _below(course.sensor.shape[1])
+    else:
+        then = _below(steps)
+    mine, its = course.sensor[step, uav], course.sensor[then, other]
+    if mine == its or then < tables.fixed[other]:
+        return False
+    new.sensor[step, uav], new.sensor[then, other] = its, mine
+    nowhere = len(tables.start) - 1
+    if its != nowhere and not _within(tables, new, step, uav, its):
+        return False
+    return mine == nowhere or _within(tables, new, then, other, mine)
+
+
+@inlined
+def _velocity(tables: Tables, now: int) -> int:
+    """Draw an allowed velocity: a near one, the highest, or any."""
+    count, kind = len(tables.velocities), np.random.random()
+    if kind < _ANY_VELOCITY:
+        return int(tables.velocities[_below(count)])
+    if kind < _HIGHEST_VELOCITY:
+        return int(tables.velocities[count - 1])
+    place = 0
+    while place < count - 1 and tables.velocities[place] < now:
+        place += 1
+    away = 1 + _below(_NEAR_VELOCITY)
+    place += away if np.random.random() < 0.5 else -away
+    return int(tables.velocities[min(max(place, 0), count - 1)])
+
+
+@inlined
+def _propose_velocity(
+    tables: Tables, course: Course, new: Proposal, step: int, uav: int, temperature: float, kind: float
+) -> bool:
+    """Draw another velocity of a UAV's step, alone, with the opposite change at a later step, or for some steps."""
+    steps, drawn = len(course.sensor), _velocity(tables, course.velocity[step, uav])
+    more = drawn - course.velocity[step, uav]
+    new.velocity[step, uav] = drawn
+    if kind < _RUN:
+        for then in range(step + 1, step + 1 + _below(steps - step)):
+            new.velocity[then, uav] = drawn
+    elif more == 0:
+        return False
+    elif kind >= _ALONE:
+        if step + 1 >= steps:
+            return False
+        then = step + 1 + _below(steps - step - 1)
+        new.velocity[then, uav] -= more
+        allowed = False
+        for velocity in tables.velocities:
+            allowed = allowed or velocity == new.velocity[then, uav]
+        if not allowed:
+            return False
+    nowhere, place = len(tables.start) - 1, course.place[step, uav] - course.velocity[step, uav]
+    anew = _ANEW if np.random.random() < _ANEW else 0.0
+    changed = False
+    for then in range(step, steps):
+        place += new.velocity[then, uav]
+        if place == course.place[then, uav]:
+            continue
+        new.place[then, uav], changed = place, True
+        j = new.sensor[then, uav]
+        if j == nowhere or np.random.random() < anew or not _within(tables, new, then, uav, j):
+            _redraw(tables, course, new, then, uav, temperature, 0.0)
+    return changed
+
+
+@compiled
+def _anneal(
+    tables: Tables,
+    course: Course,
+    new: Proposal,
+    best: IntArray,
+    least: float,
+    first: int,
+    last: int,
+    hot: float,
+    falls: float,
+    seed: int,
+) -> float:
+    """Search from step ``first`` to ``last``; write the best plan's actions and return its cost.
+
+    The temperature is ``hot`` at step 0 and falls by the factor ``falls`` a step.
+    """
+    np.random.seed(seed)
+    steps, uavs = course.sensor.shape
+    temperature = hot * falls**first
+    for turn in range(first, last):
+        if turn % _SAME_TEMPERATURE == 0:
+            temperature = hot * falls**turn
+        uav, step = _below(uavs), _below(steps)
+        if step < tables.fixed[uav]:
+            continue
+        copy(course, new)
+        kind = np.random.random()
+        if kind < _SENSOR:
+            _redraw(tables, course, new, step, uav, temperature, 0.0)
+            if new.sensor[step, uav] == course.sensor[step, uav]:
+                continue
+        elif not _propose(tables, course, new, step, uav, temperature, kind):
+            continue
+        more = gain(tables, course, new)
+        if kind >= _SENSOR and more > 0.0 and np.random.random() >= np.exp(-more / temperature):
+            continue
+        accept(tables, course, new)
+        cost = total(course.cost)
+        if cost < least - 1e-6:
+            least = cost
+            for row in range(steps):
+                for column in range(uavs):
+                    best[row, column, 0] = course.sensor[row, column]
+                    best[row, column, 1] = course.velocity[row, column]
+    return least
+
+
+@compiled
+def _settle(tables: Tables, course: Course, new: Proposal, best: IntArray) -> float:
+    """Let each step collect the most packets of what saves the same; write the sensors and return the plan's cost."""
+    steps, uavs = course.sensor.shape
+    for step in range(steps):
+        for uav in range(uavs):
+            if step < tables.fixed[uav]:
+                continue
+            copy(course, new)
+            _redraw(tables, course, new, step, uav, 1e-9, _PACKET)
+            if new.sensor[step, uav] != course.sensor[step, uav] and gain(tables, course, new) <= _PACKET:
+                accept(tables, course, new)
+            best[step, uav, 0] = course.sensor[step, uav]
+    return total(course.cost)
+
+
+class Annealing:
+    """The search for one problem's plan, over links that may be uncertain. Batteries are assumed to last.
+
+    Args:
+        problem: with ``chains``.
+    """
+
+    def __init__(self, problem: FleetProblem) -> None:
+        self._tables = Tables.of(problem)
+
+    def priced(self, actions: IntArray) -> Found:
+        """What actions ``(H, I, 2)`` are expected to lose."""
+        course, _ = self._begun(actions)
+        return Found(actions, float(course.cost.sum()))
+
+    def _begun(self, actions: IntArray) -> tuple[Course, Proposal]:
+        course, new = Course.empty(self._tables), Proposal.empty(self._tables)
+        course.sensor[:], course.velocity[:] = actions[:, :, 0], actions[:, :, 1]
+        begin(self._tables, course, new)
+        return course, new
+
+    def search(self, start: IntArray, hot: float, number: int = 0, until: float = math.inf) -> Found:
+        """The best actions of one run of 5,000 changes, at least as good as its start. Threads may search at a time.
+
+        Args:
+            start: shape ``(H, I, 2)``, beginning with the problem's fixed actions.
+            hot: the temperature at first, packets; at last it is 0.01.
+            number: of the run; each draws other changes.
+            until: a time of ``time.perf_counter`` at which the run ends; its plan then depends on the machine.
+        """
+        course, new = self._begun(start)
+        least, best = float(course.cost.sum()), start.copy()
+        falls = (_COLD / hot) ** (1.0 / _CHANGES)
+        for first in range(0, _CHANGES, _AT_ONCE):
+            if time.perf_counter() > until:
+                break
+            last, seed = min(first + _AT_ONCE, _CHANGES), _CHANGES * number + first
+            least = _anneal(self._tables, course, new, best, least, first, last, hot, falls, seed)
+        course, new = self._begun(best)
+        return Found(best, _settle(self._tables, course, new, best))
+
+
+def warm_up() -> None:
+    """Compile the search, or load what an earlier process has compiled, in advance."""
+    nothing, once = np.zeros(2), Arriving(np.zeros((1, 2)), np.zeros((1, 2)))
+    world = Scenario(name="smallest", sensors=1, uavs=1, steps=1, max_velocity=1)
+    problem = FleetProblem(
+        scenario=world,
+        trajectories=trajectories(world),
+        progress_m=np.zeros(1),
+        places=np.zeros((2, 2)),
+        queue=np.zeros(2, dtype=np.int64),
+        battery=nothing,
+        arrivals=np.zeros((1, 2), dtype=np.int64),
+        chains=queue_chains(nothing, nothing, Arriving(nothing, nothing), once, once, 1, nothing, nothing),
+    )
+    Annealing(problem).search(np.zeros((1, 1, 2), dtype=np.int64), 1.0)

@@ -1,0 +1,146 @@
+"""The edge's answers about its missions: one mission's status, its attention weights, the list of all."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field
+
+from shared.wire.schemas import (
+    Belief,
+    DecisionId,
+    Features,
+    Init,
+    MissionId,
+    Mode,
+    PromptStyle,
+    Wire,
+)
+from shared.world.scenario import Scenario
+
+
+class LearnedWorld(Wire):
+    """How a fleet's reports show that its world differs from the scenario's formulas."""
+
+    offset_db: float = Field(description="excess of the path loss over the formula's that all links share, dB")
+    deviation_db: float = Field(description="standard deviation of the excess loss of a link never measured, dB")
+    rate_share: float = Field(description="the rate that transfers get, as a share of the formula's")
+    wind: list[float] = Field(
+        min_length=2, max_length=2, description="east and north, as a share of the way that the velocity commands"
+    )
+    dispersion: float = Field(description="the variance of arrivals over a Poisson's, at least 1; 1: no bursts")
+    failed_radios: list[int] = Field(description="sensors whose transmissions fail although their links hold")
+    excess_db: dict[int, float] = Field(
+        description="sensor: mean of its latest measured excess losses, dB, where that is more than 1 dB off"
+    )
+
+
+class VisitDeadline(Wire):
+    """How one order to visit a sensor at least once in any ``visit_every`` steps was kept.
+
+    A deadline ends in each step whose last ``visit_every`` steps were flown under the order, and is met if the sensor
+    was visited in one of them. The steps are those that are over. A visit counts until its outcome says that it failed.
+    """
+
+    sensor_id: int
+    visit_every: int
+    since: int = Field(description="the first step under the order")
+    until: int | None = Field(description="the first step no longer under it; null while it is in force")
+    met: int
+    missed: int
+
+
+class MissionStatus(Wire):
+    """``GET /missions/{id}``; ``experiences`` is their number, ``prompt.experiences`` the largest number."""
+
+    # The status of a newer edge may have more fields.
+    model_config = ConfigDict(extra="ignore")
+
+    mission_id: MissionId
+    scenario: Scenario
+    mode: Mode
+    top_k: int
+    attention: Literal["on", "off"] = "on"
+    features: Features = "paper"
+    belief: Belief = "fleet"
+    verify: Literal["on", "off"] = "off"
+    planner: Literal["on", "off"] = Field("off", description="`on` if it is set and the fleet is small enough")
+    prompt: PromptStyle = PromptStyle()
+    init: Init
+    seed: int
+    note: str | None = Field(None, description="the operator's newest note")
+    decisions: int
+    feedback: int
+    experiences: int
+    learner_updates: int
+    learner_loss: float | None
+    visits: dict[int, int] = Field(description="sensor: step of the last visit")
+    # Omitted where there is none: an older client refuses fields that it does not know.
+    learned: LearnedWorld | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="how the world differs from the scenario's formulas; omitted where nothing shows that it does",
+    )
+    deadlines: list[VisitDeadline] | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="the orders to visit sensors, ended ones first, at most 100 of these; omitted where none was given",
+    )
+    readings: int | None = Field(
+        None,
+        exclude_if=lambda value: value is None,
+        description="sensors' own readings that changed the belief; omitted where there was none",
+    )
+
+
+class WeightArray(Wire):
+    """One array of a module's weights: ``values`` row by row, float32."""
+
+    name: str
+    shape: list[int]
+    values: list[float]
+
+
+class MissionAttention(Wire):
+    """``GET /missions/{id}/attention``: with the scenario, everything to score sensors as the mission does.
+
+    ``weights`` are ``query``, ``key`` and ``value`` ``(d', d)``, ``score`` ``(1, d')`` and ``bias`` ``(1,)``, of d
+    features of the preset; the scores are ``softmax(Q K^T / sqrt(d')) V w + b`` with ``Q = X W_q^T`` and so on.
+    """
+
+    mission_id: MissionId
+    features: Features
+    belief: Belief
+    top_k: int = Field(description="sensors that the mission offers; without attention, all of them")
+    updates: int = Field(description="outcomes that the weights have learned from since the mission began")
+    weights: list[WeightArray]
+
+
+class MissionLine(Wire):
+    """One mission of the list. For a mission that is only in the store, only its ID is known."""
+
+    mission_id: MissionId
+    mode: Mode | None = None
+    decisions: int | None = None
+
+
+class MissionList(Wire):
+    """``GET /missions``: at most 200 missions, the latest decision first; ``more`` further ones are not listed."""
+
+    missions: list[MissionLine]
+    more: int
+    newest: MissionId | None = Field(description="the mission of the latest decision since the edge started")
+    may_command: bool = Field(True, description="whether this request's key may make, guide and delete missions")
+
+
+class DecisionPrompt(Wire):
+    """``GET /missions/{id}/decisions/{decision_id}/prompt``, in the three blocks of the prompt.
+
+    ``asked`` says whether an LLM got the prompt; otherwise the prompt only serves the token accounting.
+    """
+
+    decision_id: DecisionId
+    asked: bool
+    static: str
+    experiences: str
+    state: str

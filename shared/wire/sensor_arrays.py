@@ -1,0 +1,55 @@
+"""A report's columns as numpy's arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.wire.schemas import SensorColumns
+
+_KEPT = "arrays"
+# What stands for a beacon's queue, battery, gain and step where there was none.
+_NO_BEACON = np.array([[0.0], [0.0], [0.0], [-1.0]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorArrays:
+    """What a report says of n sensors; nothing may change the arrays.
+
+    ``ids`` ``(n,)``; ``places`` ``(n, 2)``, m; ``queue`` packets, ``battery`` J and ``gain`` dB ``(n,)``, 0 for a
+    sensor never heard; ``beacon`` ``(n,)``, the step of the last beacon, -1 for none.
+    """
+
+    ids: NDArray[np.int64]
+    places: NDArray[np.float64]
+    queue: NDArray[np.float64]
+    battery: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    beacon: NDArray[np.int64]
+
+
+def arrays_of(sensors: SensorColumns) -> SensorArrays:
+    """The columns as arrays; they have to have positions, and no copy with other columns is made of them afterwards."""
+    # Beside the model's fields, as functools.cached_property would keep them: the wire's models are read without numpy.
+    known: SensorArrays | None = sensors.__dict__.get(_KEPT)
+    if known is None:
+        known = sensors.__dict__[_KEPT] = _arrays(sensors)
+    return known
+
+
+def _arrays(sensors: SensorColumns) -> SensorArrays:
+    count = len(sensors.id)
+    ids = np.fromiter(sensors.id, np.int64, count)
+    places = np.empty((count, 2))
+    places[:, 0], places[:, 1] = np.fromiter(sensors.x, float, count), np.fromiter(sensors.y, float, count)
+    # numpy converts None to NaN, and the wire admits no other NaN.
+    beacons = chain(sensors.queue, sensors.battery, sensors.channel_gain, sensors.last_seen)
+    values = np.fromiter(beacons, float, 4 * count).reshape(4, count)
+    np.copyto(values, _NO_BEACON, where=np.isnan(values))
+    steps = values[3].astype(np.int64)
+    for array in (ids, places, values, steps):
+        array.flags.writeable = False
+    return SensorArrays(ids, places, values[0], values[1], values[2], steps)

@@ -1,0 +1,133 @@
+"""The clairvoyant bound: the least that any fleet could have lost in one world, all arrivals known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simulator.bound.true_problem import relaxed_problem, targets, true_problem, velocities_towards
+from simulator.sites.site import Site
+
+# The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
+if TYPE_CHECKING:
+    from shared.planning.fleet_problem import FleetProblem
+    from simulator.bound.solver import News, Plan
+    from simulator.world.environment import PipelineWorld
+
+# Of each flight tried in wind: the steps of its plans (None: all that are left), and the deterministic seconds of each
+# search. Now the one, now the other loses fewer packets.
+_CHASES = ((10, 0.3), (None, 3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """A bound on the packets lost in one world, and the best flight found.
+
+    Attributes:
+        lower_bound: proven; no flight loses fewer packets.
+        lost_packets: of the best flight found.
+        actions: of that flight, shape ``(T, I, 2)``: sensor, velocity.
+        seconds: of the search.
+    """
+
+    lower_bound: int
+    lost_packets: int
+    actions: NDArray[np.int64]
+    seconds: float
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the flight is proven to be the best."""
+        return self.lost_packets == self.lower_bound
+
+    @property
+    def gap(self) -> int:
+        """Packets that the flight loses above the bound."""
+        return self.lost_packets - self.lower_bound
+
+
+def clairvoyant(
+    site: Site, seed: int, time_limit_s: float = 60.0, workers: int = 8, on_news: Callable[[News], None] | None = None
+) -> Bound:
+    """Bound one world with all its arrivals, links, wind and faults known.
+
+    The bound omits batteries where a link's strength decides the energy of a packet, which can only lower it. The
+    flight found is flown with the true batteries.
+
+    Args:
+        site: the scenario, and its trace if it has one.
+        seed: of the world.
+        time_limit_s: of the search; the bound and the flight are valid whenever it ends, but depend on the machine.
+        workers: threads of the solver, for worlds that one thread does not solve quickly.
+        on_news: called with each better plan or bound, from a thread of the solver.
+
+    Raises:
+        RuntimeError: the world lost another number of packets than the plan, so one of the two is wrong.
+        ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
+        Interrupted: by Ctrl-C, with the best plan so far.
+    """
+    from simulator.bound.solver import least_loss
+
+    return confirmed(site, seed, least_loss(problem_of(site, seed), time_limit_s, workers, on_news))
+
+
+def confirmed(site: Site, seed: int, plan: Plan) -> Bound:
+    """The bound that a plan of the whole mission proves, and the losses of the plan's flight in the world.
+
+    Where the world differs from the model, the flight may lose more than the plan, which omits what a weak link costs a
+    battery. In wind the plan cannot be flown, and another one is made from step to step.
+
+    Raises:
+        RuntimeError: the world lost another number of packets than the plan, or fewer than the bound.
+    """
+    world = _reset(site, seed)
+    tried = [plan.actions]
+    if world.truth.wind.blows:
+        tried = [_chased(_reset(site, seed), steps, work) for steps, work in _CHASES]
+    flown, actions = min(((replay(site, seed, actions), actions) for actions in tried), key=itemgetter(0))
+    # Lost packets are whole numbers; the margin covers the solver's rounding.
+    proven = int(np.ceil(plan.lower_bound - 1e-6))
+    if flown < proven or (flown != plan.lost_packets and not world.truth.differs):
+        raise RuntimeError(
+            f"the plan of seed {seed} loses {plan.lost_packets} packets, at least {proven}; flown in the world {flown}"
+        )
+    return Bound(proven, flown, actions, plan.seconds)
+
+
+def problem_of(site: Site, seed: int) -> FleetProblem:
+    """The whole mission as a planning problem, with the world's hidden state."""
+    return relaxed_problem(_reset(site, seed))
+
+
+def replay(site: Site, seed: int, actions: NDArray[np.int64]) -> int:
+    """Fly actions ``(T, I, 2)`` in the world; returns the packets lost."""
+    world = _reset(site, seed)
+    for step in actions:
+        world.step({agent: step[uav] for agent, uav in world.live.items()})
+    return sum(tally.lost_packets for tally in world.tally)
+
+
+def _reset(site: Site, seed: int) -> PipelineWorld:
+    world = site.world()
+    world.reset(seed=seed)
+    return world
+
+
+def _chased(world: PipelineWorld, steps: int | None, work: float) -> NDArray[np.int64]:
+    """Fly a world in wind with all of it known, each step by a plan of the next ones, and return the actions."""
+    from shared.planning.greedy import look_ahead
+    from simulator.bound.solver import Budget, plan
+
+    actions = []
+    while world.agents:
+        problem = true_problem(world, steps)
+        chosen = plan(problem, Budget(work=work), "cautious", look_ahead(problem)).actions[0].copy()
+        chosen[:, 1] = velocities_towards(world, targets(world, chosen[:, 1]))
+        actions.append(chosen)
+        world.step({agent: chosen[uav] for agent, uav in world.live.items()})
+    return np.array(actions)

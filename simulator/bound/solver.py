@@ -1,0 +1,326 @@
+"""Plans of a fleet with the fewest lost packets over a horizon, found and bounded by CP-SAT."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from shared.planning.fleet_problem import FleetProblem, fly, with_fixed
+from shared.planning.greedy import look_ahead
+from shared.world.channel import IntArray
+
+# OR-Tools takes a second to import, and only planning needs it.
+if TYPE_CHECKING:
+    from simulator.bound.formulation import Formulation, Links
+
+# Parameters of the solver, and the share of the work that each search gets.
+_Strategies = tuple[tuple[Mapping[str, Any], float], ...]
+
+_QUICK_WORK = 3.0
+# The steps of each plan that makes a start.
+_NEAR = 8
+# One worker first raises the bound by cores, which is fastest if most sensors lose nothing. With many losses it finds
+# no plan, and the usual search gets the rest of the work. Without a limit of work the first search never ends.
+_CORES: _Strategies = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
+# With less work the first search proves nothing.
+_WORK_FOR_CORES = 0.05
+_INTERRUPTED = "INTERRUPTED"
+_USUAL: _Strategies = (({}, 1.0),)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The limits of a search.
+
+    Attributes:
+        work: limit of the solver's deterministic time: about seconds on an idle core, but counted in operations, so
+            that with one worker the same problem gives the same plan on a busy machine too.
+        seconds: limit of the wall clock; the plan then depends on the machine.
+        workers: threads.
+        seed: of the solver's random choices.
+    """
+
+    work: float = math.inf
+    seconds: float = math.inf
+    workers: int = 1
+    seed: int = 0
+
+
+class News(NamedTuple):
+    """The progress of a search: the best plan's lost packets, as the model counts them, and the proven bound so far."""
+
+    lost_packets: float
+    lower_bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A fleet's plan.
+
+    Attributes:
+        actions: shape ``(H, I, 2)``: sensor, velocity. A UAV with nothing to collect names a sensor that no other
+            UAV's transfer needs.
+        lost_packets: the packets that the actions lose over the horizon, with the real batteries and links.
+        lower_bound: proven: no actions lose fewer, with any batteries. With ``cautious`` links it holds only if every
+            link were as weak as those.
+        status: the solver's, such as OPTIMAL, FEASIBLE or UNKNOWN.
+        seconds: wall clock, building included.
+        work: deterministic time used.
+    """
+
+    actions: IntArray
+    lost_packets: int
+    lower_bound: float
+    status: str
+    seconds: float
+    work: float
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the plan is proven to be the best (with ``cautious`` links: if every link were so weak)."""
+        return self.lost_packets <= self.lower_bound + 1e-9
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C ended a search; ``plan`` is the best plan found, and its bound holds."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__()
+        self.plan = plan
+
+
+def plan(
+    problem: FleetProblem,
+    budget: Budget,
+    links: Links = "exact",
+    hint: IntArray | None = None,
+    on_news: Callable[[News], None] | None = None,
+) -> Plan:
+    """Search once.
+
+    Args:
+        problem: to solve.
+        budget: the limits; without limits the search ends when the optimum is proven.
+        links: how exactly to take the capacity of links; see :class:`~simulator.bound.formulation.Formulation`.
+        hint: actions ``(H, I, 2)`` to start from, such as an earlier plan's, shifted by a step. They become the plan
+            unless the search finds better ones.
+        on_news: called with each better plan or bound, from a thread of the solver.
+
+    Returns:
+        The best plan found; otherwise the hint; without one, all UAVs at full speed.
+
+    Raises:
+        ValueError: the problem has uncertain links or queues, or guidance; only
+            :class:`shared.planning.annealing.Annealing` plans with these.
+        ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
+        Interrupted: Ctrl-C came, and the budget limits seconds.
+    """
+    from simulator.bound.formulation import Formulation
+
+    for name in ("chances", "chains", "allowed", "weights", "late"):
+        if getattr(problem, name) is not None:
+            raise ValueError(f"{name}: CP-SAT plans over certain links and arrivals, without guidance")
+    begun = time.perf_counter()
+    best = _flown(problem, with_fixed(problem, hint))
+    found = _Search(None, 0.0, "UNKNOWN", 0.0)
+    for strategy, share in _CORES if budget.workers == 1 and budget.work >= _WORK_FOR_CORES else _USUAL:
+        formulation = Formulation(problem, links)
+        if hint is not None or best.found:
+            formulation.hint(best.actions)
+        left = budget.seconds - (time.perf_counter() - begun)
+        now = replace(budget, work=budget.work * share, seconds=max(left, 0.0))
+        search = _search(formulation, now, strategy, on_news)
+        found = search._replace(lower_bound=max(search.lower_bound, found.lower_bound), work=found.work + search.work)
+        if search.actions is not None:
+            best = min(best, _flown(problem, search.actions)._replace(found=True), key=lambda p: p.lost_packets)
+        if search.status in ("OPTIMAL", _INTERRUPTED):
+            break
+    seconds = time.perf_counter() - begun
+    whole = Plan(best.actions, best.lost_packets, found.lower_bound, found.status, seconds, found.work)
+    if found.status == _INTERRUPTED:
+        raise Interrupted(whole)
+    return whole
+
+
+def least_loss(
+    problem: FleetProblem, seconds: float, workers: int = 8, on_news: Callable[[News], None] | None = None
+) -> Plan:
+    """The plan of the fewest lost packets and the best bound that can be proven in about ``seconds``.
+
+    The search starts from a greedy plan. It first searches quickly with uniform links, too strong for the bound and too
+    weak for the plan. If bound and plan do not meet, it searches with all ``workers``, and then with exact links.
+
+    Raises:
+        Interrupted: Ctrl-C came.
+    """
+    begun = time.perf_counter()
+    start = best = _unproven(_flown(problem, with_fixed(problem, look_ahead(problem))))
+    try:
+        for best in _improved(problem, start, seconds, workers, on_news):
+            if best.optimal:
+                break
+    except KeyboardInterrupt:
+        raise Interrupted(replace(best, seconds=time.perf_counter() - begun)) from None
+    status = "OPTIMAL" if best.optimal else "FEASIBLE"
+    return replace(best, seconds=time.perf_counter() - begun, status=status)
+
+
+def _improved(
+    problem: FleetProblem, best: Plan, seconds: float, workers: int, on_news: Callable[[News], None] | None
+) -> Iterator[Plan]:
+    """The best plan and bound after each of several searches; Ctrl-C may interrupt the last one."""
+    begun = time.perf_counter()
+    quick = Budget(work=_QUICK_WORK)
+    searches: list[tuple[Links, Budget, float]] = [
+        ("hopeful", quick, 0.3),
+        ("cautious", quick, 0.3),
+        ("hopeful", Budget(workers=workers), 0.5),
+        ("exact", Budget(workers=workers), 1.0),
+    ]
+    for links, budget, share in searches:
+        if links == "cautious":
+            left = seconds - (time.perf_counter() - begun)
+            near = _unproven(_flown(problem, _receding(problem, left * share)))
+            best = _better(best, near, links)
+            yield best
+        left = seconds - (time.perf_counter() - begun)
+        if left <= 0:
+            return
+        now = replace(budget, seconds=max(left * share, 0.01))
+        try:
+            found = plan(problem, now, links, best.actions, _of_all(on_news, best, links))
+        except Interrupted as stopped:
+            yield _better(best, stopped.plan, links)
+            raise
+        best = _better(best, found, links)
+        yield best
+
+
+def _unproven(flown: _Flown) -> Plan:
+    return Plan(flown.actions, flown.lost_packets, 0.0, "FEASIBLE", 0.0, 0.0)
+
+
+def _receding(problem: FleetProblem, seconds: float) -> IntArray:
+    """Actions from plans of a few steps each, one after another: a start for a problem too large as a whole."""
+    begun, flown = time.perf_counter(), []
+    now = problem
+    while True:
+        near = replace(
+            now,
+            arrivals=now.arrivals[:_NEAR],
+            fixed={},
+            usable=None,
+            links=now.links_until(_NEAR),
+        )
+        left = seconds - (time.perf_counter() - begun)
+        actions = look_ahead(near)
+        if left > 0:
+            actions = plan(near, Budget(work=0.3, seconds=left), "cautious", actions).actions
+        kept = actions[: _NEAR // 2 if now.horizon > _NEAR else _NEAR]
+        flown.append(kept)
+        if len(kept) == now.horizon:
+            return np.concatenate(flown)
+        now = replace(
+            near,
+            progress_m=now.progress_m + kept[:, :, 1].sum(axis=0) * problem.scenario.step_s,
+            queue=fly(near, actions).queue[len(kept)],
+            arrivals=now.arrivals[len(kept) :],
+            links=now.links_after(kept),
+        )
+
+
+def _better(best: Plan, found: Plan, links: Links) -> Plan:
+    """The better plan, with the higher of the bounds that hold in the world."""
+    proven = 0.0 if links == "cautious" else found.lower_bound
+    better = min(best, found, key=lambda p: p.lost_packets)
+    return replace(better, lower_bound=max(best.lower_bound, proven), work=best.work + found.work)
+
+
+def _of_all(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
+    """Turn the news of one search into news of all searches, without the promises of too strong or too weak links."""
+    if on_news is None:
+        return None
+
+    def pass_on(news: News) -> None:
+        lost = best.lost_packets if links == "hopeful" else min(best.lost_packets, news.lost_packets)
+        proven = best.lower_bound if links == "cautious" else max(best.lower_bound, news.lower_bound)
+        on_news(News(lost, proven))
+
+    return pass_on
+
+
+class _Search(NamedTuple):
+    """The result of one run of the solver; ``actions`` is ``None`` if it found no plan."""
+
+    actions: IntArray | None
+    lower_bound: float
+    status: str
+    work: float
+
+
+class _Flown(NamedTuple):
+    """Actions and what they lose; ``found`` is true for the solver's own."""
+
+    actions: IntArray
+    lost_packets: int
+    found: bool = False
+
+
+def _flown(problem: FleetProblem, actions: IntArray) -> _Flown:
+    return _Flown(actions, int(fly(problem, actions).lost.sum()))
+
+
+def _search(
+    formulation: Formulation, budget: Budget, strategy: Mapping[str, Any], on_news: Callable[[News], None] | None
+) -> _Search:
+    from ortools.sat.python import cp_model
+
+    solver = cp_model.CpSolver()
+    solver.parameters.num_workers = budget.workers
+    solver.parameters.random_seed = budget.seed
+    # Probing takes longer than the search itself.
+    solver.parameters.cp_model_probing_level = 0
+    for name, value in strategy.items():
+        setattr(solver.parameters, name, value)
+    if budget.work < math.inf:
+        solver.parameters.max_deterministic_time = budget.work
+    if budget.seconds < math.inf:
+        solver.parameters.max_time_in_seconds = budget.seconds
+
+    class Listener(cp_model.CpSolverSolutionCallback):
+        def on_solution_callback(self) -> None:
+            if on_news is not None:
+                on_news(News(self.objective_value, self.best_objective_bound))
+
+    # Python handles Ctrl-C, not the solver.
+    solver.parameters.catch_sigint_signal = False
+    listener = Listener() if on_news is not None else None
+    status, stopped = _solved(solver, formulation.model, listener, budget)
+    found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
+    actions = formulation.actions(solver.value) if found else None
+    # Lost packets are whole numbers; any fraction is the solver's rounding.
+    bound = float(max(0, math.ceil(solver.best_objective_bound - 1e-6)))
+    name = _INTERRUPTED if stopped else solver.status_name(status)
+    return _Search(actions, bound, name, solver.deterministic_time)
+
+
+def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any, bool]:
+    """The solver's status, and whether Ctrl-C ended the search.
+
+    Python handles Ctrl-C only between instructions of the main thread, so a long search runs in another thread.
+    """
+    if budget.seconds == math.inf:
+        return solver.solve(model, listener), False
+    with ThreadPoolExecutor(1) as beside:
+        search = beside.submit(solver.solve, model, listener)
+        try:
+            return search.result(), False
+        except KeyboardInterrupt:
+            solver.stop_search()
+            return search.result(), True

@@ -1,0 +1,81 @@
+"""Running a command: parsing its command line, and turning its errors into messages and exit codes."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TypeVar
+
+import tyro
+from rich.console import Console
+
+from shared.client.errors import EdgeError, EdgeRefused, EdgeUnreachable
+from simulator.errors import INTERRUPTED, RunFailed, UsageError
+
+Options = TypeVar("Options")
+
+
+def command_main(options: type[Options], prog: str, argv: list[str], run: Callable[[Options, Console], int]) -> int:
+    """Run one command from its command line; returns the exit code.
+
+    Args:
+        options: the dataclass whose fields are the command's options and whose docstring is its ``--help``.
+        prog: the command as people type it, such as ``aicvds simulate``.
+        argv: the arguments after it.
+        run: the command itself; returns its exit code, and may raise the errors of :func:`run_reporting_errors`.
+    """
+    try:
+        chosen = tyro.cli(options, prog=prog, args=argv)
+    except SystemExit as done:
+        return done.code if isinstance(done.code, int) else 2
+    return run_reporting_errors(prog, lambda console: run(chosen, console))
+
+
+def run_reporting_errors(prog: str, run: Callable[[Console], int]) -> int:
+    """Run a command; print its errors as one line on stderr and return an exit code. SIGTERM acts like Ctrl-C."""
+    try:
+        with sigterm_interrupts():
+            return run(Console())
+    except UsageError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 2
+    except EdgeError as error:
+        print(f"{prog}: {error}{_remedy(error)}", file=sys.stderr)
+        return 1
+    except RunFailed as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"{prog}: {error.strerror or error}{f': {error.filename}' if error.filename else ''}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _remedy(error: EdgeError) -> str:
+    """What to type next, after a semicolon; empty where that is unknown."""
+    if isinstance(error, EdgeUnreachable):
+        return "; start an edge with `aicvds serve`, or correct --edge"
+    if isinstance(error, EdgeRefused) and error.status == 401:
+        return "; put a key into AICVDS_API_KEY (`aicvds keys add` makes one for the edge)"
+    if isinstance(error, EdgeRefused) and error.status == 403:
+        return "; AICVDS_API_KEY needs a key with that scope (`aicvds keys add --scopes decide admin`)"
+    return ""
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Within the context, SIGTERM raises KeyboardInterrupt, so that `docker stop` leaves a result as Ctrl-C does."""
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,49 @@
+"""One mission to conduct."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+
+from shared.wire.schemas import Mode, Uplink
+from shared.world.scenario import Scenario
+from simulator.sites.site import Site
+
+# Seconds of search for the bound on a mission's losses. Scenario `paper` takes about one.
+BOUND_S = 10.0
+
+
+def new_mission_id(scenario: Scenario, seed: int) -> str:
+    """A new, unique ID such as ``paper-0-1f6c09ab``."""
+    return f"{scenario.name}-{seed}-{secrets.token_hex(4)}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One mission to conduct.
+
+    ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. A ``named`` mission may exist at the
+    edge before the flight. ``note`` is the operator's. Before take-off the mission waits,
+    at most ``wait_s`` seconds, while the LLM's state is one of ``wait_out``. After the flight the bound on its losses
+    is searched for ``bound_s`` seconds at most; 0 searches none. ``reference`` is a mode without an LLM in which the
+    same edge flies the same world once more, after a mission whose mode has one.
+    """
+
+    site: Site
+    seed: int
+    mission_id: str
+    out: Path
+    command: str
+    policy: str = "edge"
+    edge: str | None = None
+    mode: Mode | None = None
+    note: str | None = None
+    named: bool = False
+    uplink: Uplink = "full"
+    deadline_ms: int | None = None
+    wait_s: float = 120.0
+    wait_out: tuple[str, ...] = ("loading",)
+    reconnect_s: float = 0.0
+    bound_s: float = BOUND_S
+    reference: Mode | None = None

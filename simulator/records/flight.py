@@ -1,0 +1,98 @@
+"""A mission's flight as it is recorded: its decisions, each step's losses, the sensors' and UAVs' states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from shared.client.retries_and_redirects import Exchange
+from shared.wire.schemas import Uplink
+from shared.world.scenario import Scenario
+from simulator.records.decision import Decision
+from simulator.records.summary import FlightFacts
+from simulator.records.track import Track
+from simulator.world.observation import StepTally
+
+
+@dataclass
+class Flight:
+    """The whole steps of a mission that were flown.
+
+    ``seed`` is ``None`` where the sensors are real. ``decisions`` are in order of step and UAV. ``tally`` has one entry
+    a step. ``sensor_xy`` has shape (J, 2), metres. ``track`` has the true state before the first step and after each,
+    as far as it is known.
+    """
+
+    scenario: Scenario
+    seed: int | None
+    decisions: list[Decision] = field(default_factory=list)
+    tally: list[StepTally] = field(default_factory=list)
+    sensor_xy: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    track: Track = field(default_factory=Track)
+    interrupted: bool = False
+    started_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    duration_s: float = 0.0
+
+    @property
+    def steps_flown(self) -> int:
+        """The number of whole steps flown."""
+        return len(self.tally)
+
+    def facts(
+        self,
+        *,
+        policy: str,
+        edge: str | None,
+        uplink: Uplink | None = None,
+        mission_id: str,
+        mode: str | None,
+        model: str | None,
+        deadline_ms: int | None,
+        command: str,
+    ) -> FlightFacts:
+        """The facts for ``simulator.records.summary.summarise``."""
+        return FlightFacts(
+            scenario=self.scenario.name,
+            seed=self.seed,
+            steps=self.scenario.steps,
+            steps_flown=self.steps_flown,
+            uavs=self.scenario.uavs,
+            sensors=self.scenario.sensors,
+            policy=policy,
+            edge=edge,
+            uplink=uplink,
+            mission_id=mission_id,
+            mode=mode,
+            model=next((d.model for d in reversed(self.decisions) if d.model), model),
+            deadline_ms=next((d.deadline_ms for d in reversed(self.decisions) if d.deadline_ms), deadline_ms),
+            interrupted=self.interrupted,
+            started_at=self.started_at,
+            duration_s=self.duration_s,
+            version=version("aic-vds"),
+            command=command,
+        )
+
+
+def exchange_fields(exchange: Exchange | None) -> dict[str, Any]:
+    """The fields of a ``Decision`` that come from the edge's answer; empty without an exchange."""
+    if exchange is None:
+        return {}
+    answer = exchange.response
+    return {
+        "model": answer.model,
+        "decision_id": answer.decision_id,
+        "top_k": answer.top_k,
+        "trust": {} if answer.guided is None else answer.guided.trust,
+        "tokens": answer.tokens,
+        "latency_ms": answer.latency_ms,
+        "deadline_ms": answer.deadline_ms,
+        "rtt_ms": exchange.rtt_ms,
+        "attempts": exchange.attempts,
+        "request_bytes": exchange.request_bytes,
+        "response_bytes": exchange.response_bytes,
+        "attention_bytes": exchange.attention_bytes,
+    }

@@ -1,0 +1,179 @@
+"""An operator's note, flown: report, page and ``GET /missions/{id}`` show the deadlines that the records show."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from playwright.sync_api import expect
+
+from service.api.app import create_app
+from service.config.settings import Settings
+from simulator.commands import simulate
+from simulator.flying.pilots import Choice, EdgePilot
+from simulator.world.observation import Observation
+from tests.e2e.page.conftest import Open, violations
+from tests.support.running import serving
+from tests.support.undrawn import reports_undrawn
+from tests.support.waiting import until
+from tests.unit.service.guidance.test_operator_guidance import Scribe
+from tests.unit.service.stub_llm import wait_for
+
+pytestmark = pytest.mark.needs("chromium")
+
+NOTE = "Suspected leak at sensor 3: visit it every third step."
+EVERY = 3
+ORDERS = f"visit sensor 3 every {EVERY} steps"
+FIRST, SECOND = (f"Visit sensor {sensor} at least once in every {every} steps." for sensor, every in ((3, 3), (2, 4)))
+# Two of ten radios are dead, so that some visits fail.
+FLIGHT = ("--scenario", "faulty", "--seed", "2", "--no-bound")
+
+
+@contextmanager
+def reading(*orders: str) -> Iterator[str]:
+    """An edge in this process, whose LLM rewrites notes as these orders, one after another."""
+    with serving(Scribe(*orders).app) as llm:
+        settings = Settings(mode="llm", llm_url=f"{llm}/v1", llm_model="scribe", deadline_ms=60_000)
+        with serving(create_app(settings)) as url:
+            with httpx.Client(base_url=url) as client:
+                wait_for(client, "ready")
+            yield url
+
+
+@pytest.fixture(scope="module")
+def edge() -> Iterator[str]:
+    with reading(ORDERS) as url:
+        yield url
+
+
+@pytest.fixture
+def renewed() -> Iterator[str]:
+    """An edge that reads two notes, and understands no third."""
+    with reading(ORDERS, "visit sensor 2 every 4 steps", "hm") as url:
+        yield url
+
+
+def deadlines(out: Path, sensor: int, every: int, since: int = 0, end: int | None = None) -> list[int]:
+    """Met and missed, window by window, of ``decisions.jsonl`` alone."""
+    decisions = [json.loads(line) for line in (out / "decisions.jsonl").read_text(encoding="utf-8").splitlines()]
+    served = {d["step"] for d in decisions if d["sensor_id"] == sensor and not d["failed"]}
+    last = max(d["step"] for d in decisions) if end is None else end - 1
+    windows = [range(step - every + 1, step + 1) for step in range(since + every - 1, last + 1)]
+    met = sum(not served.isdisjoint(window) for window in windows)
+    return [met, len(windows) - met]
+
+
+def proposed(edge: str, mission: str) -> None:
+    address = f"{edge}/missions/{mission}/guidance"
+    until(lambda: httpx.get(address).json()["status"] == "proposed", lambda: httpx.get(address).text)
+
+
+def guide(edge: str, mission: str, **answer: Any) -> None:
+    assert httpx.post(f"{edge}/missions/{mission}/guidance", json=answer).status_code == 200
+
+
+def shown(visit: Open, edge: str, mission: str) -> list[int]:
+    """Met and missed on the mission page."""
+    page = visit(f"{edge}/?mission={mission}")
+    expect(page.locator("#badge")).to_have_text("Ended")
+    page.locator("#operator > summary").click()
+    text = page.locator("#deadlines-met").inner_text()
+    found = re.search(r"are over: (\d+) met, (\d+) missed", text)
+    assert found is not None, text
+    return [int(number) for number in found.groups()]
+
+
+def test_a_confirmed_note_shows_the_same_deadlines_everywhere(edge: str, visit: Open, tmp_path: Path) -> None:
+    scenario = {"scenario": "faulty", "note": NOTE, "seed": 2}
+    assert httpx.put(f"{edge}/missions/patrol", json={**scenario, "mode": "value"}).status_code == 200
+    proposed(edge, "patrol")
+    guide(edge, "patrol", answer="confirm")
+    out = tmp_path / "run"
+    assert simulate.main(["--edge", edge, *FLIGHT, "--mission", "patrol", "--out", str(out)]) == 0
+    met, missed = counted = deadlines(out, 3, EVERY)
+    # So that no number agrees by being 0.
+    assert met > 0 and missed > 0
+    operator = json.loads((out / "summary.json").read_bytes())["operator"]
+    told = httpx.get(f"{edge}/missions/patrol").json()["deadlines"]
+    assert operator["note"] == NOTE and operator["deadlines"] == told
+    assert told == [{"sensor_id": 3, "visit_every": EVERY, "since": 0, "until": None, "met": met, "missed": missed}]
+    report = (out / "report.html").read_text(encoding="utf-8")
+    assert f"<td>visit deadlines met / missed</td><td>{met} / {missed}</td>" in report
+    assert f"<td>sensor 3, every 3 steps</td><td>0</td><td>29</td><td>{met}</td><td>{missed}</td>" in report
+    assert NOTE in report and "which may cost packets: Visit sensor 3 at least once in every 3 steps." in report
+    assert shown(visit, edge, "patrol") == counted
+
+
+def test_orders_that_change_in_flight_are_counted_while_they_are_in_force(
+    edge: str, visit: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, decide = tmp_path / "run", EdgePilot.decide
+    own = {"sensors": [{"sensor_id": 3, "visit_every": EVERY}, {"sensor_id": 5, "visit_every": 2}]}
+
+    def deciding(pilot: EdgePilot, uav: int, seen: Observation, taken: frozenset[int]) -> Choice:
+        at = (int(seen["step"][0]), uav)
+        if at == (4, 0):
+            proposed(edge, "watch")
+            guide(edge, "watch", answer="confirm")
+        # UAV 0 has decided already, so these are in force from the next step on.
+        elif at == (12, 1):
+            guide(edge, "watch", guidance=own)
+        elif at == (20, 0):
+            guide(edge, "watch", answer="reject")
+        return decide(pilot, uav, seen, taken)
+
+    monkeypatch.setattr(EdgePilot, "decide", deciding)
+    with reports_undrawn():
+        options = ("--mode", "value", "--mission", "watch", "--note", NOTE)
+        assert simulate.main(["--edge", edge, *FLIGHT, *options, "--out", str(out)]) == 0
+    spans = [(3, EVERY, 4, 20), (5, 2, 13, 20)]
+    counted = [deadlines(out, *span) for span in spans]
+    assert [sum(counts) for counts in counted] == [14, 6]
+    names = ("sensor_id", "visit_every", "since", "until", "met", "missed")
+    expected = [dict(zip(names, (*span, *counts), strict=True)) for span, counts in zip(spans, counted, strict=True)]
+    operator = json.loads((out / "summary.json").read_bytes())["operator"]
+    assert operator == {"note": NOTE, "orders": None, "deadlines": expected}
+    assert httpx.get(f"{edge}/missions/watch").json()["deadlines"] == expected
+    assert shown(visit, edge, "watch") == [sum(counts) for counts in zip(*counted, strict=True)]
+
+
+def test_the_page_says_which_orders_end_and_always_offers_to_withdraw_them(renewed: str, visit: Open) -> None:
+    assert httpx.put(f"{renewed}/missions/two", json={"mode": "value", "note": NOTE}).status_code == 200
+    page = visit(f"{renewed}/?mission=two", expected=("409",))
+    note, changes, in_force = (page.locator(f"#{name}") for name in ("note-input", "note-changes", "orders-words"))
+    send, confirm, withdraw = (
+        page.get_by_role("button", name=name) for name in ("Send the note", "Confirm", "Withdraw the orders")
+    )
+    # The first reading ends nothing.
+    expect(confirm).to_be_visible()
+    expect(changes).to_be_hidden()
+    expect(withdraw).to_be_hidden()
+    confirm.click()
+    expect(in_force).to_have_text(FIRST)
+    note.fill("Look at sensor 2 every 4 steps.")
+    send.click()
+    expect(changes).to_have_text(f"These orders end when you confirm: {FIRST} These begin: {SECOND}")
+    expect(withdraw).to_be_visible()
+    assert violations(page) == []
+    # Another operator answers meanwhile; what this one confirms is what the page shows.
+    page.get_by_role("button", name="Freeze view").click()
+    guide(renewed, "two", guidance={"max_velocity": 9})
+    confirm.click()
+    expect(page.locator("#operator-error")).to_contain_text("the guidance has changed since")
+    page.get_by_role("button", name="Freeze view").click()
+    expect(in_force).to_have_text("Never fly faster than 9 m/s.")
+    expect(page.locator("#orders-ended")).to_have_text(f"Ended by the last change: {FIRST}")
+    note.fill("Mind sensor 2.")
+    send.click()
+    expect(page.locator("#note-state")).to_contain_text("was not understood")
+    withdraw.click()
+    expect(in_force).to_have_text("None.")
+    expect(page.locator("#orders-ended")).to_contain_text("Never fly faster than 9 m/s.")
+    expect(page.locator("#note-state")).to_contain_text("was not understood")
+    expect(withdraw).to_be_hidden()

@@ -1,0 +1,107 @@
+"""The file that says which device is which sensor: what is wrong in it is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from field.lorawan.configuration import BadConfiguration, Configuration, read_configuration
+from tests.support.places import ROOT
+
+EXAMPLE = ROOT / "examples" / "lorawan" / "lorawan.toml"
+TEXT = EXAMPLE.read_text()
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "lorawan.toml"
+    path.write_text(text)
+    return path
+
+
+def read(tmp_path: Path, *replaced: tuple[str, str]) -> Configuration:
+    text = TEXT
+    for old, new in replaced:
+        assert old in text
+        text = text.replace(old, new, 1)
+    return read_configuration(written(tmp_path, text))
+
+
+def test_the_example_is_read() -> None:
+    found = read_configuration(EXAMPLE)
+    assert found.broker.address == ("localhost", 1883)
+    assert [found.mission_of(device) for device in found.device] == ["patrol", "patrol", "patrol-north"]
+    assert found.network.topics == [
+        f"application/{found.network.application}/device/+/event/{event}" for event in ("up", "status")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("tenant", "topic"), [('tenant = "ttn"', "v3/app1@ttn/devices/+/up"), ("", "v3/app1/devices/+/up")]
+)
+def test_the_things_stack_has_a_tenant_in_its_topics_except_the_open_source_one(
+    tmp_path: Path, tenant: str, topic: str
+) -> None:
+    found = read(
+        tmp_path,
+        ('"chirpstack"', '"the-things-stack"'),
+        ('application = "ae5ba7f1-53a6-4f0e-9f3b-6f1f3a7c2b10"', 'application = "app1"'),
+        ('tenant = "52f14cd4-c6f1-4fbd-8f87-4025e1d49242"', tenant),
+    )
+    assert found.network.topics == [topic]
+
+
+@pytest.mark.parametrize(
+    ("url", "address"),
+    [
+        ("mqtt://broker:1884", ("broker", 1884)),
+        ("mqtts://broker.example", ("broker.example", 8883)),
+        ("mqtts://[::1]", ("::1", 8883)),
+        ("mqtt://[::1]:1884", ("::1", 1884)),
+    ],
+)
+def test_an_address_has_the_usual_port_unless_it_names_one(tmp_path: Path, url: str, address: tuple[str, int]) -> None:
+    assert read(tmp_path, ("mqtt://localhost", url)).broker.address == address
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("mqtt://localhost", "http://localhost", "broker.url: must be mqtt://host"),
+        ("mqtt://localhost", "mqtt://me:secret@localhost", "broker.url: must be mqtt://host"),
+        ("mqtt://localhost", "mqtt://localhost:70000", "broker.url: must be mqtt://host"),
+        ('"chirpstack"', '"chirp"', "network.server: "),
+        ('application = "ae', 'application = "+/ae', "network.application: "),
+        ('queue = "queue"', 'queue = ".queue"', "payload.queue: "),
+        ('queue = "queue"', 'queues = "queue"', "payload.queue: is missing"),
+        ("battery_full_j = 50", 'battery = "b"', "payload: battery_full_j is missing"),
+        ("battery_full_j = 50", "battery_full_j = nan", "payload.battery_full_j: "),
+        ('"0004a30b001c0531"', '"0004a30b001c053"', "device[1].dev_eui: "),
+        ('"0004a30b001c0531"', '"0004A30B001C0530"', "device: device 0004a30b001c0530 appears more than once"),
+        ("sensor_id = 1", "sensor_id = 0", "device: sensor 0 of patrol appears more than once"),
+        ("sensor_id = 1", "sensor_id = -1", "device[1].sensor_id: "),
+        ("sensor_id = 1", "sensor = 1", "device[1].sensor_id: is missing"),
+        ('mission = "patrol"', 'mission = "pa trol"', "mission: "),
+        ('mission = "patrol"', 'misson = "patrol"', "misson: there is no such field; did you mean mission?"),
+        ("# ca_file", "ca_file", "broker: ca_file, certificate and key are for TLS"),
+        ('url = "mqtt://', 'certificate = "c"\nurl = "mqtts://', "broker: certificate and key belong together"),
+        ('url = "mqtt://', 'ca_file = "none.pem"\nurl = "mqtts://', "broker.ca_file: there is no file "),
+        ("[[device]]", "[[device]", "is no TOML: "),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, named: str) -> None:
+    with pytest.raises(BadConfiguration) as error:
+        read(tmp_path, (old, new))
+    assert str(error.value).startswith(str(tmp_path / "lorawan.toml"))
+    assert named in str(error.value)
+
+
+def test_files_for_tls_are_beside_the_file(tmp_path: Path) -> None:
+    (tmp_path / "ca.crt").write_text("")
+    found = read(tmp_path, ('url = "mqtt://localhost"', 'url = "mqtts://localhost"\nca_file = "ca.crt"'))
+    assert found.broker.ca_file == tmp_path / "ca.crt"
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadConfiguration, match="No such file"):
+        read_configuration(tmp_path / "none.toml")

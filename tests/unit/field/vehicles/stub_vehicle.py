@@ -1,0 +1,87 @@
+"""A vehicle and a clock in simulated time, for what needs no wire."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+
+from field.errors import VehicleError
+from field.vehicles.mission_clock import Clock
+from field.vehicles.vehicle import FlightMode, VehicleState
+from shared.world.trajectory import trajectories
+from simulator.sites.plans.mission_path import MissionItem
+from simulator.sites.site import Site
+
+
+class SimulatedClock(Clock):
+    """Moves only where it is waited for."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def now(self) -> float:
+        return self.now_s
+
+    async def until(self, time_s: float) -> None:
+        await asyncio.sleep(0)
+        self.now_s = max(self.now_s, time_s)
+
+
+class StubVehicle:
+    """Flies its trajectory at the speed that it is told, times ``wind``.
+
+    Attributes:
+        told: every command.
+        lands_at_s: from then on it lands.
+        shift_m: how far north of its path it reports itself.
+    """
+
+    def __init__(self, site: Site, uav: int, clock: SimulatedClock, wind: float = 1.0) -> None:
+        self.name = f"stub {uav}"
+        self.told: list[str | float] = []
+        self.lands_at_s = float("inf")
+        self.shift_m = 0.0
+        self.deaf = False
+        self.mode: FlightMode = "mission"
+        self.flown_m = 0.0
+        self._site, self._path, self._clock, self._wind = site, trajectories(site.scenario)[uav], clock, wind
+        self._speed, self._at_s = 5.0, clock.now()
+
+    async def state(self) -> VehicleState:
+        """Now."""
+        self._advance()
+        assert self._site.frame is not None
+        x, y = self._path.at(self.flown_m).tolist()
+        longitude, latitude = self._site.frame.degrees([(x, y + self.shift_m)])[0].tolist()
+        state = VehicleState(True, True, self.mode, (longitude, latitude), 100.0)
+        return replace(state, mode="landing") if self._clock.now() >= self.lands_at_s else state
+
+    async def mission(self) -> list[MissionItem]:
+        """None."""
+        return []
+
+    async def set_speed(self, speed_m_s: float) -> None:
+        """Fly at it."""
+        self._obey(speed_m_s)
+        self._speed = speed_m_s
+
+    async def hold(self) -> None:
+        """Stay."""
+        self._obey("hold")
+        self.mode = "hold"
+
+    async def resume(self) -> None:
+        """Go on."""
+        self._obey("resume")
+        self.mode = "mission"
+
+    def _obey(self, command: str | float) -> None:
+        self._advance()
+        self.told.append(command)
+        if self.deaf:
+            raise VehicleError(f"{self.name} did not do {command}: TIMEOUT")
+
+    def _advance(self) -> None:
+        if self.mode == "mission":
+            self.flown_m += self._speed * self._wind * (self._clock.now() - self._at_s)
+        self._at_s = self._clock.now()

@@ -1,0 +1,50 @@
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.config.settings import Settings
+from shared.kit.cores import usable_cores
+
+
+@pytest.mark.parametrize(("quota", "cores"), [("100000 100000", 1), ("50000 100000", 1), ("99900000 100000", None)])
+def test_a_containers_quota_counts(tmp_path: Path, quota: str, cores: int | None) -> None:
+    (tmp_path / "cpu.max").write_text(f"{quota}\n")
+    assert usable_cores(tmp_path / "cpu.max") == (cores or usable_cores(tmp_path / "none"))
+
+
+def test_no_quota_is_no_limit(tmp_path: Path) -> None:
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    assert usable_cores(tmp_path / "cpu.max") == usable_cores(tmp_path / "none") >= 1
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *("localhost:8080", "ftp://host/v1", "http:/host", "http:///v1", "http://[::1/v1", "http://me:PASS@host/v1"),
+        "http://ho\tst/v1",
+    ],
+)
+def test_an_llm_url_must_be_one(url: str) -> None:
+    with pytest.raises(ValidationError, match="llm_url") as caught:
+        Settings(llm_url=url)
+    assert all("PASS" not in fault["msg"] for fault in caught.value.errors())
+
+
+def test_a_trailing_slash_makes_no_difference() -> None:
+    assert Settings(llm_url="http://host/v1/").llm_url == "http://host/v1"
+
+
+def test_a_key_read_from_a_file_loses_its_newline_and_never_shows() -> None:
+    settings = Settings(llm_api_key="sk-secret\n")
+    assert settings.llm_api_key is not None
+    assert settings.llm_api_key.get_secret_value() == "sk-secret"
+    assert "secret" not in repr(settings)
+    with pytest.raises(ValidationError, match="printable ASCII"):
+        Settings(llm_api_key="sk-\u00e9")
+
+
+def test_experiences_that_cannot_fit_the_context_are_refused() -> None:
+    with pytest.raises(ValidationError, match="AICVDS_LLM_CONTEXT"):
+        Settings(experiences=200)
+    assert Settings(experiences=200, llm_context=8192).experiences == 200

@@ -1,0 +1,49 @@
+"""What the event loop calls is compiled before the edge is ready, in one form."""
+
+from __future__ import annotations
+
+from service.edge.compilation import load_for_event_loop
+from service.prompting import row_kinds
+from service.prompting.token_accounting import UnprunedState
+from shared.belief import beacon_updates, expected_queues, link_expectations, record_updates
+from shared.belief.fleet_belief import FleetBelief
+from shared.belief.records import take_report
+from shared.features.augmented_state import augment
+from tests.unit.shared.belief.test_belief_updates import WORLD, flown, report
+
+
+def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
+    """On the event loop every decision would wait for the compiler."""
+    functions = [
+        beacon_updates.take_beacons,
+        beacon_updates.take_arrivals,
+        beacon_updates.in_range,
+        expected_queues.bursts_to_come,
+        expected_queues.expected_queues,
+        record_updates.record_beacons,
+        link_expectations.measured_excess,
+        link_expectations.expected_transfers,
+        link_expectations.transfer,
+        link_expectations.know_rings,
+        link_expectations.formula_transfers,
+        row_kinds.count_kinds,
+    ]
+    load_for_event_loop()
+    assert {function.__name__: len(function.signatures) for function in functions} == {  # type: ignore[attr-defined]
+        function.__name__: 1 for function in functions
+    }
+    belief, records = flown(60)
+    again = FleetBelief(WORLD)
+    again.load_state_dict(belief.state_dict())
+    for step in range(60, 64):
+        take_report(report(step), step, records, again)
+        for known, rates in ((again, None), (None, records.rates)):
+            state = augment(
+                report(step), step, WORLD, visits=records.visits, rates=rates, reserved=(), preset="reach", belief=known
+            )
+            UnprunedState(state, ",".join).tokens(len)
+        again.tell(step % 2, step, 0, 3)
+        again.settle(step % 2, step, failed=False)
+    again.queue(70)
+    again.arrivals.burst(70)
+    assert {len(function.signatures) for function in functions} == {1}  # type: ignore[attr-defined]

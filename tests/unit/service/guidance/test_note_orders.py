@@ -1,0 +1,123 @@
+"""Orders: what an LLM may say of a note, and what is refused whatever the server promised."""
+
+import json
+import re
+from contextlib import suppress
+
+import pytest
+
+from service.guidance.note_orders import BadOrders, numbers_in, parse_orders, similar_examples
+from service.guidance.order_examples import EXAMPLES
+from service.guidance.order_grammar import admissible, constrain_orders
+from shared.planning.orders import Guidance, SensorWish
+
+NOTE = "Suspected leak at sensor 4: visit it every third step, not over 9 m/s."
+MEANT = Guidance(sensors=[SensorWish(sensor_id=4, visit_every=3)], max_velocity=9)
+ORDERS = "visit sensor 4 every 3 steps, fly at most 9 m/s"
+
+
+def test_orders_become_a_structure() -> None:
+    assert parse_orders(ORDERS, NOTE) == MEANT
+    assert parse_orders(json.dumps({"orders": ORDERS.split(", ")}), NOTE) == MEANT
+    assert parse_orders(" nothing\n", NOTE) == Guidance()
+    both = parse_orders("visit sensor 4 every 3 steps, sensor 4 counts 9 times", NOTE)
+    assert both.sensors == [SensorWish(sensor_id=4, visit_every=3, weight=9)]
+
+
+def test_numbers_are_found_as_digits_and_as_words() -> None:
+    assert numbers_in("Sensor 12 every other step, twice as important as sensor 3") == {12: 1, 2: 2, 3: 1}
+    assert numbers_in("Be careful.") == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("visit sensor 5 every 3 steps", "number 5 more often than the note"),
+        ("visit sensor 4 every 3 steps, fly at most 3 m/s", "number 3 more often than the note"),
+        ("fly at most 9 m/s, fly at most 3 m/s", "ordered twice"),
+        ("visit sensor 4 every 3 steps!", "is no order"),
+        ("I would visit sensor 4.", "is no order"),
+        ("{", "is not a JSON object with a list of orders"),
+        ('{"orders": [4]}', "is not a JSON object with a list of orders"),
+        ("", "is no order"),
+    ],
+)
+def test_what_the_note_does_not_bear_is_refused(text: str, why: str) -> None:
+    with pytest.raises(BadOrders, match=re.escape(why)):
+        parse_orders(text, NOTE)
+
+
+def test_a_value_out_of_range_is_refused_by_name() -> None:
+    with pytest.raises(BadOrders, match="weight"):
+        parse_orders("sensor 4 counts 60 times", "sensor 4 counts 60 times")
+    with pytest.raises(BadOrders, match="max_velocity"):
+        parse_orders("fly at most 60 m/s", "at most 60 m/s")
+
+
+def test_a_note_without_numbers_or_with_very_many_is_not_asked_about() -> None:
+    with pytest.raises(BadOrders, match="has no number"):
+        admissible("Be careful.")
+    with pytest.raises(BadOrders, match="more than 10"):
+        admissible(" ".join(map(str, range(40))))
+
+
+def test_every_constraint_allows_the_right_orders_and_no_other_number() -> None:
+    orders = admissible(NOTE)
+    assert set(ORDERS.split(", ")) <= set(orders)
+    assert {int(n) for order in orders for n in re.findall(r"[0-9]+", order)} == {3, 4, 9}
+    grammar = constrain_orders("grammar", NOTE)["grammar"]
+    assert all(f'"{order}"' in grammar for order in orders)
+    regex = constrain_orders("structured_outputs", NOTE)["structured_outputs"]["regex"]
+    assert re.fullmatch(regex, ORDERS) and re.fullmatch(regex, "nothing")
+    assert not re.fullmatch(regex, "visit sensor 5 every 3 steps")
+    schema = constrain_orders("json_schema", NOTE)["response_format"]["json_schema"]["schema"]
+    assert schema["properties"]["orders"]["items"]["enum"] == orders
+    assert constrain_orders("none", NOTE) == {}
+
+
+def derived(grammar: str) -> set[str]:
+    """All that a grammar without recursion allows."""
+    rules = dict(line.split(" ::= ", 1) for line in grammar.splitlines())
+
+    def said(rule: str) -> set[str]:
+        found = set()
+        for words, _, following in re.findall(r'\(("[^)]*")\)( \(", " (s\d+)\)\?)?', rules[rule]):
+            for order in re.findall(r'"([^"]*)"', words):
+                found |= {order} | ({f"{order}, {rest}" for rest in said(following)} if following else set())
+        return found
+
+    return said("s0") | {"nothing"}
+
+
+def test_the_grammar_uses_no_number_more_often_than_the_note() -> None:
+    note = "Suspected leak at sensor 4: visit it every third step."
+    said = derived(constrain_orders("grammar", note)["grammar"])
+    assert "visit sensor 4 every 3 steps" in said and "fly at most 3 m/s, do not fly at 4 m/s" in said
+    assert "visit sensor 4 every 3 steps, sensor 4 counts 3 times" not in said
+    for text in said:
+        with suppress(BadOrders):
+            parse_orders(text, note)
+            continue
+        # Nothing is refused for its numbers.
+        assert re.search("fly at (most|least).*fly at", text), text
+    twice = derived(constrain_orders("grammar", "Sensor 3 every 3 steps, it counts 5 times.")["grammar"])
+    assert "visit sensor 3 every 3 steps, sensor 3 counts 5 times" in twice
+
+
+def test_a_note_with_many_numbers_gets_a_small_grammar() -> None:
+    grammar = constrain_orders("grammar", " ".join(map(str, range(10))))["grammar"]
+    assert grammar.count("::=") == 2
+
+
+def test_every_worked_example_stands_up_to_its_own_checks() -> None:
+    for note, orders in EXAMPLES:
+        understood = parse_orders(orders, note)
+        assert bool(understood) == (orders != "nothing")
+        if orders != "nothing":
+            assert set(orders.split(", ")) <= set(admissible(note))
+
+
+def test_the_examples_shown_are_the_most_alike() -> None:
+    nearest, orders = similar_examples("Never use 3 m/s.")[-1]
+    assert (nearest, orders) == ("Never use 12 m/s.", "do not fly at 12 m/s")
+    assert len(similar_examples(NOTE)) == len(set(similar_examples(NOTE))) == 8

@@ -1,0 +1,82 @@
+"""Reading notes with the orders' adapter: three readings, their agreement, and their doubts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, cast
+
+import pytest
+
+from service.guidance.lettered_orders import STATIC
+from service.guidance.note_compiler import compile_note
+from service.guidance.note_orders import BadOrders
+from service.llm.answers import Completion, TokenPosition
+from service.llm.request_bodies import Rewriting
+from service.llm.server_pool import ServerPool
+from shared.planning.orders import Guidance, Impossible, SensorWish
+from shared.world.scenario import SCENARIOS
+
+PAPER = SCENARIOS["paper"]
+NOTE = "Sensor 4 every 3 steps, and not over 9 m/s."
+MEANT = Guidance(sensors=[SensorWish(sensor_id=4, visit_every=3)], max_velocity=9)
+RIGHT, OTHER = "visit {0} every {1}; max {2}", "visit {0} every {1}; min {2}"
+
+
+class Adapted:
+    """An embedded LLM with the orders' adapter that says this of the note's letters, one answer a reading."""
+
+    reads_letters = True
+
+    def __init__(self, answers: Sequence[str], probability: float = 1.0) -> None:
+        self._answers = iter(answers)
+        self._probability = probability
+        self.read: list[str] = []
+
+    async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> Completion:
+        fields = wanted.constrain("grammar")
+        assert (wanted.instruction, temperature, fields["logprobs"]) == (STATIC, 0.0, True)
+        letters = re.findall(r"\b[A-Z]\b", wanted.text)
+        assert all(f'"{letter}"' in fields["grammar"] for letter in letters)
+        self.read.append(wanted.text)
+        text = next(self._answers).format(*letters)
+        positions = tuple(TokenPosition(f" {word}", {word: self._probability}) for word in text.split())
+        return Completion(text, None, None, None, positions)
+
+
+async def reading(llm: Adapted) -> Any:
+    return await compile_note(NOTE, PAPER, cast(ServerPool, llm))
+
+
+async def test_three_readings_with_other_letters_that_agree_have_no_doubt() -> None:
+    llm = Adapted([RIGHT] * 3)
+    found = await reading(llm)
+    assert (found.guidance, found.doubts) == (MEANT, ())
+    assert len(set(llm.read)) == 3
+
+
+@pytest.mark.parametrize("answers", [[RIGHT, OTHER, RIGHT], [OTHER, RIGHT, RIGHT], [RIGHT, RIGHT, "unclear"]])
+async def test_where_the_readings_differ_the_commonest_is_proposed_with_a_doubt(answers: list[str]) -> None:
+    found = await reading(Adapted(answers))
+    assert found.guidance == MEANT
+    assert found.doubts == ("The note can be read in more than one way.",)
+
+
+async def test_an_unlikely_reading_has_a_doubt() -> None:
+    assert (await reading(Adapted([RIGHT] * 3, probability=0.9))).doubts == ("The LLM is not sure of this reading.",)
+
+
+async def test_a_note_that_most_readings_find_unclear_is_refused() -> None:
+    with pytest.raises(BadOrders, match="is unclear"):
+        await reading(Adapted(["unclear", RIGHT, "unclear"]))
+
+
+async def test_what_the_fleet_cannot_do_is_refused() -> None:
+    with pytest.raises(Impossible, match="sensor 9 is unknown"):
+        llm = cast(ServerPool, Adapted([RIGHT] * 3))
+        await compile_note(NOTE.replace("4", "9"), PAPER.model_copy(update={"sensors": 5}), llm)
+
+
+async def test_more_than_twenty_numbers_are_refused() -> None:
+    with pytest.raises(BadOrders, match="more than 20"):
+        await compile_note("1 " * 21, PAPER, cast(ServerPool, Adapted([])))

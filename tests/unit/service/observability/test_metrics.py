@@ -1,0 +1,80 @@
+"""What Prometheus is told of learning and of the queues."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any
+
+import httpx
+import pytest
+
+from service.observability.metrics import Metrics
+from tests.support.places import ROOT
+from tests.support.waiting import until
+
+Report = Callable[..., dict[str, Any]]
+Edge = Callable[..., httpx.Client]
+
+
+def numbers(client: httpx.Client) -> dict[str, float]:
+    """The edge's numbers by series."""
+    lines = (line.rsplit(" ", 1) for line in client.get("/metrics").text.splitlines() if not line.startswith("#"))
+    return {series: float(number) for series, number in lines}
+
+
+def test_every_update_counts_with_its_loss(edge: Edge, report: Report) -> None:
+    client, outcome = edge(), None
+    for step in range(6):
+        answer = client.post("/decide", json=report(step=step, outcome=outcome)).json()
+        outcome = {"decision_id": answer["decision_id"], "cost": 2.0}
+    until(lambda: numbers(client)["aicvds_learner_update_loss_count"] >= 5)
+    told = numbers(client)
+    assert told["aicvds_learner_update_loss_count"] == 5
+    assert told["aicvds_learner_update_loss_sum"] > told["aicvds_learner_loss"] > 0
+    last = client.get("/missions/test").json()["learner_loss"]
+    assert told["aicvds_learner_loss"] == pytest.approx(last)
+
+
+def test_full_queues_are_a_risk_and_empty_ones_are_none(edge: Edge, report: Report) -> None:
+    client, totals = edge(), []
+    for packets in (0, 60):
+        body = report(mission_id=f"queues-of-{packets}")
+        sensors = body["sensors"]
+        sensors.update({name: column[:4] for name, column in sensors.items()})
+        sensors["queue"] = [packets] * 4
+        assert client.post("/decide", json=body).status_code == 200
+        totals.append(numbers(client)["aicvds_overflow_risk_sum"])
+    assert totals[0] < 0.05
+    assert totals[1] - totals[0] > 0.95
+
+
+def test_the_version_is_that_of_the_package(edge: Edge) -> None:
+    client = edge()
+    assert numbers(client)[f'aicvds_build_info{{version="{version("aic-vds")}"}}'] == 1
+    assert client.get("/openapi.json").json()["info"]["version"] == version("aic-vds")
+
+
+def test_without_an_llm_no_breaker_is_open(edge: Edge) -> None:
+    told = numbers(edge())
+    assert told["aicvds_llm_breaker_open"] == 0
+    by_status = {series: n for series, n in told.items() if series.startswith("aicvds_llm_servers")}
+    assert by_status == {
+        f'aicvds_llm_servers{{status="{status}"}}': float(status == "off")
+        for status in ("loading", "ready", "unavailable", "off")
+    }
+
+
+def test_the_docs_name_every_metric_with_its_labels() -> None:
+    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    named = {
+        row[1].strip(" `"): (row[2].strip(), re.findall(r"`(\w+)`", row[3]))
+        for row in (line.split("|") for line in page.splitlines() if line.startswith("| `aicvds_"))
+    }
+    ends = {"counter": "_total", "info": "_info"}
+    collectors: list[Any] = [
+        c for c in Metrics().registry._collector_to_names if getattr(c, "_name", "").startswith("aicvds")
+    ]
+    kinds = [(c._name, getattr(c, "_type", "histogram"), getattr(c, "_labelnames", ())) for c in collectors]
+    assert named == {name + ends.get(kind, ""): (kind, list(labels)) for name, kind, labels in kinds}

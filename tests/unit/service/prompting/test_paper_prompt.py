@@ -1,0 +1,229 @@
+import hashlib
+import json
+from typing import Any, Literal
+
+import pytest
+
+from service.errors import Refused
+from service.mission.mission_status import status_of
+from service.prompting.paper_prompt import Template
+from service.prompting.prompt import Prompt
+from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
+from shared.world.actions import Action
+from shared.world.scenario import SCENARIOS
+from tests.unit.service.making import PAPER, attended, mission, uav
+
+Format = Literal["csv", "json", "markdown"]
+FORMATS: list[Format] = ["csv", "json", "markdown"]
+
+
+def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> list[Prompt]:
+    """The prompts of a mission's first steps, each decided for sensor 1 at 7 m/s and paid for."""
+    m = mission(spec, **settings)
+    prompts = []
+    for step in range(steps):
+        view = attended(m, uav(step=step, position=(500.0 + step, 500.0)), step)
+        prompts.append(m.template.prompt(view.state, view.shown(), m.experiences.block))
+        m.commit(view.pending(f"{step:032x}", Action(1, 7)))
+        m.apply(Outcome(decision_id=f"{step:032x}", cost=0.125))
+    return prompts
+
+
+@pytest.mark.parametrize("row_format", FORMATS)
+@pytest.mark.parametrize("order", ["score", "shuffled"])
+def test_the_static_block_is_the_same_bytes_at_every_step(
+    row_format: Format, order: Literal["score", "shuffled"]
+) -> None:
+    prompts = flown(spec=MissionSpec(prompt=PromptStyle(format=row_format, order=order)))
+    assert len({p.static for p in prompts}) == 1
+    assert len({p.state for p in prompts}) > 1
+    for earlier, later in zip(prompts, prompts[1:], strict=False):
+        assert later.experiences.startswith(earlier.experiences)
+
+
+def test_the_static_block_tells_the_scenarios_numbers() -> None:
+    assert Template(PAPER).static != Template(SCENARIOS["paper"].model_copy(update={"queue_capacity": 50})).static
+
+
+def test_by_default_the_static_block_changes_on_purpose_only() -> None:
+    static = mission().template.static
+    assert static == Template(PAPER).static
+    assert hashlib.sha256(static.encode()).hexdigest().startswith("a6882f4c33fcbf53")
+
+
+@pytest.mark.parametrize(
+    ("max_velocity", "rule"),
+    [
+        (14, "8 to 14 beyond 50 m, 1 to 7 within 50 m, 0 at the sensor."),
+        (8, "8 beyond 50 m, 1 to 7 within 50 m, 0 at the sensor."),
+        (5, "5 beyond 50 m, 1 to 5 within 50 m, 0 at the sensor."),
+        (1, "1 beyond 50 m, 1 within 50 m, 0 at the sensor."),
+    ],
+)
+@pytest.mark.parametrize("row_format", FORMATS)
+@pytest.mark.parametrize("features", ["paper", "reach"])
+def test_the_velocity_rule_is_the_papers_up_to_the_worlds_limit(
+    max_velocity: int, rule: str, row_format: Format, features: Literal["paper", "reach"]
+) -> None:
+    scenario = PAPER.model_copy(update={"max_velocity": max_velocity})
+    static = Template(scenario, PromptStyle(format=row_format), features).static
+    rules = static.split("Rules:\n")[1].split("\n\n")[0].splitlines()
+    assert [one for one in rules if "elocity" in one] == [
+        f"3. Velocity, in whole m/s, follows the chosen sensor's distance: {rule}"
+    ]
+    assert "slow" not in static.lower() and "fast" not in static.lower()
+
+
+def test_rows_are_sorted_by_score_and_say_what_is_known() -> None:
+    m = mission(top_k=2)
+    m.records.visits[0] = 4
+    view = attended(m, uav(step=6, queue=[30.0, None, 60.0, 15.0]), 6)
+    prompt = m.template.prompt(view.state, view.shown(), [])
+    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids
+    assert prompt.uncompressed.text.splitlines() == [
+        "0,30,50,-90,2,0",
+        "1,?,?,?,6,100",
+        "2,60,50,-90,6,200",
+        "3,15,50,-90,6,300",
+    ]
+    assert set(prompt.state.splitlines()) < {"0,30,-90,2,0", "2,60,-90,6,200", "3,15,-90,6,300"}
+
+
+def test_experiences_stand_between_static_and_state() -> None:
+    last = flown()[-1]
+    line = "20,-90,0,100 > 1 7: 0.1\n"
+    assert last.experiences.startswith(line)
+    assert last.user == last.experiences + last.state
+
+
+def test_json_is_an_object_a_line() -> None:
+    spec = MissionSpec(prompt=PromptStyle(format="json"), top_k=3)
+    first, last = flown(2, spec)
+    numbers = [json.loads(line) for line in first.state.splitlines()]
+    assert len(numbers) == 3
+    assert list(numbers[0]) == ["sensor_id", "queue", "gain", "age", "distance"]
+    assert all(type(value) is int for row in numbers for value in row.values())
+    assert json.loads(last.experiences) == {
+        "queue": 20,
+        "gain": -90,
+        "age": 0,
+        "distance": 100,
+        "answer": "1 7",
+        "cost": 0.1,
+    }
+
+
+def test_json_has_null_for_what_was_never_heard() -> None:
+    m = mission(MissionSpec(prompt=PromptStyle(format="json")))
+    view = attended(m, uav(queue=[30.0, None]))
+    whole = m.template.prompt(view.state, view.shown(), []).uncompressed.text.splitlines()
+    unheard = {"sensor_id": 1, "queue": None, "battery": None, "gain": None, "age": 0, "distance": 100}
+    assert json.loads(whole[1]) == unheard
+    assert json.loads(whole[0])["battery"] == 50
+
+
+def test_markdown_is_a_table_with_its_header_and_experiences_are_another() -> None:
+    first, last = flown(2, MissionSpec(prompt=PromptStyle(format="markdown"), top_k=2))
+    header = ["| sensor_id | queue | gain | age | distance |", "| --- | --- | --- | --- | --- |"]
+    assert first.experiences == ""
+    assert first.state.splitlines()[:2] == header
+    assert len(first.state.splitlines()) == 4
+    assert last.user.splitlines()[:6] == [
+        "| queue | gain | age | distance | answer | cost |",
+        "| --- | --- | --- | --- | --- | --- |",
+        "| 20 | -90 | 0 | 100 | 1 7 | 0.1 |",
+        "",
+        *header,
+    ]
+    assert last.uncompressed.text.splitlines()[1].startswith("| sensor_id | queue | battery | gain |")
+
+
+@pytest.mark.parametrize("row_format", FORMATS)
+def test_the_static_block_speaks_of_what_the_mission_shows(row_format: Format) -> None:
+    static = mission(MissionSpec(prompt=PromptStyle(format=row_format))).template.static
+    assert ("JSON" in static) == (row_format == "json")
+    assert ("table" in static) == (row_format == "markdown")
+    assert ("Past decisions are rows" in static) == (row_format == "csv")
+    assert "the most promising first" in static
+    shuffled = mission(MissionSpec(prompt=PromptStyle(format=row_format, order="shuffled"))).template.static
+    assert "the most promising first" not in shuffled
+    assert "in no particular order" in shuffled
+
+
+def test_shuffled_rows_are_the_same_rows_in_an_order_of_seed_step_and_uav() -> None:
+    def order(seed: int, step: int, uav_id: int) -> list[int]:
+        m = mission(MissionSpec(prompt=PromptStyle(order="shuffled"), seed=seed))
+        view = attended(m, uav(step=step, uav_id=uav_id), step)
+        prompt = m.template.prompt(view.state, view.shown(), [])
+        shown = [int(line.split(",")[0]) for line in prompt.state.splitlines()]
+        assert sorted(shown) == sorted(view.kept_ids)
+        return shown
+
+    cases = [(seed, step, uav_id) for seed in range(2) for step in range(3) for uav_id in range(2)]
+    orders = [order(*case) for case in cases]
+    assert orders == [order(*case) for case in cases]
+    assert len({tuple(o) for o in orders}) > 6
+
+
+def test_shuffling_changes_the_prompt_and_nothing_else() -> None:
+    shuffled = mission(MissionSpec(prompt=PromptStyle(order="shuffled")))
+    view, plain = attended(shuffled, uav()), attended(mission(), uav())
+    assert view.candidates == plain.candidates
+    assert view.best_by_value() == plain.best_by_value()
+
+
+def test_without_attention_every_admissible_sensor_is_shown_in_the_requests_order() -> None:
+    m = mission(MissionSpec(attention="off", top_k=2, mode="llm"), llm_adapter="off")
+    view = attended(m, uav(queue=[30.0, None, 60.0, 15.0]))
+    prompt = m.template.prompt(view.state, view.shown(), [])
+    assert [int(line.split(",")[0]) for line in prompt.state.splitlines()] == view.kept_ids == [0, 2, 3]
+    assert "in no particular order" in prompt.static
+
+
+def test_mode_value_keeps_attention_which_is_all_that_it_has() -> None:
+    m = mission(MissionSpec(attention="off", top_k=2))
+    assert len(attended(m, uav()).kept_ids) == 2
+
+
+def test_as_many_as_there_are_sensors_are_offered_best_first_or_shuffled() -> None:
+    for order in ("score", "shuffled"):
+        m = mission(MissionSpec(top_k=100, prompt=PromptStyle(order=order)))
+        view = attended(m, uav())
+        scores = [candidate.score for candidate in view.candidates]
+        assert len(scores) == 6
+        assert scores == sorted(scores, reverse=True)
+        assert (view.shown() == view.rows) == (order == "score")
+
+
+def test_no_experiences_means_no_block_and_no_word_of_it() -> None:
+    prompts = flown(4, MissionSpec(prompt=PromptStyle(experiences=0, format="markdown")))
+    assert [p.experiences for p in prompts] == [""] * 4
+    assert "Past decisions" not in prompts[0].static
+
+
+@pytest.mark.parametrize(("told", "kept"), [(None, 8), (6, 6), (100, 100)])
+def test_a_mission_says_how_many_experiences_it_keeps(told: int | None, kept: int) -> None:
+    prompts = flown(105, MissionSpec(prompt=PromptStyle(experiences=told)))
+    assert max(len(p.experiences.splitlines()) for p in prompts) == kept
+    status = status_of(mission(MissionSpec(prompt=PromptStyle(experiences=told))))
+    assert status.prompt.experiences == kept
+
+
+@pytest.mark.parametrize("row_format", FORMATS)
+def test_thirty_experiences_fit_the_embedded_models_context(row_format: Format) -> None:
+    spec = MissionSpec(mode="llm", prompt=PromptStyle(format=row_format, experiences=30), top_k=10)
+    assert status_of(mission(spec)).prompt.experiences == 30
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        MissionSpec(mode="llm", prompt=PromptStyle(format="json", experiences=100)),
+        MissionSpec(mode="llm", attention="off", scenario=SCENARIOS["dense"].model_copy(update={"sensors": 500})),
+    ],
+)
+def test_a_prompt_that_cannot_fit_the_context_is_refused(spec: MissionSpec) -> None:
+    with pytest.raises(Refused, match=r"need up to \d+ tokens and AICVDS_LLM_CONTEXT is 4096"):
+        mission(spec)
+    assert mission(spec, llm_context=131_072).mode == "llm"
+    assert mission(spec.model_copy(update={"mode": "value"})).mode == "value"

@@ -1,0 +1,65 @@
+"""The drift: what a UAV flies in a wind, learned from its progress."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from shared.belief.drift import Drift
+from shared.world.scenario import SCENARIOS
+from shared.world.trajectory import Circle, trajectories
+
+LAP = trajectories(SCENARIOS["paper"])[0]
+
+
+def flown_in(wind: tuple[float, float], start_m: float, still_m: float) -> float:
+    """The way in a wind, as the share of its component along the heading in the middle of the way in still air."""
+    angle = (start_m + still_m / 2) / 300.0
+    return still_m * (1.0 - wind[0] * math.sin(angle) + wind[1] * math.cos(angle))
+
+
+def learned(wind: tuple[float, float], steps: int = 20) -> Drift:
+    drift, progress = Drift(), 100.0
+    for _ in range(steps):
+        way = flown_in(wind, progress, 140.0)
+        drift.learn(LAP, progress, 140.0, progress + way)
+        progress += way
+    return drift
+
+
+def test_still_air_is_no_drift_and_changes_no_number() -> None:
+    drift, ways = learned((0.0, 0.0)), np.arange(10.0)
+    assert drift.none
+    assert drift.flown(LAP, 3.0, ways) is ways
+
+
+def test_the_wind_is_found() -> None:
+    assert learned((0.3, -0.2)).wind == pytest.approx((0.3, -0.2), abs=0.05)
+
+
+def test_the_way_ahead_is_longer_with_the_wind_and_shorter_against_it() -> None:
+    drift = learned((0.3, 0.0))
+    # The lap begins due east and goes north: west along its north, east along its south.
+    quarter = LAP.length_m / 4
+    ahead = np.array([0.0, 70.0, 140.0])
+    against, along = (drift.flown(LAP, start, ahead) for start in (quarter - 70, 3 * quarter - 70))
+    assert against[0] == along[0] == 0
+    assert against[2] == pytest.approx(140 * 0.7, rel=0.05)
+    assert along[2] == pytest.approx(140 * 1.3, rel=0.05)
+
+
+def test_impossible_progress_is_bounded() -> None:
+    drift = Drift()
+    for _ in range(50):
+        drift.learn(LAP, 0.0, 140.0, 1e9)
+    assert drift.flown(LAP, 0.0, np.array([140.0]))[0] <= 2.2 * 140
+    drift.learn(LAP, 0.0, 0.0, 50.0)
+
+
+def test_a_restored_drift_goes_on_as_it_was() -> None:
+    drift, again = learned((0.1, 0.2)), Drift()
+    again.load_state_dict(drift.state_dict())
+    np.testing.assert_array_equal(drift.wind, again.wind)
+    assert isinstance(LAP, Circle)

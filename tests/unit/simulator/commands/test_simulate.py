@@ -1,0 +1,222 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shared.wire.schemas import MissionSpec
+from shared.world.scenario import SCENARIOS
+from simulator.commands import simulate
+from simulator.records.decision_log import read_decisions
+from simulator.records.run_folder import DRAWN
+from simulator.records.summary import LossBound, Summary
+from tests.support.edge_stub import EdgeStub, stub_edge
+from tests.support.waiting import PATIENCE_S, until
+
+
+@pytest.fixture
+def stub() -> Iterator[EdgeStub]:
+    with stub_edge() as edge:
+        yield edge
+
+
+def summary_in(out: Path) -> Summary:
+    return Summary.model_validate_json((out / "summary.json").read_bytes())
+
+
+def test_a_mission_leaves_its_files(stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    code = simulate.main(
+        ["--edge", stub.url, "--steps", "3", "--seed", "4", "--deadline-ms", "30000", "--out", str(out)]
+    )
+    assert code == 0
+    left = ["decisions.jsonl", "figures", "report.html", "requests.jsonl", "summary.json"]
+    assert sorted(p.name for p in out.iterdir()) == left
+    assert {str(p.relative_to(out)) for p in (out / "figures").iterdir()} == set(DRAWN)
+    summary = summary_in(out)
+    assert (summary.seed, summary.steps, summary.decisions, summary.deadline_ms) == (4, 3, 9, 30_000)
+    assert len(read_decisions(out / "decisions.jsonl")) == 9
+    assert summary.command.startswith("aicvds simulate --edge http://127.0.0.1")
+    assert set(stub.missions) == {summary.mission_id}
+    assert stub.missions[summary.mission_id].seed == 4
+    assert {d.deadline_ms for d in stub.decides} == {30_000}
+    printed = capsys.readouterr().out
+    assert "AIC-VDS: 6 llm, 3 policy" in printed
+    assert "The LLM took 6 of 9 decisions" in printed and "llm_timeout 3" in printed
+    assert "80 % read from" in printed and "lost; 6 llm, 3 policy" in printed
+    for words in ("AIC-VDS", "EOF", "WQCS", "summary.json", "report.html"):
+        assert words in printed
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(("awaited", "polled", "message"), [("on", 3, "stub-1"), ("off", 1, "unavailable")])
+def test_an_llm_out_of_reach_is_waited_for_where_that_is_wanted(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], awaited: str, polled: int, message: str
+) -> None:
+    stub.readiness = [(True, "unavailable"), (True, "unavailable"), (True, "ready")]
+    arguments = ["--edge", stub.url, "--steps", "1", "--await-llm", awaited, "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert stub.polled == polled
+    assert message in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_an_old_result_is_overwritten_only_with_the_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert simulate.main(arguments) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    (tmp_path / "figures" / "tokens.pdf").write_text("of a mission that an LLM flew")
+    assert simulate.main([*arguments, "--overwrite"]) == 0
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == {"losses", "visits"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_local_policy_is_reported_under_its_own_name(tmp_path: Path) -> None:
+    assert simulate.main(["--policy", "round_robin", "--steps", "2", "--out", str(tmp_path)]) == 0
+    summary = summary_in(tmp_path)
+    assert set(summary.lost_packets) == {"round_robin", "eof", "wqcs"}
+    assert summary.edge is None and summary.by_source.onboard == 6
+
+
+def test_the_bound_is_searched_unless_it_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = LossBound(lower_bound=2, best_flight=2, seconds=0.5)
+    monkeypatch.setattr("simulator.bound.mission_bound.mission_bound", lambda *_: found)
+    arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
+    assert simulate.main(arguments) == 0
+    assert summary_in(tmp_path).bound == found
+    assert "Nobody can lose fewer than 2 packets" in capsys.readouterr().out
+    assert "Nobody can lose fewer than 2 packets" in (tmp_path / "report.html").read_text("utf-8")
+    assert simulate.main([*arguments, "--overwrite", "--no-bound"]) == 0
+    assert (summary_in(tmp_path).bound, summary_in(tmp_path).bound_missing) == (None, None)
+
+
+def test_a_named_mission_has_its_note_and_its_address(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--edge", stub.url, "--steps", "1", "--mission", "patrol", "--out", str(tmp_path), "--overwrite"]
+    assert simulate.main([*arguments, "--note", "Visit sensor 4 every third step."]) == 0
+    assert stub.missions["patrol"].note == "Visit sensor 4 every third step."
+    assert f"Mission patrol; watch it at {stub.url}/?mission=patrol" in capsys.readouterr().out
+    # The mission is there: it is flown as it is, and a new note is given to it.
+    made = stub.missions["patrol"]
+    assert simulate.main([*arguments, "--note", "Visit sensor 2 every fourth step."]) == 0
+    assert stub.missions["patrol"] is made and stub.notes == {"patrol": "Visit sensor 2 every fourth step."}
+
+
+def test_a_flight_may_end_before_its_mission_does(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub.missions["patrol"] = MissionSpec(scenario=SCENARIOS["paper"])
+    arguments = ["--edge", stub.url, "--mission", "patrol", "--steps", "1", "--out", str(tmp_path), "--overwrite"]
+    assert simulate.main(arguments) == 0
+    assert "seed 0, 1 steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "flown", "message"),
+    [
+        (["--steps", "4"], 0, "of 3 steps; give at most --steps 3"),
+        (["--scenario", "stress", "--steps", "3"], 0, "for another world (paper)"),
+        (["--steps", "1", "--mode", "value"], 0, "in mode llm; leave out --mode value"),
+        (["--steps", "1"], 3, "with 3 decisions already; choose another ID"),
+    ],
+)
+def test_a_mission_that_does_not_fit_is_refused(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], flown: int, message: str
+) -> None:
+    stub.missions["patrol"] = MissionSpec(scenario=SCENARIOS["paper"].model_copy(update={"steps": 3}))
+    stub.flown["patrol"] = flown
+    assert simulate.main(["--edge", stub.url, "--mission", "patrol", "--out", str(tmp_path), *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--edge is missing"),
+        (["--edge", "nowhere"], "'nowhere' is not an edge's URL"),
+        (["--edge", "http://e", "--scenario", "mars"], "unknown scenario 'mars'"),
+        (["--edge", "http://e", "--steps", "0"], "--steps 0"),
+        (["--edge", "http://e", "--seed", "-1"], "--seed -1"),
+        (["--edge", "http://e", "--policy", "magic"], "--policy magic"),
+        (["--edge", "http://e", "--deadline-ms", "5"], "--deadline-ms 5"),
+        (["--edge", "http://e", "--wait-s", "nan"], "--wait-s nan"),
+        (["--edge", "http://e", "--reconnect-s", "-1"], "--reconnect-s -1"),
+        (["--edge", "http://e", "--policy", "eof"], "--policy eof asks no edge"),
+        (["--policy", "eof", "--uplink", "delta"], "--uplink delta means nothing"),
+        (["--policy", "eof", "--mode", "llm"], "--mode llm means nothing"),
+        (["--policy", "eof", "--note", "x"], "--note x means nothing"),
+        (["--edge", "http://e", "--mission", "a b"], "--mission 'a b'"),
+        (["--edge", "http://e", "--note", "x" * 281], "at most 280"),
+        (["--edge", "http://e", "--out", __file__], "is a file"),
+        (["--policy", "eof", "--out", f"{__file__}/below"], f"--out {__file__}/below: Not a directory"),
+    ],
+)
+def test_bad_use_is_one_line_and_code_2(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert simulate.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("aicvds simulate: ") and error.count("\n") == 1 and message in error
+
+
+def test_an_error_of_tyro_is_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert simulate.main(["--seed", "x"]) == 2
+    assert simulate.main(["--help"]) == 0
+    assert "AICVDS_API_KEY" in capsys.readouterr().out
+
+
+def test_no_edge_is_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "run"
+    assert simulate.main(["--edge", "http://127.0.0.1:1", "--wait-s", "0", "--out", str(out)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "http://127.0.0.1:1" in error
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_an_edge_that_never_decides_is_code_1(
+    stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stub.otherwise = "crash"
+    assert simulate.main(["--edge", stub.url, "--steps", "2", "--out", str(tmp_path)]) == 1
+    assert "6 decisions were taken on board" in capsys.readouterr().err
+    assert summary_in(tmp_path).by_reason == {"edge_refused": 6}
+
+
+@pytest.mark.long
+def test_sigterm_leaves_a_partial_result(stub: EdgeStub, tmp_path: Path) -> None:
+    # It is interrupted while the eighth decision is waited for: the second of the third step.
+    stub.script, stub.otherwise = ["ok"] * 7, "slow"
+    arguments = ["simulate", "--edge", stub.url, "--no-bound", "--out", str(tmp_path)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "shared.kit.command_line", *arguments], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        until(lambda: stub.gate.came)
+        process.send_signal(signal.SIGTERM)
+        printed, _ = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 130
+    finally:
+        process.kill()
+        process.wait()
+    summary = summary_in(tmp_path)
+    assert f"interrupted after {summary.steps_flown} steps; writing their results" in printed
+    assert summary.interrupted and summary.steps_flown == 2
+    assert summary.decisions == 3 * summary.steps_flown == len(read_decisions(tmp_path / "decisions.jsonl"))
+    assert f"interrupted after step {summary.steps_flown} of 30" in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_help_comes_without_the_heavy_imports() -> None:
+    code = (
+        "import sys; from simulator.commands import simulate; simulate.main(['--help']);"
+        "print([m for m in ('matplotlib', 'pettingzoo', 'scipy', 'torch') if m in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
