@@ -74,7 +74,6 @@ bench: install
 	$(BIN)/python benchmarks/llm.py --rounds 3
 	$(BIN)/python benchmarks/sensors.py
 	$(BIN)/python benchmarks/fleet.py
-	$(BIN)/python benchmarks/processes.py --rounds 3
 	$(BIN)/python benchmarks/world.py
 
 faults: install

@@ -57,15 +57,3 @@ class Misdirected(Refused):
         super().__init__(field, detail)
         self.owner = owner
         self.retry_s = retry_s
-
-
-class Elsewhere(Exception):
-    """Another process of this edge decides the mission, and gets the request; no client sees this.
-
-    Attributes:
-        slot: that process's number.
-    """
-
-    def __init__(self, slot: int) -> None:
-        super().__init__(f"process {slot} decides this mission")
-        self.slot = slot

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import partial
 from importlib.metadata import version
 from typing import TypedDict
 
@@ -19,11 +18,9 @@ from service.api.authentication import KeyAuthentication
 from service.api.load_limits import RequestLimits
 from service.api.openapi import schema_of
 from service.api.routes import decisions, router
-from service.config.process_member import Member
 from service.config.settings import Settings
 from service.edge.compilation import load_for_event_loop
 from service.edge.engine import Engine
-from service.llm.embedded import Embed, embedded
 from service.llm.server_pool import ServerPool
 from service.observability.metrics import Metrics
 from service.observability.tracing import Traced, Traces, provider_from_environment
@@ -41,12 +38,11 @@ class State(TypedDict):
     metrics: Metrics
 
 
-def create_app(settings: Settings, store: Store | None = None, member: Member | None = None) -> FastAPI:
+def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     """One edge service; its LLM begins to load when the application starts.
 
     Args:
         store: the missions' durable store, closed when the application ends; None keeps missions in memory only.
-        member: which of several processes of the edge this is; None where it is the only one.
 
     Raises:
         BadKeys: the file of keys that the settings name cannot be used.
@@ -59,10 +55,9 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
         # One thread computes the small modules faster than it can start others, and llama.cpp needs the other cores.
         torch.set_num_threads(1)
         metrics = Metrics()
-        embed = embedded if member is None else _shared_llm(member)
-        llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc, embed)
+        llm = ServerPool(settings, warm_up(settings), metrics.llm_breaker_opened.inc)
         counter = await asyncio.to_thread(TokenCounter, settings.cache_dir)
-        engine = Engine(settings, llm, counter, metrics, traces, store, member)
+        engine = Engine(settings, llm, counter, metrics, traces, store)
         app.state.engine = engine
         llm.start()
         try:
@@ -90,10 +85,6 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
     app.include_router(router)
     app.include_router(live_routes.router)
     app.mount("/static", live_routes.ASSETS, name="static")
-    if member is not None:
-        from service.api.process_routing import Siblings
-
-        app.add_middleware(Siblings, member=member)
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if settings.keys is not None:
         app.add_middleware(KeyAuthentication, keys=ApiKeys(settings.keys))
@@ -103,10 +94,3 @@ def create_app(settings: Settings, store: Store | None = None, member: Member | 
     problem_details.install(app)
     app.openapi = lambda: schema_of(app)  # type: ignore[method-assign]
     return app
-
-
-def _shared_llm(member: Member) -> Embed:
-    """The embedded LLM of another process. Only an edge of several processes spends time on importing this."""
-    from service.llm.hosted import hosted
-
-    return partial(hosted, member)

@@ -146,7 +146,6 @@ async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> 
 @router.get("/missions/{mission_id}/decisions/{decision_id}/prompt", responses=documented(404, 422), tags=["decisions"])
 async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: TheEngine) -> DecisionPrompt:
     """The prompt by which a decision was made; only those of the newest decisions are kept, and not over a restart."""
-    engine.missions.check_place(mission_id)
     decision = engine.live.history.find(mission_id, decision_id)
     if decision is None or decision.prompt is None:
         raise NotFound("decision_id", f"the prompt of decision {decision_id} is unknown or forgotten")

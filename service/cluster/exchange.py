@@ -9,7 +9,7 @@ from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope
 
-from service.api.merging import Answer
+from service.cluster.merging import Answer
 
 # Routes whose body names the mission, `default` unless it says otherwise.
 _BY_BODY = frozenset(("/decide", "/decide/batch", "/feedback"))

@@ -17,9 +17,9 @@ from starlette.routing import Mount, Route
 from starlette.types import Receive, Scope, Send
 
 from service.api.load_limits import RequestLimits
-from service.api.merging import Answer, merged_metrics, merged_missions, merged_readiness
 from service.api.problem_details import problem_response
 from service.cluster.exchange import Exchanged
+from service.cluster.merging import Answer, merged_metrics, merged_missions, merged_readiness
 from service.config.settings import Settings
 from service.server.middleware import SecurityHeaders
 from shared.kit.bounded import BoundedDict

@@ -7,8 +7,8 @@ import socket
 from functools import partial
 from typing import TYPE_CHECKING
 
-from service.api.merging import DECIDED_AT, Answer
 from service.cluster.exchange import Exchanged, answer_of
+from service.cluster.merging import DECIDED_AT, Answer
 from service.config.settings import Settings
 from service.observability import logs
 from service.server.server import Server

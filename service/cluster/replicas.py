@@ -15,9 +15,9 @@ from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.exceptions import RayServeException
 from ray.serve.schema import LoggingConfig
 
-from service.api.merging import Answer
 from service.cluster.exchange import Exchanged
 from service.cluster.ingress import OwnersGone
+from service.cluster.merging import Answer
 from service.cluster.owner import Owner
 from service.config.settings import Settings
 from shared.kit.ray_connection import RayUnusable

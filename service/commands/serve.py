@@ -10,19 +10,17 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from pydantic import ValidationError
 
 from shared.kit.validation_messages import problem_of
-from shared.wire.schemas import LLM_MODES, Mode
+from shared.wire.schemas import Mode
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from service.config.process_member import Member
     from service.config.settings import Settings
 
 
@@ -49,8 +47,6 @@ class Serve:
     """The model at that server. Default: AICVDS_LLM_MODEL, or the first that it lists."""
     store: Annotated[str | None, tyro.conf.arg(metavar="FILE|none", help_behavior_hint="")] = None
     """SQLite file of the missions; none: they end with the process. Default: AICVDS_STORE, or a file in your home."""
-    processes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Processes that decide, at most one a core; each has missions of its own. Default: AICVDS_PROCESSES, or 1."""
 
     ray: Annotated[str | None, tyro.conf.arg(metavar="local|auto|HOST:PORT", help_behavior_hint="")] = None
     """Be the ingress of edges on Ray: on one that starts here (local), or on the cluster of this machine. Needs the
@@ -60,7 +56,7 @@ class Serve:
 
     def settings(self) -> dict[str, Any]:
         """The settings that were given as options; the environment has the others."""
-        names = ("mode", "llm_url", "llm_model", "store", "processes")
+        names = ("mode", "llm_url", "llm_model", "store")
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -98,8 +94,7 @@ def main(argv: list[str]) -> int:
         with listener:
             if args.ray is not None:
                 return _serve_cluster(listener, settings, args.ray, *replicas)
-            place = None if settings.processes == 1 else _share_out(settings, listener)
-            return place if isinstance(place, int) else _serve(listener, settings, url, place)
+            return _serve(listener, settings, url)
     except KeyboardInterrupt:
         return 130
     finally:
@@ -136,31 +131,7 @@ def checked_settings(given: dict[str, Any], host: str) -> Settings | None:
     return settings
 
 
-def _share_out(settings: Settings, listener: socket.socket) -> Member | int:
-    """Start the edge's processes; returns the exit code in the parent, and in each of them its place."""
-    from service.commands.process_parent import Parent
-    from service.storage.locks import StoreUnusable
-
-    embeds = settings.llm_url is None and settings.mode in LLM_MODES
-    try:
-        parent = Parent(settings, listener, partial(_host_llm, settings) if embeds else None)
-    except StoreUnusable as error:
-        return _refused(_store_fault(error))
-    except OSError as error:
-        return _refused(f"--processes {settings.processes}: {error}")
-    return parent.run()
-
-
-def _host_llm(settings: Settings, folder: Path) -> int:
-    """Have the embedded LLM for all processes; returns an exit code where it cannot be loaded."""
-    from service.llm.hosted import host
-    from service.server.malloc import hand_back_memory
-
-    hand_back_memory()
-    return host(settings, folder)
-
-
-def _serve(listener: socket.socket, settings: Settings, url: str, member: Member | None) -> int:
+def _serve(listener: socket.socket, settings: Settings, url: str) -> int:
     from service.observability import logs
     from service.server.malloc import hand_back_memory
     from service.server.server import Server
@@ -168,9 +139,8 @@ def _serve(listener: socket.socket, settings: Settings, url: str, member: Member
     hand_back_memory()
     logs.configure(settings.log_level, settings.log_format)
     # A machine reads a log of JSON: it gets no banner.
-    prints = settings.log_format == "text" and (member is None or (member.slot == 0 and not member.replaces))
-    loaded = _say if prints else lambda text: None
-    server = Server(partial(_application, settings, url, loaded, member), settings.log_level, member)
+    loaded = _say if settings.log_format == "text" else lambda text: None
+    server = Server(partial(_application, settings, url, loaded), settings.log_level)
     server.run(sockets=[listener])
     if isinstance(server.error, _Unusable):
         return _refused(str(server.error))
@@ -200,8 +170,6 @@ def _fault_with_ray(settings: Settings) -> str | None:
     """Why edges on Ray cannot have these settings."""
     if not settings.store.startswith("postgresql"):
         return "--ray: edges on several machines share a store only in PostgreSQL: set AICVDS_STORE"
-    if settings.processes != 1:
-        return "--ray and --processes: leave --processes (AICVDS_PROCESSES) out; --replicas says how many edges"
     return None
 
 
@@ -214,7 +182,7 @@ def _bounds(replicas: str) -> tuple[int, int] | None:
     return bounds if 1 <= bounds[0] <= bounds[1] <= 1000 else None
 
 
-def _application(settings: Settings, url: str, loaded: Callable[[str], None], member: Member | None) -> FastAPI:
+def _application(settings: Settings, url: str, loaded: Callable[[str], None]) -> FastAPI:
     """Import torch and make the edge; raises ``_Unusable``."""
     from service.api.api_keys import BadKeys
     from service.api.app import create_app
@@ -224,8 +192,8 @@ def _application(settings: Settings, url: str, loaded: Callable[[str], None], me
 
     settings = settings.model_copy(update={"advertise_url": settings.advertise_url or _reachable(url)})
     try:
-        store = None if settings.store == "none" else Store(settings.store, member)
-        app = create_app(settings, store, member)
+        store = None if settings.store == "none" else Store(settings.store)
+        app = create_app(settings, store)
     except BadKeys as error:
         raise _Unusable(f"AICVDS_KEYS: {error}") from None
     except StoreUnusable as error:

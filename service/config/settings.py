@@ -31,6 +31,10 @@ def _default_store() -> str:
 
 # A small model's products are short, and the threads meet after each. More than two threads were not measured.
 _MOST_EMBEDDED_THREADS = 8
+# Variables of earlier versions, and what replaces them.
+_REMOVED = {
+    "AICVDS_PROCESSES": ": several edges share one PostgreSQL behind a load balancer, or start one with --ray",
+}
 # Variables of `aicvds simulate`, `aicvds mqtt` and docker-compose.yml, often in the same .env file.
 _SIMULATORS = {
     f"AICVDS_{name}"
@@ -132,8 +136,6 @@ class Settings(BaseSettings):
     # Seconds that this edge owns a mission of a PostgreSQL store without renewing that. Another edge can go on with the
     # missions of a killed one after so long.
     lease_s: float = Field(5.0, ge=1, le=300)
-    # Processes that decide, each for the missions of its own: one a core. All have the store and the embedded LLM.
-    processes: int = Field(1, ge=1, le=64)
     # Missions at once, in memory or in the store; one more is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
     # Whether a decision for a mission that does not exist makes it. `off`: mission `default` alone, so that a mistyped
@@ -253,4 +255,4 @@ def unknown_variables() -> dict[str, str]:
     """
     known = {f"AICVDS_{name.upper()}" for name in Settings.model_fields} | _SIMULATORS
     unknown = sorted(name for name in os.environ if name.startswith("AICVDS_") and name not in known)
-    return {name: suggestion(name, known) for name in unknown}
+    return {name: _REMOVED.get(name) or suggestion(name, known) for name in unknown}

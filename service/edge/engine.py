@@ -10,7 +10,6 @@ from functools import partial
 from pydantic import TypeAdapter
 from structlog.contextvars import bind_contextvars, clear_contextvars
 
-from service.config.process_member import Member
 from service.config.settings import Settings
 from service.deciding.decision_task import RESERVE_S, DecisionTask
 from service.deciding.llm_query import LlmQueries
@@ -62,7 +61,6 @@ class Engine:
         metrics: Metrics,
         traces: Traces,
         store: Store | None,
-        member: Member | None = None,
     ) -> None:
         self._settings = settings
         self._metrics = metrics
@@ -74,9 +72,7 @@ class Engine:
         self._batches = BatchDecider(self.pipeline, self.queries)
         self.journal: Journal | NullJournal = NullJournal() if store is None else Journal(store, metrics)
         self._feedback = Feedback(metrics, self.journal, self.live)
-        self.missions = MissionRegistry(
-            settings, metrics, self.journal, store, self.compiler.compile, self.live.forget, member
-        )
+        self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile, self.live.forget)
 
     def hurry(self) -> None:
         """The service is closing: queries to the LLM end within seconds, and pages get no more updates."""

@@ -6,13 +6,12 @@ import asyncio
 from collections.abc import Callable
 from typing import TypeVar
 
-from service.config.process_member import Member
 from service.config.settings import Settings
 from service.deciding.decision_task import RESERVE_S
 from service.deciding.stopwatch import Deadline
 from service.edge.ownership import LeasedOwnership, SoleOwnership
 from service.edge.stored_missions import StoredMissions
-from service.errors import Conflict, Elsewhere, NotFound, Unavailable
+from service.errors import Conflict, NotFound, Unavailable
 from service.mission.mission import Mission
 from service.observability.metrics import Metrics
 from service.storage.journal import Journal, NullJournal
@@ -29,11 +28,9 @@ class MissionRegistry:
     """Missions by ID, bounded in number; a refused request makes no mission.
 
     A stored mission is loaded by its first request, so that many missions do not slow down a restart. In a store that
-    several edges share, this edge takes the mission's lease first. Where the edge has several processes, each has the
-    missions of its own slot, and every method about another's mission raises :class:`Elsewhere`.
+    several edges share, this edge takes the mission's lease first.
 
     Args:
-        member: which of the edge's processes this is; None where it is the only one.
         on_load: called with each mission that was loaded from the store.
         on_drop: called with the ID of each mission that another edge has taken over.
     """
@@ -46,17 +43,15 @@ class MissionRegistry:
         store: Store | None,
         on_load: Callable[[Mission], None],
         on_drop: Callable[[str], None],
-        member: Member | None = None,
     ) -> None:
         self._settings = settings
         self._metrics = metrics
         self._journal = journal
-        self._member = member
         self._missions: dict[str, Mission] = {}
         self._store: StoredMissions | None = None
         self._ownership: LeasedOwnership | SoleOwnership = SoleOwnership()
         if store is not None and isinstance(journal, Journal):
-            self._store = StoredMissions(settings, metrics, journal, store, self._missions, on_load, on_drop, member)
+            self._store = StoredMissions(settings, metrics, journal, store, self._missions, on_load, on_drop)
             self._ownership = self._store.ownership
         self._count()
 
@@ -74,11 +69,6 @@ class MissionRegistry:
     def intact(self) -> bool:
         """Whether this edge can have missions: it renews their leases, and its SQLite file is still there."""
         return self._ownership.intact and not self._journal.replaced
-
-    def check_place(self, mission_id: str) -> None:
-        """Raises :class:`Elsewhere` where another process decides the mission."""
-        if self._member is not None and not self._member.decides(mission_id):
-            raise Elsewhere(self._member.slot_of(mission_id))
 
     async def get(self, mission_id: str) -> Mission:
         """The mission, loaded from the store where it is not in memory.
@@ -127,8 +117,6 @@ class MissionRegistry:
             Refused: as :meth:`Reports.complete`; nothing is recorded.
         """
         mission_id = request.mission_id
-        if self._member is not None:
-            self.check_place(mission_id)
         mission = self._missions.get(mission_id)
         if mission is not None and not self._ownership.owns(mission_id):
             mission = None
@@ -176,7 +164,6 @@ class MissionRegistry:
             Misdirected: another edge has it.
             Unavailable: the store fails.
         """
-        self.check_place(mission_id)
         self.refuse_if_failing("mission_id")
         if self._store is not None:
             await self._store.claim_to_delete(mission_id)
@@ -210,7 +197,6 @@ class MissionRegistry:
 
     async def _find(self, mission_id: str, within_s: float) -> Mission | None:
         """The mission, loaded where it is not in memory or where this edge does not have its lease."""
-        self.check_place(mission_id)
         if mission_id in self._missions and self._ownership.owns(mission_id):
             return self._missions[mission_id]
         if self._store is not None:

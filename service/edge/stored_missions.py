@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.config.process_member import Member
 from service.config.settings import Settings
 from service.edge.ownership import LeasedOwnership, SoleOwnership
 from service.errors import Conflict, Misdirected, Unavailable
@@ -32,7 +31,6 @@ class StoredMissions:
         missions: those in memory, by ID.
         on_load: called with each mission that was loaded from the store.
         on_drop: called with the ID of each mission that another edge has taken over.
-        member: which of the edge's processes this is; None where it is the only one.
 
     Attributes:
         ownership: which missions this edge may decide for.
@@ -49,7 +47,6 @@ class StoredMissions:
         missions: dict[str, Mission],
         on_load: Callable[[Mission], None],
         on_drop: Callable[[str], None],
-        member: Member | None = None,
     ) -> None:
         self._settings = settings
         self._metrics = metrics
@@ -58,16 +55,15 @@ class StoredMissions:
         self._missions = missions
         self._on_load = on_load
         self._on_drop = on_drop
-        self._member = member
         self._under_way: dict[str, asyncio.Task[None]] = {}
         # A single thread of its own, so that a store that hangs delays no decision, and because torch draws initial
         # weights from one generator.
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
         self.ownership: LeasedOwnership | SoleOwnership = SoleOwnership()
         if store.leases is None:
-            self.listed = self._own(store.missions())
+            self.listed = set(store.missions())
         else:
-            self.listed = self._own(store.leases.unowned())
+            self.listed = set(store.leases.unowned())
             address = settings.advertise_url or ""
             self.ownership = LeasedOwnership(store.leases, address, settings.lease_s, metrics, self._reconcile)
         journal.on_lost = self.drop
@@ -201,10 +197,5 @@ class StoredMissions:
         """The leases were renewed: drop what other edges have taken over, and list what nobody else has."""
         for mission_id in taken:
             self.drop(mission_id)
-        self.listed = self._own(unowned) - self._missions.keys()
+        self.listed = set(unowned) - self._missions.keys()
         self._metrics.missions.set(len(self._missions) + len(self.listed))
-
-    def _own(self, mission_ids: list[str]) -> set[str]:
-        """Those that this process decides."""
-        member = self._member
-        return set(mission_ids) if member is None else {name for name in mission_ids if member.decides(name)}

@@ -90,11 +90,6 @@ class EmbeddedServer:
             gguf.stem if one is None else f"{gguf.stem}+{one.stem}" for one in (adapter, orders)
         )
 
-    @property
-    def gone(self) -> bool:
-        """Whether the server is at this address no longer: False."""
-        return False
-
     @contextmanager
     def request(self, system: str, trained: str) -> Iterator[dict[str, Any]]:
         """While a request runs, its fields: the adapter answers prompts whose static block is ``trained``."""

@@ -238,8 +238,6 @@ class LlmServer:
                 async with asyncio.timeout(_PROBE_TIMEOUT_S):
                     await self._client.complete(probe_body(self.model, self.constraint))
             except (NoDecision, TimeoutError) as error:
-                if self._embedded is not None and self._embedded.gone:
-                    return self.start()
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
             else:
@@ -269,9 +267,6 @@ class LlmServer:
     async def _connect(self) -> LLMClient:
         """Reach or load the LLM, probe its abilities, and send the warm-up."""
         settings, http_client = self._settings, await asyncio.to_thread(_http_client)
-        if self._client is not None and self._embedded is not None and self._embedded.gone:
-            await self._client.close()
-            self._client = None
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
             self._client = http_client(settings.llm_url, api_key=key, session_header=settings.llm_session_header)

@@ -5,15 +5,11 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 
 import uvicorn
 from starlette.applications import Starlette
 
-from service.config.process_member import Member
 from service.observability import logs
-from service.server.connection_handover import MovableHttpProtocol, MovedConnections
 from service.server.connection_limits import BoundedHttpProtocol
 from service.server.middleware import StartupGate
 
@@ -30,23 +26,19 @@ class Server(uvicorn.Server):
     Args:
         load: imports and makes the edge's application, in a thread.
         log_level: of uvicorn; at ``debug`` requests are logged too.
-        member: which of several processes of the edge this is; None where it is the only one.
 
     Attributes:
         gate: the application as it is served, also while it loads.
     """
 
-    def __init__(self, load: Callable[[], Starlette], log_level: str, member: Member | None = None) -> None:
+    def __init__(self, load: Callable[[], Starlette], log_level: str) -> None:
         self.gate = StartupGate(load, self._end)
-        self._member = member
-        self._moved: MovedConnections | None = None
-        self._joining: asyncio.Task[None] | None = None
         config = uvicorn.Config(
             self.gate,
             # uvicorn takes a plain function for an older interface.
             interface="asgi3",
             log_config=None,
-            http=BoundedHttpProtocol if member is None else MovableHttpProtocol,
+            http=BoundedHttpProtocol,
             # The edge has no websockets; their library would read request heads without a limit.
             ws="none",
             log_level=log_level,
@@ -59,36 +51,6 @@ class Server(uvicorn.Server):
     def error(self) -> Exception | None:
         """Why the edge could not be loaded, if so; the server ends then."""
         return self.gate.error
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen; in place of a process that has ended only once the edge is loaded, as the others answer meanwhile."""
-        if self._member is None:
-            await super().startup(sockets)
-        elif not self._member.replaces:
-            await super().startup(sockets)
-            await self._join(self._member, [])
-        else:
-            await super().startup([])
-            self._joining = asyncio.create_task(self._join_loaded(self._member, sockets or []), name="join")
-
-    async def _join_loaded(self, member: Member, sockets: list[socket.socket]) -> None:
-        await self.gate.opened()
-        if not self.should_exit:
-            await self._join(member, sockets)
-
-    async def _join(self, member: Member, sockets: list[socket.socket]) -> None:
-        """Take the other processes' requests and connections, and accept at the sockets."""
-        loop = asyncio.get_running_loop()
-        protocol = partial(
-            MovableHttpProtocol, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
-        )
-        requests = member.requests_of(member.slot)
-        # Of a process that was killed.
-        Path(requests).unlink(missing_ok=True)
-        self.servers.append(await loop.create_unix_server(protocol, requests))
-        self._moved = MovedConnections(member.connections_of(member.slot), protocol)
-        for listening in sockets:
-            self.servers.append(await loop.create_server(protocol, sock=listening, backlog=self.config.backlog))
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer the connected clients, with less time for the LLM; then end the application, which saves its state."""
@@ -112,7 +74,3 @@ class Server(uvicorn.Server):
         for listening in sockets:
             listening.close()
         await asyncio.sleep(_ARRIVING_S)
-        if self._joining is not None:
-            self._joining.cancel()
-        if self._moved is not None:
-            self._moved.close()

@@ -5,12 +5,8 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
-
-from service.config.process_member import Member
 
 # How long a lock that another process has is tried, and how often.
 _LAST_COMMIT_S, _RETRY_S = 1.0, 0.02
@@ -48,47 +44,9 @@ class FileLock:
                     raise StoreUnusable(f"another edge uses {self.file}") from None
             time.sleep(_RETRY_S)
 
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """While no other process changes the schema: with this lock there is none."""
-        yield
-
     def close(self) -> None:
         """Release the lock."""
         self._lock.close()
-
-
-class SharedLock:
-    """The lock of a SQLite file that several processes of one edge have, and that of this process's place among them.
-
-    The place is free once the process that wrote the file for a killed one has ended, perhaps after a last commit.
-
-    Attributes:
-        file, descriptors: as of :class:`FileLock`.
-
-    Raises:
-        StoreUnusable, OSError: as :class:`FileLock`.
-    """
-
-    def __init__(self, file: str, member: Member) -> None:
-        assert member.store_lock is not None
-        self._shared = member.store_lock
-        self._place = FileLock(str(member.folder / str(member.slot)))
-        self.file = os.path.realpath(file)
-        self.descriptors = (self._shared, *self._place.descriptors)
-
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """While no other process changes the schema: a lock of its own, whoever else has the file's."""
-        fcntl.lockf(self._shared, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            fcntl.lockf(self._shared, fcntl.LOCK_UN)
-
-    def close(self) -> None:
-        """Release the place; the parent process releases the file."""
-        self._place.close()
 
 
 def sqlite_file(store: str) -> str | None:

@@ -13,11 +13,10 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.config.process_member import Member
 from service.mission.events import Event
 from service.mission.resolved_spec import ResolvedSpec
 from service.storage.leases import Leases
-from service.storage.locks import FileLock, SharedLock, StoreUnusable
+from service.storage.locks import FileLock, StoreUnusable
 from service.storage.process_writer import ProcessWriter
 from service.storage.rows import Statements, decode, unpack
 from service.storage.schema import SCHEMA, checkpoints, journal, missions
@@ -59,7 +58,6 @@ class Store:
 
     Args:
         url: path of a SQLite file, or a URL of SQLAlchemy.
-        member: which of several processes of one edge this is, if there are several; they use a SQLite file together.
 
     Raises:
         StoreUnusable: the store cannot be reached, is damaged or of a newer version, or another edge uses the file.
@@ -68,16 +66,15 @@ class Store:
         leases: of the missions in PostgreSQL; None for a SQLite file, which is this edge's alone.
     """
 
-    def __init__(self, url: str, member: Member | None = None) -> None:
+    def __init__(self, url: str) -> None:
         self.leases: Leases | None = None
-        self._lock: FileLock | SharedLock | None = None
+        self._lock: FileLock | None = None
         try:
             self._engine = _engine(url)
             file = self._engine.url.database
             if file and self._engine.dialect.name == "sqlite":
-                self._lock = FileLock(file) if member is None else SharedLock(file, member)
-                with self._lock.alone():
-                    self._migrate()
+                self._lock = FileLock(file)
+                self._migrate()
             else:
                 self.leases = Leases(self._engine)
                 self._migrate()

@@ -12,8 +12,8 @@ import httpx
 import pytest
 
 from tests.e2e.processes import output_until, run_here, started
-from tests.e2e.shared_out import Report, drained, first_event
 from tests.faults.shared_store import Database
+from tests.support.running_edges import Report, drained, first_event
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("made_on_decide")]

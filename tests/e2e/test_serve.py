@@ -110,7 +110,8 @@ def test_a_busy_port_is_one_clear_line() -> None:
 def test_a_misspelt_setting_is_told() -> None:
     told = run_here("serve", AICVDS_TOPK="3", AICVDS_TOP_K="0")
     assert "AICVDS_TOP_K" in told.stderr
-    with started("serve", "--port", "0", AICVDS_TOPK="3") as process:
+    with started("serve", "--port", "0", AICVDS_PROCESSES="2", AICVDS_TOPK="3") as process:
+        output_until(process, "AICVDS_PROCESSES is no setting and changes nothing: several edges share one PostgreSQL")
         output_until(process, "AICVDS_TOPK is no setting and changes nothing; did you mean AICVDS_TOP_K?")
 
 
@@ -130,7 +131,6 @@ def test_nothing_runs_before_the_settings_are_checked(tmp_path: Path) -> None:
     ("args", "env", "why"),
     [
         (["--ray", "local"], {}, "a store only in PostgreSQL"),
-        (["--ray", "local", "--processes", "2"], {"AICVDS_STORE": "postgresql://h/d"}, "leave --processes"),
         (["--ray", "local", "--replicas", "4-2"], {"AICVDS_STORE": "postgresql://h/d"}, "--replicas 4-2"),
         (["--ray", "local"], {"AICVDS_STORE": "postgresql://h/d"}, "ray is not installed. Install the extra"),
         # The edges on a cluster listen on their machines' addresses, even where the ingress does not.

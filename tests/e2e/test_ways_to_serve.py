@@ -1,4 +1,4 @@
-"""One process, several, and Ray: each serves a PostgreSQL store alike, and what it acknowledged outlives it."""
+"""One edge, and edges on Ray: each serves a PostgreSQL store alike, and what it acknowledged outlives it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import psycopg
 import pytest
 
 from tests.e2e.processes import output_until, started
-from tests.e2e.shared_out import Report, drained
 from tests.faults.shared_store import Database
+from tests.support.running_edges import Report, drained
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(400)]
 
-WAYS = {"plain": (), "processes": ("--processes", "2"), "ray": ("--ray", "local", "--replicas", "2")}
+WAYS = {"plain": (), "ray": ("--ray", "local", "--replicas", "2")}
 NAMES = tuple(f"mission{number}" for number in range(4))
 ENDED = "ended"
 # Fields of a mission that depend on the time of day.
@@ -121,5 +121,4 @@ def served(way: tuple[str, ...], folder: Path, report: Report) -> list[Any]:
 
 def test_each_way_to_serve_decides_alike_and_loses_nothing_when_killed(tmp_path: Path, report: Report) -> None:
     plain = served(WAYS["plain"], tmp_path / "plain", report)
-    assert served(WAYS["processes"], tmp_path / "processes", report) == plain
     assert served(WAYS["ray"], tmp_path / "ray", report) == plain

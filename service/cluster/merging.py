@@ -1,4 +1,4 @@
-"""Answers for a whole edge that has several processes, or a cluster's edges, from what each of them answers."""
+"""Answers for a whole cluster, from what each of its edges answers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from itertools import chain, zip_longest
 from starlette.responses import Response
 from starlette.types import Message, Send
 
-from service.observability.gathered import gathered
+from service.cluster.gathered_metrics import gathered
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness
 
-# When a process's newest decision was, in its answer to another process.
+# When an edge's newest decision was, in its answer to the ingress.
 DECIDED_AT = "x-decided-at"
 _MOST_LISTED = 200
 
@@ -44,7 +44,7 @@ class Answer:
 
 
 def merged_metrics(answers: Mapping[str, Answer], own: Answer) -> Response:
-    """All samples, each with the name of its process as a label; ``own`` is one of the answers."""
+    """All samples, each with the name of its edge as a label; ``own`` is one of the answers."""
     texts = {name: answer.body.decode() for name, answer in answers.items() if answer.status == 200}
     return Response(gathered(texts), media_type=own.header("content-type"))
 
@@ -63,7 +63,7 @@ def merged_readiness(answers: Iterable[Answer], away: str | None) -> Response:
 
 
 def merged_missions(answers: Iterable[Answer], own: Answer) -> Response:
-    """The missions of all, each process's in its order, one of each in turn: the one that decided last first.
+    """The missions of all, each edge's in its order, one of each in turn: the one that decided last first.
 
     A mission that is only in the store may be in several lists.
     """
