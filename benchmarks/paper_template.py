@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from service.prompting.experiences import Experiences
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt
-from service.prompting.row_formats import UNKNOWN, Cells
+from service.prompting.rows import UNKNOWN, Cells
 from service.prompting.token_accounting import UnprunedState
 from shared.features.augmented_state import State
 from shared.world.actions import Action

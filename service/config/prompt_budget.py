@@ -7,7 +7,7 @@ from shared.wire.schemas import Features, PromptFormat
 # Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an
 # experience in each format.
 _STATIC_TOKENS = 400
-_ROW_TOKENS = {"csv": 32, "json": 64, "markdown": 56, "compact": 12}
+_ROW_TOKENS = {"csv": 32, "compact": 12}
 # Of the two further columns of feature preset `reach`.
 _REACH_TOKENS = 16
 

@@ -17,7 +17,7 @@ from service.guidance.step_guidance import StepGuidance
 from service.learning.modules import Attended, Sample, top_k
 from service.mission.decisions import Pending
 from service.mission.mission import Mission
-from service.prompting.row_formats import cells
+from service.prompting.rows import cells
 from shared.features.augmented_state import Reach, State, augment
 from shared.wire.schemas import Candidate, UavState
 from shared.world.actions import Action

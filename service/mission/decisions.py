@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from service.errors import Conflict, NotFound, Refused
 from service.learning.modules import Sample
-from service.prompting.row_formats import Cells
+from service.prompting.rows import Cells
 from shared.kit.bounded import BoundedDict
 from shared.wire.schemas import Outcome
 from shared.world.scenario import Scenario

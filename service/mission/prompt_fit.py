@@ -34,7 +34,6 @@ def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Te
     examples = solved(spec, spec.features, scenario, weights, spec.top_k if spec.uses_attention else None)
     return Template(
         scenario,
-        spec.prompt,
         spec.features,
         demonstrations=examples,
         experiences=experiences,

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.prompting.candidates import CandidateSet, Viewpoint
 from service.prompting.guided_prompt import GuidedTemplate
-from service.prompting.row_formats import UNKNOWN, Cells
+from service.prompting.rows import UNKNOWN, Cells
 from shared.belief.learned_channel import LIKELY, ExpectedLinks
 from shared.features.augmented_state import Reach, State
 from shared.world.actions import Action

@@ -14,7 +14,7 @@ from importlib.resources import files
 import numpy as np
 
 from service.learning.modules import Weights, top_k
-from service.prompting.row_formats import Cells, cells
+from service.prompting.rows import Cells, cells
 from shared.features.augmented_state import State, augment
 from shared.wire.schemas import Features, MissionSpec, SensorId, Step, UavState, Wire
 from shared.world.scenario import Scenario

@@ -8,7 +8,7 @@ from dataclasses import replace
 from service.prompting.candidates import CandidateSet, Letters, Viewpoint
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt, note_block
-from service.prompting.row_formats import FORMATS, Cells, cells
+from service.prompting.rows import Cells, cells, row
 from service.prompting.token_accounting import UnprunedState
 from shared.features.augmented_state import Reach, State
 from shared.world.actions import Action
@@ -120,7 +120,7 @@ class GuidedTemplate(Template):
             static=self.static,
             experiences="".join(experiences),
             state=last + candidates.rows,
-            uncompressed=UnprunedState(state, FORMATS["csv"].row, last),
+            uncompressed=UnprunedState(state, row, last),
         )
 
     def fleet_prompts(
@@ -132,7 +132,7 @@ class GuidedTemplate(Template):
         """
         shares = {}
         for uav, (candidates, state) in uavs.items():
-            unpruned = UnprunedState(state, FORMATS["csv"].row, _list(uav, ""))
+            unpruned = UnprunedState(state, row, _list(uav, ""))
             shares[uav] = Prompt("", "", _list(uav, candidates.numbered_rows()), unpruned)
         uav, first = next(iter(shares.items()))
         last = "".join(nearest)

@@ -6,10 +6,20 @@ from collections.abc import Sequence
 
 from service.prompting.demonstrations import Solved
 from service.prompting.prompt import Prompt, note_block
-from service.prompting.row_formats import FORMATS, UNKNOWN, Cells, cells, columns, full_columns, meanings
+from service.prompting.rows import (
+    EXPERIENCE_NOTE,
+    UNKNOWN,
+    Cells,
+    cells,
+    columns,
+    experience,
+    introduction,
+    meanings,
+    row,
+)
 from service.prompting.token_accounting import UnprunedState
 from shared.features.augmented_state import State
-from shared.wire.schemas import Features, PromptStyle
+from shared.wire.schemas import Features
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
 
@@ -40,7 +50,6 @@ class Template:
 
     Args:
         scenario: the mission's world.
-        style: the rows' format; the caller orders the rows.
         features: the preset, which determines a row's columns.
         experiences: the most experiences of a prompt; with 0 the static block does not mention them.
         ranked: whether the rows are ordered best first.
@@ -51,7 +60,6 @@ class Template:
     def __init__(
         self,
         scenario: Scenario,
-        style: PromptStyle | None = None,
         features: Features = "paper",
         *,
         experiences: int = 8,
@@ -59,7 +67,6 @@ class Template:
         demonstrations: Sequence[Solved] = (),
         note: str | None = None,
     ) -> None:
-        self._format = FORMATS[(style and style.format) or "csv"]
         self._columns = columns(features)
         self.demonstrations = "".join(map(self._demonstration, demonstrations))
         examples = f"{_EXAMPLES}\n\n{self.demonstrations}" if demonstrations else ""
@@ -71,16 +78,16 @@ class Template:
             limit=-scenario.path_loss_limit_db,
             far=_levels(_NEAR_VELOCITY + 1, scenario.max_velocity),
             near=_levels(1, min(_NEAR_VELOCITY, scenario.max_velocity)),
-            introduction=self._format.introduction(self._columns, order),
+            introduction=introduction(self._columns, order),
             meanings=meanings(features),
             note=note_block(note),
-            experiences=f"{self._format.experience_note}\n\n" if experiences else "",
+            experiences=f"{EXPERIENCE_NOTE}\n\n" if experiences else "",
             demonstrations=examples,
         )
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """One line of the experiences: the chosen sensor's row, the decision, and its cost, which has the failure."""
-        return self._format.experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.1f}")
+        return experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.1f}")
 
     def unreported_row(self, sensor_id: int) -> Cells:
         """The row of a sensor that the report lacks."""
@@ -96,23 +103,16 @@ class Template:
             experiences: the lines of the block of experiences.
             nearest: lines of experiences for this prompt alone.
         """
-        header = self._format.experience_header(self._columns)
-        retrieved = "".join(nearest)
-        if nearest and not experiences:
-            retrieved = header + retrieved
-        last = retrieved + (self._format.gap if experiences or nearest else "")
+        last = "".join(nearest)
         return Prompt(
             static=self.static,
-            experiences=(header if experiences else "") + "".join(experiences),
-            state=last + self._table(cells(state, kept_rows)),
-            uncompressed=UnprunedState(state, self._format.row, last + self._format.header(full_columns(state))),
+            experiences="".join(experiences),
+            state=last + "".join(map(row, cells(state, kept_rows))),
+            uncompressed=UnprunedState(state, row, last),
         )
 
     def _demonstration(self, solved: Solved) -> str:
-        return f"{self._table(solved.rows)}Answer: {solved.sensor_id} {solved.velocity}\n\n"
-
-    def _table(self, rows: Sequence[Cells]) -> str:
-        return "".join((self._format.header(rows[0]), *map(self._format.row, rows))) if rows else ""
+        return f"{''.join(map(row, solved.rows))}Answer: {solved.sensor_id} {solved.velocity}\n\n"
 
 
 def _levels(slowest: int, fastest: int) -> str:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from service.config.settings import Settings
 from service.llm.answers import Completion
-from service.prompting.row_formats import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
 from service.prompting.row_kinds import count_kinds
+from service.prompting.rows import ALWAYS_KNOWN, UNKNOWN, Cells, full_columns
 from service.prompting.tokenizer import ENCODING, encoding
 from shared.features.augmented_state import State
 from shared.wire.schemas import Tokens

@@ -302,11 +302,11 @@ class FeedbackResponse(Wire):
     result: Literal["applied", "duplicate"]
 
 
-PromptFormat = Literal["csv", "json", "markdown", "compact"]
+PromptFormat = Literal["csv", "compact"]
 
 
 class PromptStyle(Received):
-    """The prompt's form of the sensors: JSON is one object a line, Markdown a table with its header.
+    """The prompt's form of the sensors.
 
     ``shuffled`` draws a new order of the rows for every step and UAV, from the mission's seed. Experiences are appended
     until there are too many; ``selection`` then chooses the ones that stay. ``demonstrations`` are worked examples in

@@ -31,13 +31,12 @@ from simulator.records.request_log import read_requests
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out, refuse_old_result
 from simulator.reporting.replay_agreement import Compared, Prices, ReplaySummary, agreement, by_source, show, side
 
-Format = Literal["csv", "json", "markdown"]
 REPLAY, REPLAYED = "replay.json", "replayed.jsonl"
 
 
 @dataclass(frozen=True)
 class Replay:
-    """Send the requests of a logged mission again, to another model, prompt format, k or mode.
+    """Send the requests of a logged mission again, to another model, number of experiences, k or mode.
 
     Fly and log a mission, then start an edge with another LLM (or other settings) and replay against it:
 
@@ -49,7 +48,7 @@ class Replay:
 
     The same edge with another prompt, or without its LLM:
 
-      aicvds replay runs/first --edge http://127.0.0.1:8000 --format json --top-k 3
+      aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value --top-k 3
 
       aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value
 
@@ -81,10 +80,6 @@ class Replay:
     """The modules' features."""
     init: Annotated[Init | None, arg(metavar="pretrained|random", help_behavior_hint="")] = None
     """The modules' initial weights."""
-    format: Annotated[
-        Literal["csv", "json", "markdown"] | None, arg(metavar="csv|json|markdown", help_behavior_hint="")
-    ] = None
-    """The format of the prompt's rows."""
     order: Annotated[Literal["score", "shuffled"] | None, arg(metavar="score|shuffled", help_behavior_hint="")] = None
     """The rows' order."""
     experiences: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -110,7 +105,7 @@ class Replay:
 
 
 _OF_SPEC = ("mode", "top_k", "attention", "features", "init")
-_OF_PROMPT = ("format", "order", "experiences", "selection", "demonstrations")
+_OF_PROMPT = ("order", "experiences", "selection", "demonstrations")
 
 
 def main(argv: list[str]) -> int:

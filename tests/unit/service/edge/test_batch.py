@@ -20,7 +20,7 @@ from service.llm.request_bodies import constrain_labels
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
-from service.prompting.row_formats import FORMATS
+from service.prompting.rows import row
 from service.prompting.token_accounting import UnprunedState
 from shared.world.actions import Action
 from tests.support.running import serving
@@ -222,7 +222,7 @@ def test_a_server_that_hangs_on_the_probe_is_asked_one_by_one(
 
 def test_what_is_left_of_a_word_is_the_llms_word() -> None:
     """A velocity forbidden meanwhile counts as the nearest that is offered; of sensors given away nothing is left."""
-    prompt = Prompt("", "", "", UnprunedState(attended(mission(), uav()).state, FORMATS["csv"].row))
+    prompt = Prompt("", "", "", UnprunedState(attended(mission(), uav()).state, row))
     word = LlmAdvice(
         prompt, {Action(1, 9): 0.3, Action(1, 2): 0.1, Action(4, 7): 0.6}, None, None, calibrated=False, model=None
     )

@@ -57,21 +57,6 @@ def test_the_llm_decides_within_the_grammar(loaded: httpx.Client, report: Report
         assert 0 <= answer["velocity"] <= 14
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("row_format", ["json", "markdown"])
-def test_it_reads_every_format(loaded: httpx.Client, report: Report, row_format: str) -> None:
-    style = {"format": row_format, "order": "shuffled", "experiences": 30}
-    made = loaded.put(f"/missions/{row_format}", json={"prompt": style, "attention": "off"})
-    assert made.json()["prompt"].items() >= style.items()
-    outcome = None
-    for step in range(3):
-        body = report(mission_id=row_format, step=step, outcome=outcome)
-        answer = loaded.post("/decide", json=body).json()
-        assert answer["source"] == "llm", answer["reason"]
-        outcome = {"decision_id": answer["decision_id"], "cost": 0.5}
-    assert answer["tokens"]["cached"] > answer["tokens"]["static"]
-
-
 def test_the_static_block_is_read_once(loaded: httpx.Client, report: Report) -> None:
     """From the second decision on, the server has the static block and the earlier experiences in its cache."""
     first = loaded.post("/decide", json=report(mission_id="cache")).json()

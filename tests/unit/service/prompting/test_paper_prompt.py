@@ -1,5 +1,4 @@
 import hashlib
-import json
 from typing import Any, Literal
 
 import pytest
@@ -12,9 +11,6 @@ from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
 from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS
 from tests.unit.service.making import PAPER, attended, mission, uav
-
-Format = Literal["csv", "json", "markdown"]
-FORMATS: list[Format] = ["csv", "json", "markdown"]
 
 
 def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> list[Prompt]:
@@ -29,12 +25,9 @@ def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> l
     return prompts
 
 
-@pytest.mark.parametrize("row_format", FORMATS)
 @pytest.mark.parametrize("order", ["score", "shuffled"])
-def test_the_static_block_is_the_same_bytes_at_every_step(
-    row_format: Format, order: Literal["score", "shuffled"]
-) -> None:
-    prompts = flown(spec=MissionSpec(prompt=PromptStyle(format=row_format, order=order)))
+def test_the_static_block_is_the_same_bytes_at_every_step(order: Literal["score", "shuffled"]) -> None:
+    prompts = flown(spec=MissionSpec(prompt=PromptStyle(order=order)))
     assert len({p.static for p in prompts}) == 1
     assert len({p.state for p in prompts}) > 1
     for earlier, later in zip(prompts, prompts[1:], strict=False):
@@ -60,13 +53,12 @@ def test_by_default_the_static_block_changes_on_purpose_only() -> None:
         (1, "1 beyond 50 m, 1 within 50 m, 0 at the sensor."),
     ],
 )
-@pytest.mark.parametrize("row_format", FORMATS)
 @pytest.mark.parametrize("features", ["paper", "reach"])
 def test_the_velocity_rule_is_the_papers_up_to_the_worlds_limit(
-    max_velocity: int, rule: str, row_format: Format, features: Literal["paper", "reach"]
+    max_velocity: int, rule: str, features: Literal["paper", "reach"]
 ) -> None:
     scenario = PAPER.model_copy(update={"max_velocity": max_velocity})
-    static = Template(scenario, PromptStyle(format=row_format), features).static
+    static = Template(scenario, features).static
     rules = static.split("Rules:\n")[1].split("\n\n")[0].splitlines()
     assert [one for one in rules if "elocity" in one] == [
         f"3. Velocity, in whole m/s, follows the chosen sensor's distance: {rule}"
@@ -96,56 +88,11 @@ def test_experiences_stand_between_static_and_state() -> None:
     assert last.user == last.experiences + last.state
 
 
-def test_json_is_an_object_a_line() -> None:
-    spec = MissionSpec(prompt=PromptStyle(format="json"), top_k=3)
-    first, last = flown(2, spec)
-    numbers = [json.loads(line) for line in first.state.splitlines()]
-    assert len(numbers) == 3
-    assert list(numbers[0]) == ["sensor_id", "queue", "gain", "age", "distance"]
-    assert all(type(value) is int for row in numbers for value in row.values())
-    assert json.loads(last.experiences) == {
-        "queue": 20,
-        "gain": -90,
-        "age": 0,
-        "distance": 100,
-        "answer": "1 7",
-        "cost": 0.1,
-    }
-
-
-def test_json_has_null_for_what_was_never_heard() -> None:
-    m = mission(MissionSpec(prompt=PromptStyle(format="json")))
-    view = attended(m, uav(queue=[30.0, None]))
-    whole = m.template.prompt(view.state, view.shown(), []).uncompressed.text.splitlines()
-    unheard = {"sensor_id": 1, "queue": None, "battery": None, "gain": None, "age": 0, "distance": 100}
-    assert json.loads(whole[1]) == unheard
-    assert json.loads(whole[0])["battery"] == 50
-
-
-def test_markdown_is_a_table_with_its_header_and_experiences_are_another() -> None:
-    first, last = flown(2, MissionSpec(prompt=PromptStyle(format="markdown"), top_k=2))
-    header = ["| sensor_id | queue | gain | age | distance |", "| --- | --- | --- | --- | --- |"]
-    assert first.experiences == ""
-    assert first.state.splitlines()[:2] == header
-    assert len(first.state.splitlines()) == 4
-    assert last.user.splitlines()[:6] == [
-        "| queue | gain | age | distance | answer | cost |",
-        "| --- | --- | --- | --- | --- | --- |",
-        "| 20 | -90 | 0 | 100 | 1 7 | 0.1 |",
-        "",
-        *header,
-    ]
-    assert last.uncompressed.text.splitlines()[1].startswith("| sensor_id | queue | battery | gain |")
-
-
-@pytest.mark.parametrize("row_format", FORMATS)
-def test_the_static_block_speaks_of_what_the_mission_shows(row_format: Format) -> None:
-    static = mission(MissionSpec(prompt=PromptStyle(format=row_format))).template.static
-    assert ("JSON" in static) == (row_format == "json")
-    assert ("table" in static) == (row_format == "markdown")
-    assert ("Past decisions are rows" in static) == (row_format == "csv")
+def test_the_static_block_speaks_of_what_the_mission_shows() -> None:
+    static = mission().template.static
+    assert "Past decisions are rows" in static
     assert "the most promising first" in static
-    shuffled = mission(MissionSpec(prompt=PromptStyle(format=row_format, order="shuffled"))).template.static
+    shuffled = mission(MissionSpec(prompt=PromptStyle(order="shuffled"))).template.static
     assert "the most promising first" not in shuffled
     assert "in no particular order" in shuffled
 
@@ -196,7 +143,7 @@ def test_as_many_as_there_are_sensors_are_offered_best_first_or_shuffled() -> No
 
 
 def test_no_experiences_means_no_block_and_no_word_of_it() -> None:
-    prompts = flown(4, MissionSpec(prompt=PromptStyle(experiences=0, format="markdown")))
+    prompts = flown(4, MissionSpec(prompt=PromptStyle(experiences=0)))
     assert [p.experiences for p in prompts] == [""] * 4
     assert "Past decisions" not in prompts[0].static
 
@@ -209,16 +156,15 @@ def test_a_mission_says_how_many_experiences_it_keeps(told: int | None, kept: in
     assert status.prompt.experiences == kept
 
 
-@pytest.mark.parametrize("row_format", FORMATS)
-def test_thirty_experiences_fit_the_embedded_models_context(row_format: Format) -> None:
-    spec = MissionSpec(mode="llm", prompt=PromptStyle(format=row_format, experiences=30), top_k=10)
+def test_thirty_experiences_fit_the_embedded_models_context() -> None:
+    spec = MissionSpec(mode="llm", prompt=PromptStyle(experiences=30), top_k=10)
     assert status_of(mission(spec)).prompt.experiences == 30
 
 
 @pytest.mark.parametrize(
     "spec",
     [
-        MissionSpec(mode="llm", prompt=PromptStyle(format="json", experiences=100)),
+        MissionSpec(mode="llm", scenario="dense", prompt=PromptStyle(format="csv", experiences=100), top_k=20),
         MissionSpec(mode="llm", attention="off", scenario=SCENARIOS["dense"].model_copy(update={"sensors": 500})),
     ],
 )

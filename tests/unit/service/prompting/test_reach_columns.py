@@ -1,6 +1,5 @@
 """Feature preset ``reach``: what a UAV on its lap could collect after a step at each velocity."""
 
-import json
 import math
 
 import numpy as np
@@ -8,9 +7,8 @@ import pytest
 
 from service.deciding.attended_state import AttendedState
 from service.mission.mission_status import status_of
-from service.prompting.row_formats import columns
 from shared.features.augmented_state import FEATURES, LEVEL_FEATURES, distances_between, places_ahead
-from shared.wire.schemas import Features, MissionSpec, PromptStyle, UavState
+from shared.wire.schemas import Features, MissionSpec, UavState
 from shared.world.channel import link_holds, packets_per_step
 from shared.world.scenario import SCENARIOS, Point
 from shared.world.trajectory import trajectories
@@ -154,13 +152,6 @@ def test_a_row_tells_the_best_velocity_and_what_it_collects() -> None:
     plain = mission().template.static
     assert "movable" not in plain
     assert "with five numbers" in plain
-
-
-def test_a_row_in_json_has_the_same_columns() -> None:
-    m = mission(MissionSpec(features="reach", prompt=PromptStyle(format="json")))
-    view = attended(m, on_lap([at(-300.0)], [60.0]))
-    row = json.loads(m.template.prompt(view.state, view.shown(), []).state)
-    assert tuple(row) == columns("reach")
 
 
 @pytest.mark.parametrize("scenario", sorted(SCENARIOS))

@@ -6,10 +6,10 @@ from typing import get_args
 import pytest
 
 from service.config.settings import Settings
-from service.prompting.row_formats import FORMATS
+from service.prompting.rows import row
 from service.prompting.token_accounting import TokenCounter, UnprunedState, price_usd
 from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
-from shared.wire.schemas import Features, MissionSpec, PromptStyle
+from shared.wire.schemas import Features, MissionSpec
 from shared.world.scenario import Scenario
 from tests.unit.service.making import attended, mission, uav
 
@@ -76,23 +76,21 @@ def test_every_number_of_up_to_three_digits_is_one_token_and_longer_ones_are_spl
     assert [COUNTER.count("7" * digits) for digits in range(1, 11)] == [1, 1, 1, 2, 2, 2, 3, 3, 3, 4]
 
 
-@pytest.mark.parametrize("row_format", FORMATS)
 @pytest.mark.parametrize("features", get_args(Features))
-def test_the_uncompressed_state_is_counted_as_if_it_were_written(row_format: str, features: Features) -> None:
+def test_the_uncompressed_state_is_counted_as_if_it_were_written(features: Features) -> None:
     """Numbers of 1 to 7 digits, zeros, negative ones and unknown ones, with lines above them and without."""
     spec = MissionSpec.model_validate(
         {
             "scenario": Scenario(sensors=300, queue_capacity=100_000, area_m=1e6),
-            "prompt": PromptStyle.model_validate({"format": row_format}),
             "features": features,
         }
     )
     m = mission(spec)
-    drawn = random.Random(features + row_format)
+    drawn = random.Random(features)
     queue = [None if drawn.random() < 0.3 else float(int(10 ** drawn.uniform(0, 5)) - 1) for _ in range(300)]
     view = attended(m, uav(step=3000, x=[10 ** drawn.uniform(0, 6) for _ in queue], queue=queue), 3000)
     for lines in ([], ["20,-90,0,100 > 1 7: 0.1\n"]):
         whole = m.template.prompt(view.state, view.shown(), [], lines).uncompressed
         assert len(whole.text.splitlines()) >= 300
         assert whole.tokens(COUNTER.count) == COUNTER.count(whole.text)
-    assert UnprunedState(view.state, FORMATS["csv"].row).tokens(COUNTER.count) > 300 * 11
+    assert UnprunedState(view.state, row).tokens(COUNTER.count) > 300 * 11

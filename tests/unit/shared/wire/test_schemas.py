@@ -161,7 +161,7 @@ def test_a_mission_is_the_papers_unless_told_otherwise() -> None:
 
 
 def test_a_mission_with_its_own_prompt_survives_json() -> None:
-    style = PromptStyle(format="json", order="shuffled", experiences=30)
+    style = PromptStyle(format="compact", order="shuffled", experiences=30)
     spec = MissionSpec(attention="off", features="reach", prompt=style)
     assert MissionSpec.model_validate_json(spec.model_dump_json()) == spec
 

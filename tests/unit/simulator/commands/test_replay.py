@@ -106,14 +106,13 @@ def test_another_mode_prompt_and_k_are_compared_and_different_decisions_are_not_
     client = edge(mode="llm", llm_gguf="none")
     url = str(client.base_url)
     run = fly(url, tmp_path / "run", 8)
-    changes = "--mode value --format json --top-k 2 --features reach --init random --experiences 4 --selection best"
+    changes = "--mode value --top-k 2 --features reach --init random --experiences 4 --selection best"
     again = replay_again(run, url, tmp_path / "again", *changes.split())
     assert again.changed == {
         "mode": ("llm", "value"),
         "top_k": (5, 2),
         "features": (None, "reach"),
         "init": ("pretrained", "random"),
-        "prompt.format": ("csv", "json"),
         "prompt.experiences": (8, 4),
         "prompt.selection": ("recent", "best"),
     }
