@@ -2,7 +2,7 @@
 
     python benchmarks/sensors.py
 
-It flies missions of 10 to 10,000 sensors in turn against real edges with a store: one of mode ``value``, which has no
+It flies missions of 10 to 2,000 sensors in turn against real edges with a store: one of mode ``value``, which has no
 LLM, and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The share is the edge's own time,
 ``latency_ms``, less the LLM's. The round trip, also less the LLM's time, includes HTTP and parsing. Decisions of the
 LLM-free policy, for example without a heard sensor, are counted and omitted. Every request has the last decision's
@@ -67,7 +67,7 @@ ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
 class Sensors:
     """Measure the edge's share, memory and wire by the number of sensors."""
 
-    sensors: tuple[int, ...] = (10, 100, 1000, 10_000)
+    sensors: tuple[int, ...] = (10, 100, 1000, 2000)
     """Numbers of sensors J, ascending."""
     steps: int = 6
     """Steps of a mission, at least 2; three UAVs decide at each."""

@@ -175,9 +175,11 @@ def _attend(mission: Mission, features: NDArray[np.float32], packets: FloatArray
     """Places among the n sensors of those to keep, best first, and their attention, with added ``packets`` ``(n,)``."""
     if not len(features):
         return [], Attended(np.empty(0, dtype=np.float32), features.__getitem__)
-    # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
-    added = None if packets is None else (packets / mission.scenario.queue_capacity).astype(np.float32)
+    attended = mission.learner.weights.attend(features)
+    if packets is not None:
+        # A score is minus a cost, and the packets of a cost are counted in queues of capacity W.
+        added = (packets / mission.scenario.queue_capacity).astype(np.float32)
+        attended = attended._replace(scores=attended.scores + added)
     if not mission.uses_attention:
-        return list(range(len(features))), mission.learner.weights.attend(features, added=added)
-    attended = mission.learner.weights.attend(features, mission.top_k, added)
+        return list(range(len(features))), attended
     return top_k(attended.scores, mission.top_k), attended

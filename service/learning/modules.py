@@ -16,16 +16,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from service.learning.contenders import contenders
 from service.learning.softmax_means import Array, softmax, softmax_means
 from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
 from shared.wire.schemas import Features
-from shared.world.channel import IntArray
 
 WIDTH = 32
-# Fewer sensors are scored in numpy, with an n x n array. Of very many, those are scored that may be among the best, if
-# many times fewer are needed.
-_MANY, _VERY_MANY, _FEW = 64, 4096, 20
+# Fewer sensors are scored in numpy, with an n x n array.
+_MANY = 64
 
 
 class Sample(NamedTuple):
@@ -153,15 +150,9 @@ class Weights:
         """The attention module's parameters by name."""
         return {name: getattr(self.parameters, name) for name in AttentionWeights._fields}
 
-    def attend(self, features: Array, best: int | None = None, added: Array | None = None) -> Attended:
-        """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`.
-
-        Args:
-            best: so many highest scores are needed: others may be minus infinity.
-            added: shape ``(n,)``, is added to the scores.
-        """
-        attended = self._attend_few(features) if len(features) < _MANY else self._attend_many(features, best, added)
-        return attended if added is None else attended._replace(scores=attended.scores + added)
+    def attend(self, features: Array) -> Attended:
+        """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`."""
+        return self._attend_few(features) if len(features) < _MANY else self._attend_many(features)
 
     def _attend_few(self, features: Array) -> Attended:
         own = self.parameters
@@ -170,17 +161,12 @@ class Weights:
         z = softmax(similar) @ (features @ own.value.T)
         return Attended(z @ own.score[0] + own.bias[0], z.__getitem__)
 
-    def _attend_many(self, features: Array, best: int | None, added: Array | None) -> Attended:
-        """As :meth:`attend`, without ``added`` in the scores."""
+    def _attend_many(self, features: Array) -> Attended:
         own = self.parameters
         # q_i k_j = x_i W_q^T W_k x_j, and what a score adds up is w W_v x_j: no head needs more than d dimensions.
         queries = features @ (own.query.T @ own.key) * np.float32(len(own.query) ** -0.5)
         values = features @ (own.score[0] @ own.value)
-        rows: slice | IntArray = slice(None)
-        if best is not None and len(features) >= max(_VERY_MANY, _FEW * best):
-            rows = contenders(queries, features, values, best, added)
-        scores = np.full(len(features), -np.inf, dtype=np.float32)
-        scores[rows] = softmax_means(queries[rows], features, values) + own.bias[0]
+        scores = softmax_means(queries, features, values) + own.bias[0]
         return Attended(scores, partial(self._contexts, features, queries))
 
     def _contexts(self, features: Array, queries: Array, rows: list[int]) -> Array:

@@ -6,21 +6,17 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.kit.compiled import compiled, inlined
-from shared.kit.cores import usable_cores
 
 Array = NDArray[np.float32]
 
-# Queries that are computed at a time: what they need stays in a core's nearest cache. Their number does not depend on
-# the number of cores, so neither do the results. From so many queries on, the cores share them.
-_SHARE, _FOR_CORES = 256, 2048
+# Queries that are computed at a time: what they need stays in a core's nearest cache.
+_SHARE = 256
 # Keys whose products with a query are computed at a time, and dimensions that are added at a time.
 _KEYS, _DIMENSIONS = 4, 4
 # The largest product of a query with some keys, about so many, stands for its largest product. Where it is so far below
@@ -70,7 +66,7 @@ def softmax(logits: Array) -> Array:
 
 
 def softmax_means(queries: Array, keys: Array, values: Array) -> Array:
-    """The weighted means ``(m,)``, the same to the bit on any number of cores.
+    """The weighted means ``(m,)``.
 
     Args:
         queries: shape ``(m, d)``.
@@ -91,14 +87,7 @@ def softmax_means(queries: Array, keys: Array, values: Array) -> Array:
     def means(first: int) -> Array:
         return _means(np.ascontiguousarray(wide[:, first : first + _SHARE]), filled, counted)
 
-    shares = range(0, len(queries), _SHARE)
-    cores = usable_cores() if len(queries) >= _FOR_CORES else 1
-    return np.concatenate([*(_threads(cores).map(means, shares) if cores > 1 else map(means, shares))])
-
-
-@cache
-def _threads(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="attention")
+    return np.concatenate([means(first) for first in range(0, len(queries), _SHARE)])
 
 
 def _means(queries: Array, keys: Array, counted: Array) -> Array:

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 # Listeners of all missions together.
 MAX_LISTENERS = 32
 _PERIOD_S = 0.1
-# The largest share of the event loop's time for updates: one for 10,000 sensors takes milliseconds.
+# The largest share of the event loop's time for updates: one for 2,000 sensors takes milliseconds.
 _SHARE = 0.05
 # The backlog of updates for late listeners, in number and in bytes.
 _MOST_FRAMES, _MOST_BYTES = 30, 1_000_000

@@ -18,7 +18,7 @@ _MOST_CHARACTERS = 4_000_000
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
-    """A prompt's text without the unpruned state, which may have 10,000 sensors."""
+    """A prompt's text without the unpruned state, which may have 2,000 sensors."""
 
     static: str
     experiences: str

@@ -3,8 +3,7 @@
 The state block without pruning and masks, the baseline for the tokens saved, is never sent: its tokens are counted
 without writing it. It has full rows, also where the prompt's own rows are shorter (letters, or the compact prompt).
 Apart from the digits, a row's tokens depend only on which of its numbers are negative or unknown; the digits of a
-number cost one token for every three. This way 10,000 rows take a millisecond; writing and tokenizing them takes a
-hundred.
+number cost one token for every three. Writing and tokenizing many rows would take a hundred times as long.
 """
 
 from __future__ import annotations

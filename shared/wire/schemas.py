@@ -14,9 +14,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInf
 from shared.kit.received_objects import few_names, plain
 from shared.wire.problem import INCOMPLETE
 from shared.wire.reasons import Reason
-from shared.world.scenario import Scenario
+from shared.world.scenario import MAX_SENSORS, Scenario
 
-MAX_SENSORS = 10_000
 MAX_STEP = 1_000_000
 # A UAV that waited longer reports this much.
 MAX_ROUND_TRIP_MS = 600_000.0
@@ -68,7 +67,7 @@ class Received(Wire):
 
 
 class SensorColumns(Received):
-    """One UAV's knowledge of the sensors: parallel arrays of 1 to 10,000 entries, all of the same length.
+    """One UAV's knowledge of the sensors: parallel arrays of 1 to 2,000 entries, all of the same length.
 
     ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last
     beacon) are all ``null`` for a sensor never heard, and none is for a sensor that was heard. ``x`` and ``y`` may both

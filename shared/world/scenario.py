@@ -15,6 +15,7 @@ Point = tuple[float, float]
 Coordinate = Annotated[float, Field(ge=-1e7, le=1e7)]
 Waypoint = Annotated[tuple[Coordinate, Coordinate], Field(strict=False)]
 
+MAX_SENSORS = 2_000
 _MAX_ARRIVALS = 10_000_000
 
 
@@ -33,7 +34,7 @@ class Scenario(Unmodelled):
     _few_names = model_validator(mode="before")(few_names)
 
     name: str = Field("paper", pattern=r"^[a-z][a-z0-9_]{0,31}$")
-    sensors: int = Field(10, ge=1, le=10_000, description="number of ground sensors J")
+    sensors: int = Field(10, ge=1, le=MAX_SENSORS, description="number of ground sensors J")
     uavs: int = Field(3, ge=1, le=100, description="number of UAVs I")
     steps: int = Field(30, ge=1, le=10_000, description="waypoints of a mission T")
 

@@ -10,13 +10,13 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, from_json
 
-from shared.world.scenario import Point
+from shared.world.scenario import MAX_SENSORS, Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence, FenceRole
 from simulator.sites.files.reading import quoted, text_of
 
 MAX_BYTES = 20_000_000
-MAX_SENSORS, MAX_TRAJECTORIES, MAX_WAYPOINTS, MAX_FENCES = 10_000, 100, 1000, 100
+MAX_TRAJECTORIES, MAX_WAYPOINTS, MAX_FENCES = 100, 1000, 100
 MAX_RADIUS_M = 1e6
 ROLES = '"sensor", "trajectory", "pipeline", "fence" or "no_fly"'
 # RFC 7946 has no `crs` member; older programs still write one, which is valid if it names WGS 84.

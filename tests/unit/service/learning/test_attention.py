@@ -4,7 +4,6 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from service.learning.initial_weights import initial_weights
 from service.learning.modules import Attention, Modules, top_k
 
 
@@ -69,20 +68,6 @@ def test_decisions_score_many_sensors_as_the_reference(sensors: int, features: i
     np.testing.assert_allclose(attended.contexts(rows), z[rows], atol=2e-6)
     # Which rows are asked for at a time changes no bit of a velocity's value.
     np.testing.assert_array_equal(attended.contexts(rows[:1])[0], attended.contexts(rows)[0])
-
-
-def test_of_very_many_sensors_the_best_have_the_same_scores_as_of_all() -> None:
-    weights = initial_weights("pretrained", "reach", 15, 0)
-    random = np.random.default_rng(3)
-    x = random.random((5000, 12), dtype=np.float32)
-    added = np.where(random.random(5000) < 0.001, 0.05, 0.0).astype(np.float32)
-    for more in (None, added):
-        whole, few = weights.attend(x, added=more), weights.attend(x, 5, more)
-        scored = np.isfinite(few.scores)
-        assert 5 <= scored.sum() < 5000
-        np.testing.assert_array_equal(few.scores[scored], whole.scores[scored])
-        assert top_k(few.scores, 5) == top_k(whole.scores, 5)
-        np.testing.assert_array_equal(few.contexts([7, 4000]), whole.contexts([7, 4000]))
 
 
 def test_a_masked_sensor_changes_nothing() -> None:

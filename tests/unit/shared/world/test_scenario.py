@@ -96,4 +96,6 @@ def test_every_point_of_the_area_is_within_260_m_of_a_lap() -> None:
 
 def test_a_world_too_large_to_draw_is_refused() -> None:
     with pytest.raises(ValidationError, match="sensors x steps"):
-        Scenario(sensors=10_000, steps=10_000)
+        Scenario(sensors=2_000, steps=10_000)
+    with pytest.raises(ValidationError, match="less than or equal to 2000"):
+        Scenario(sensors=2_001)
