@@ -148,12 +148,11 @@ class OperatorGuidance:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a ``state_dict``."""
-        # Journals of earlier versions have no note: theirs is the spec's.
-        self.note = state.get("note", self.note)
+        self.note = state["note"]
         self.status = state["status"]
         self._obey(Guidance.model_validate(state["obeyed"]))
         proposed = state["understood"]
         self._proposed = None if proposed is None else Guidance.model_validate(proposed)
         self._origin, self._model, self._failure = state["origin"], state["model"], state["failure"]
-        self._doubts = state.get("doubts", [])
-        self._begun, self._ended = state.get("begun", []), state.get("ended", [])
+        self._doubts = state["doubts"]
+        self._begun, self._ended = state["begun"], state["ended"]

@@ -223,10 +223,10 @@ class Mission:
             "feedback": self.feedback,
             "pending": self.pending.state_dict(),
             "applied": self.pending.applied.state_dict(),
-            "repeats": self.idempotent_answers.state_dict(),
-            "memory": self.experiences.state_dict(),
+            "idempotent_answers": self.idempotent_answers.state_dict(),
+            "experiences": self.experiences.state_dict(),
             "records": self.records.state_dict(),
-            "turns": self.reservations.state_dict(),
+            "reservations": self.reservations.state_dict(),
             "belief": self.belief.state_dict(),
             "guidance": self.guidance.state_dict(),
             "visit_orders": self.visit_orders.state_dict(),
@@ -239,19 +239,16 @@ class Mission:
         self.decisions, self.feedback = state["decisions"], state["feedback"]
         self.pending.load_state_dict(state["pending"])
         self.pending.applied.load_state_dict(state["applied"])
-        self.idempotent_answers.load_state_dict(state["repeats"])
-        self.experiences.load_state_dict(state["memory"])
+        self.idempotent_answers.load_state_dict(state["idempotent_answers"])
+        self.experiences.load_state_dict(state["experiences"])
         self.records.load_state_dict(state["records"])
-        self.reservations.load_state_dict(state["turns"])
+        self.reservations.load_state_dict(state["reservations"])
         self.belief.load_state_dict(state["belief"])
         for model, trust in state["trust"].items():
             self.trust[model].load_state_dict(trust)
         self.restore_guidance(state["guidance"])
-        # Checkpoints of earlier versions have neither: their orders count from the next decision.
-        if "visit_orders" in state:
-            self.visit_orders.load_state_dict(state["visit_orders"])
-        if "readings" in state:
-            self.readings.load_state_dict(state["readings"])
+        self.visit_orders.load_state_dict(state["visit_orders"])
+        self.readings.load_state_dict(state["readings"])
 
     def restore_guidance(self, state: dict[str, Any]) -> None:
         """Restore the operator's guidance from its ``state_dict``."""

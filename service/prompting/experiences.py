@@ -42,14 +42,13 @@ class Experience:
     """A past decision: its line in the prompt, its cost, and the chosen row's attention features ``(d,)``, each 0..1.
 
     ``features`` is None where the modules had no part in the decision; `similar` ignores such an experience.
-    ``sensor_id`` is None in experiences that an earlier version stored.
     """
 
     line: str
     cost: float
     features: NDArray[np.float32] | None
-    sensor_id: int | None = None
-    failed: bool = False
+    sensor_id: int
+    failed: bool
 
 
 class Experiences:

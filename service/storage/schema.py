@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlalchemy as sa
 
 # The newest version in service/storage/migrations/versions.
-SCHEMA = "0003"
+SCHEMA = "0004"
 
 metadata = sa.MetaData()
 missions = sa.Table(

@@ -30,8 +30,10 @@ from shared.wire.schemas import MissionSpec
 _CONNECT_S = 5
 _STATEMENT_MS = 5000
 _IDLE_MS = 1500
-# An arbitrary key, which no other program of the same database may use. Earlier versions had this lock while they ran.
+# An arbitrary key, which no other program of the same database may use.
 _MIGRATING = 0x41494356
+# Schemas of versions before the first release, whose missions this one cannot read.
+_UNRELEASED = ("0001", "0002", "0003")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,22 +154,24 @@ class Store:
                 command.upgrade(config, "head")
 
     def _migrate_alone(self, db: sa.Connection) -> None:
-        """Wait for an edge that migrates the database too, and refuse one that an earlier version uses."""
+        """Wait for an edge that migrates the database too; raises ``StoreUnusable`` where that takes too long."""
         try:
             db.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATING)))
         except sa.exc.OperationalError as error:
             if "lock timeout" not in str(error):
                 raise
             database = self._engine.url.database
-            raise StoreUnusable(f"an edge of an earlier version uses the database {database}: end it") from None
+            raise StoreUnusable(f"another edge has migrated the database {database} for too long: end it") from None
 
 
 def _version(db: sa.Connection) -> str | None:
-    """The schema's version, None for an empty database; raises ``StoreUnusable`` where this program is older."""
+    """The schema's version, None for an empty database; raises ``StoreUnusable`` where this program cannot read it."""
     known = sa.inspect(db).has_table("alembic_version")
     version: str | None = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
     if version is not None and version > SCHEMA:
         raise StoreUnusable(f"it was made by a newer version of this program (schema {version}, not {SCHEMA})")
+    if version in _UNRELEASED:
+        raise StoreUnusable(f"it was made before the first release (schema {version}, not {SCHEMA})")
     return version
 
 

@@ -19,8 +19,7 @@ _POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
 # The probability that a burst lasts into the next step, and its powers until they are 0.
 GOES_ON = 0.7
 _POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
-_ARRAYS = ("arrived", "watched")
-_NEWER_ARRAYS = ("recent", "recent_at")
+_ARRAYS = ("arrived", "watched", "recent", "recent_at")
 
 
 class Arrivals:
@@ -98,16 +97,13 @@ class Arrivals:
 
     def state_dict(self) -> dict[str, Any]:
         """The arrivals, as copies."""
-        arrays = {name: getattr(self, name).copy() for name in (*_ARRAYS, *_NEWER_ARRAYS)}
+        arrays = {name: getattr(self, name).copy() for name in _ARRAYS}
         return {**arrays, "surprise": self._surprise, "intervals": self._intervals}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state; one of an earlier version knows rates alone."""
+        """Restore a ``state_dict``."""
         for name in _ARRAYS:
             setattr(self, name, state[name])
         self.rate = self.arrived / self.watched
-        if "surprise" in state:
-            for name in _NEWER_ARRAYS:
-                setattr(self, name, state[name])
-            self._surprise, self._intervals = state["surprise"], state["intervals"]
-            self._estimate_dispersion()
+        self._surprise, self._intervals = state["surprise"], state["intervals"]
+        self._estimate_dispersion()

@@ -235,14 +235,13 @@ class FleetBelief:
         return {**arrays, **self.arrivals.state_dict(), "uavs": uavs, **learned}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a belief. One of an earlier version has neither visits nor a channel."""
+        """Restore a ``state_dict``."""
         for name in _ARRAYS:
             setattr(self, name, state[name])
         self.arrivals.load_state_dict(state)
         self.uavs = {uav: Whereabouts.of(told) for uav, told in state["uavs"].items()}
-        if "channel" in state:
-            self.channel.load_state_dict(state["channel"])
-            self.drift.load_state_dict(state["drift"])
+        self.channel.load_state_dict(state["channel"])
+        self.drift.load_state_dict(state["drift"])
 
     def queue(self, step: int, ids: IntArray | None = None) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``ids``."""

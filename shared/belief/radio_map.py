@@ -190,7 +190,7 @@ class RadioMap:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a map, to the bit. One of an earlier version is without what was solved."""
+        """Restore a ``state_dict``, to the bit."""
         numbers: list[tuple[slice | int, str]] = [
             (_PLACE, "places"),
             (EXCESS, "excess"),
@@ -203,7 +203,7 @@ class RadioMap:
         self.count = state["count"]
         self.heard, self.kind, self._compared = state["heard"], KINDS[state["kind"]], state["compared"]
         self.exact = state["exact"]
-        if state.get("solved") is not None:
+        if state["solved"] is not None:
             self._inverse, self._kept[..., MEASURED], self._kept[..., ONES] = state["solved"]
             self._estimate()
         elif not self.exact:

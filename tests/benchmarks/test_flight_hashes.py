@@ -14,7 +14,7 @@ from tests.benchmarks.running import figures
 pytestmark = pytest.mark.long
 
 
-RECORDED = Path(__file__).with_name("flights_601e8f2.json")
+RECORDED = Path(__file__).with_name("flights.json")
 SHORT = r"^(paper|pipeline) (eof|wqcs|value full)|^paper (value|policy|guided) (full|delta|pruned)"
 
 

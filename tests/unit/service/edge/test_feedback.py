@@ -26,7 +26,7 @@ from tests.unit.service.making import attended, uav
 Report = Callable[..., dict[str, Any]]
 
 # What of a mission's state has decisions' IDs in it, which are random.
-_NAMED = {"turns", "pending", "applied", "repeats", "records", "trust"}
+_NAMED = {"reservations", "pending", "applied", "idempotent_answers", "records", "trust"}
 
 
 def test_the_same_flight_learns_the_same(tmp_path: Path, report: Report) -> None:

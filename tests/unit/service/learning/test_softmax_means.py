@@ -26,17 +26,6 @@ def test_any_number_of_keys_and_dimensions_has_the_exact_means(keys: int, dimens
     np.testing.assert_allclose(softmax_means(*case), exact(*case), atol=2e-6)
 
 
-def test_cores_share_many_queries_and_give_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    case = drawn(4097, 200, 12)
-    found = []
-    for cores in (1, 2, 3, 16):
-        monkeypatch.setattr("service.learning.softmax_means.usable_cores", lambda cores=cores: cores)
-        found.append(softmax_means(*case))
-    np.testing.assert_allclose(found[0], exact(*case), atol=2e-6)
-    for shared in found[1:]:
-        np.testing.assert_array_equal(shared, found[0])
-
-
 @pytest.mark.parametrize("scale", [10.0, 100.0, 1000.0])
 def test_products_that_differ_by_more_than_numbers_have_exponents(scale: float) -> None:
     case = drawn(300, 1000, 5, scale)

@@ -15,7 +15,7 @@ SELECTIONS: tuple[Selection, ...] = get_args(Selection)
 
 
 def past(line: str, cost: float = 0.0, *features: float) -> Experience:
-    return Experience(f"{line}\n", cost, np.array(features, dtype=np.float32) if features else None)
+    return Experience(f"{line}\n", cost, np.array(features, dtype=np.float32) if features else None, 0, False)
 
 
 def remembering(selection: Selection, limit: int, *experiences: Experience, uavs: int = 1) -> Experiences:

@@ -1,4 +1,4 @@
-"""The experiences of a mission with the compact prompt: in flight, after a restart, and of an earlier version."""
+"""The experiences of a mission with the compact prompt: in flight, and after a restart."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from service.config.settings import Settings
-from service.mission.mission import Mission
-from shared.wire.schemas import MissionSpec
 from tests.support.running import serving
-from tests.unit.service.keeping import copy_of, fly, running, state
+from tests.unit.service.keeping import copy_of, fly, running
 from tests.unit.service.stub_llm import StubLlm, wait_for
 
 Report = Callable[..., dict[str, Any]]
@@ -54,13 +51,3 @@ def test_between_compactions_a_prompt_begins_with_the_one_before(tmp_path: Path,
     same = [(one, other) for (one, before), (other, after) in pairwise(seen) if before == after]
     assert len(same) >= 4
     assert all(later.startswith(earlier) for earlier, later in same)
-
-
-def test_a_checkpoint_of_an_earlier_version_flies_on_with_experiences() -> None:
-    settings = Settings(llm_url="http://127.0.0.1:9/v1", mode="llm", llm_adapter="served")
-    mission = Mission("test", MissionSpec.model_validate(EIGHT), settings)
-    stored = state(mission)
-    stored["memory"] = {"block": ["7d9X"], "compactions": 0, "since": 1, "remembered": [["7d9X", 1.0, None]]}
-    mission.load_state_dict(stored)
-    assert mission.experiences.block == ["7d9X"]
-    assert mission.state_dict()["memory"]["remembered"] == [["7d9X", 1.0, None, None, False]]

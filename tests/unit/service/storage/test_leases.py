@@ -190,26 +190,26 @@ async def test_a_transaction_of_a_lost_mission_writes_nothing(store: Store) -> N
 
 
 @contextmanager
-def _earlier(url: str) -> Iterator[sa.Connection]:
-    """The database as the version before left it; a connection to it."""
+def _emptied(url: str) -> Iterator[sa.Connection]:
+    """The database without the tables; a connection to it."""
     engine = sa.create_engine(url.replace("postgresql://", "postgresql+psycopg://"))
     config = Config()
     config.set_main_option("script_location", "service/storage/migrations")
     config.set_main_option("path_separator", "os")
     with engine.begin() as db:
         config.attributes["connection"] = db
-        command.downgrade(config, "0002")
+        command.downgrade(config, "base")
     with engine.connect() as db:
         yield db
     engine.dispose()
 
 
-def test_a_database_of_the_version_before_is_opened_once_its_edge_has_ended(postgres: str) -> None:
+def test_an_empty_database_is_opened_once_the_edge_that_migrates_it_has_ended(postgres: str) -> None:
     Store(postgres).close()
-    with _earlier(postgres) as edge:
+    with _emptied(postgres) as edge:
         edge.exec_driver_sql(f"SELECT pg_advisory_lock({0x41494356})")
         edge.commit()
-        with pytest.raises(StoreUnusable, match="an edge of an earlier version uses the database"):
+        with pytest.raises(StoreUnusable, match="another edge has migrated the database"):
             Store(postgres)
         edge.exec_driver_sql(f"SELECT pg_advisory_unlock({0x41494356})")
         edge.commit()

@@ -68,14 +68,6 @@ def test_a_restored_state_goes_on_to_the_bit(came: IntArray) -> None:
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_a_state_of_an_earlier_version_knows_rates_alone() -> None:
-    state, again = told(bursts()).state_dict(), Arrivals(WORLD)
-    again.load_state_dict({name: state[name] for name in ("arrived", "watched")})
-    np.testing.assert_array_equal(again.rate, told(bursts()).rate)
-    assert again.dispersion == 1.0
-    assert not again.burst(200).any()
-
-
 def test_where_nothing_is_expected_nothing_is_no_surprise_and_a_packet_is_no_burst() -> None:
     nothing = SCENARIOS["paper"].model_copy(update={"arrival_rate_min": 0.0, "arrival_rate_max": 0.0})
     arrivals, ids = Arrivals(nothing), np.arange(10)

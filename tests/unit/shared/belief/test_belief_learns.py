@@ -261,13 +261,3 @@ def test_a_restored_belief_learns_on_to_the_bit() -> None:
     for name in ("packets", "hold"):
         np.testing.assert_array_equal(getattr(whole.links(0, ways), name), getattr(again.links(0, ways), name))
     np.testing.assert_array_equal(whole.queue(14), again.queue(14))
-
-
-def test_a_belief_of_an_earlier_version_has_no_channel_and_no_visits() -> None:
-    fleet, again = fails(2), FleetBelief(WORLD)
-    state = fleet.state_dict()
-    state["uavs"] = {uav: last[:4] for uav, last in state["uavs"].items()}
-    again.load_state_dict({name: state[name] for name in state if name not in ("channel", "drift")})
-    assert again.channel.by_formula
-    assert again.decided(2) == {0: (0, 0)}
-    assert again.uavs[0].visit is None

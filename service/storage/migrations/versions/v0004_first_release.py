@@ -1,16 +1,16 @@
-"""Missions, their checkpoints and their journal."""
+"""The tables of the first release; the revisions before it were never released."""
 
 from __future__ import annotations
 
 import sqlalchemy as sa
 from alembic import op
 
-revision = "0001"
+revision = "0004"
 down_revision = None
 
 
 def upgrade() -> None:
-    """Make the first three tables."""
+    """Make the tables; that of leases in PostgreSQL alone."""
     op.create_table(
         "missions",
         sa.Column("mission_id", sa.String(64), primary_key=True),
@@ -31,9 +31,19 @@ def upgrade() -> None:
         sa.Column("body", sa.LargeBinary, nullable=False),
         sqlite_with_rowid=False,
     )
+    if op.get_context().dialect.name == "postgresql":
+        op.create_table(
+            "leases",
+            sa.Column("mission_id", sa.String(64), primary_key=True),
+            sa.Column("owner", sa.String(36), nullable=False, index=True),
+            sa.Column("address", sa.Text, nullable=False),
+            sa.Column("epoch", sa.BigInteger, nullable=False),
+            sa.Column("expires_at", sa.DateTime(timezone=True), nullable=False),
+        )
 
 
 def downgrade() -> None:
-    """Drop them."""
-    for table in ("journal", "checkpoints", "missions"):
+    """Drop the tables."""
+    tables = ["journal", "checkpoints", "missions"]
+    for table in ["leases", *tables] if op.get_context().dialect.name == "postgresql" else tables:
         op.drop_table(table)
