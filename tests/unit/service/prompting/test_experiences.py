@@ -73,14 +73,6 @@ def test_failures_keep_the_newest_of_each_sensor_those_that_failed_first() -> No
     assert again.block == memory.block
 
 
-def test_an_experience_that_an_earlier_version_stored_stays() -> None:
-    memory = Experiences(2, "failures")
-    old = {"block": ["a\n", "b\n"], "compactions": 0, "since": 2, "remembered": [["a\n", 1.0, None], ["b\n", 0, None]]}
-    memory.load_state_dict(old)
-    memory.remember(Experience("c\n", 0.0, None, 1, failed=True))
-    assert words(memory.block) == "c"
-
-
 def test_best_keeps_the_lowest_costs_and_some_of_the_highest_as_warnings() -> None:
     costs = {"a": 0.1, "b": 3.0, "c": 0.4, "d": 0.0, "e": 1.0, "f": 0.2, "g": 2.0, "h": 0.3, "i": 0.5}
     memory = remembering("best", 8, *(past(line, cost) for line, cost in costs.items()))
