@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.progress import track
 from tyro.conf import arg
 
+from lab.executors import ordered_map
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import Header, RolloutStep, write_rollouts
 from shared.client.errors import EdgeError
-from shared.kit.executors import ordered_map
 from shared.world.scenario import Scenario, scenario_named
 from simulator.policies.registry import policy_named
 

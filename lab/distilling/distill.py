@@ -14,11 +14,11 @@ from lab.distilling.decision_student import Agreement, DecisionStudent, agreemen
 from lab.distilling.examples import PromptExample
 from lab.distilling.examples_file import examples_of
 from lab.distilling.options import Distill
+from lab.executors import ordered_map
 from service.config.settings import Settings
 from service.llm.adapter_version import DECISIONS, PROMPT_VERSION
 from service.llm.model_file import embedded_model, sha256
 from service.prompting.compact_prompt import STATIC
-from shared.kit.executors import ordered_map
 
 # Held-out decisions of each scenario that are evaluated.
 _EVALUATED = 300

@@ -21,10 +21,10 @@ from lab.distilling.examples import (
     prompt_examples,
     view_of,
 )
+from lab.executors import OrderedMap
 from lab.exploration.rollouts import Header, RolloutStep, read_rollouts
 from service.llm.adapter_version import PROMPT_VERSION
 from service.llm.model_file import sha256
-from shared.kit.executors import OrderedMap
 
 # Every so many missions of a file, one is held out, and seen in each of these views.
 HELD_OUT = 11

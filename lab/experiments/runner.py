@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from lab.executors import executor
 from lab.experiments.edges import edge_for
 from lab.experiments.execution import CannotFly, commit, fly_locally, fly_with_edge
 from lab.experiments.flight import FlightRecord, FlightStore
@@ -19,7 +20,6 @@ from lab.experiments.measures import substituted_decisions
 from lab.experiments.pace import Pace, duration_text
 from lab.experiments.plan import Experiment, Plan, Planned, Setup, plan
 from lab.experiments.result import Result
-from shared.kit.executors import executor
 from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
 

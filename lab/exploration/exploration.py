@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Protocol, Self
 import numpy as np
 
 from lab.exploration.rollouts import Reference, RolloutStep
+from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.client.errors import EdgeError
 from shared.world.scenario import Scenario
-from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 # The world and the planner take seconds to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
-from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 # The file in a training's folder from which it resumes.
 STATE = "state.pt"

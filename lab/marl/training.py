@@ -15,10 +15,10 @@ from torch.utils.tensorboard import SummaryWriter
 from lab.marl.curve import Point
 from lab.marl.evaluate import lost_packets
 from lab.marl.plan import STATE, Plan
+from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 from simulator.policies import checkpoint
-from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 TENSORBOARD = "tensorboard"
 _CURVE_POINTS = 50

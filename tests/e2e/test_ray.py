@@ -14,14 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from lab import executors
 from lab.commands import explore
+from lab.executors import executor
 from lab.experiments.flight import FlightRecord, FlightStore
 from lab.experiments.result import Result
 from lab.experiments.runner import FLIGHTS, RESULT
 from lab.experiments.schemes import local
 from lab.exploration.rollouts import read_rollouts
-from shared.kit import executors
-from shared.kit.executors import executor
 from shared.kit.ray_connection import RayUnusable
 from shared.world.scenario import SCENARIOS
 from simulator.sites.site import Site

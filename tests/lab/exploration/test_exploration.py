@@ -10,13 +10,13 @@ import pytest
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import RolloutStep
 from lab.exploration.teachers import TEACHERS, Clairvoyant, Planner, TeacherName
+from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.client.errors import EdgeError
 from shared.world.scenario import SCENARIOS
 from simulator.bound.clairvoyant_bound import clairvoyant
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
-from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 from simulator.world.environment import PipelineWorld
 from tests.support.edge_stub import stub_edge
 

@@ -15,10 +15,10 @@ from lab.marl import madqn, mappo
 from lab.marl.curve import Point, plot, read_csv, write_csv
 from lab.marl.plan import STATE, Plan
 from lab.marl.training import _HELD_OUT, Learner, Round, Training
+from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 from simulator.policies import checkpoint
-from simulator.sites.training_seeds import FIRST_TRAINING_SEED
 
 pytestmark = pytest.mark.long
 

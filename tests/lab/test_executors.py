@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from shared.kit.executors import executor, ordered_map
+from lab.executors import executor, ordered_map
 from shared.kit.ray_connection import RayUnusable
 
 
