@@ -150,8 +150,8 @@ def _run(training: Training, options: Train, console: Console) -> None:
 
 
 def _conclude(training: Training, command: str, out: Path, console: Console) -> None:
+    from lab.marl.checkpoint import Checkpoint
     from lab.marl.curve import plot, write_csv
-    from simulator.policies.checkpoint import Checkpoint
 
     plan = training.plan
     weights = {name: value.clone() for name, value in training.learner.network.state_dict().items()}

@@ -152,7 +152,7 @@ def weights_of(policy: str) -> str | None:
 
     As part of the flights' identity, it makes a newly trained scheme fly again.
     """
-    file = files("simulator").joinpath("checkpoints", f"{policy}.pt")
+    file = files("lab.marl").joinpath("checkpoints", f"{policy.rpartition(':')[2]}.pt")
     return sha256(file.read_bytes()).hexdigest()[:16] if file.is_file() else None
 
 

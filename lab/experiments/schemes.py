@@ -92,6 +92,7 @@ _POLICY_LABELS = {
     "round_robin": "round robin",
     "random": "random",
 }
+_LEARNED = {name: f"lab.marl.learned:{name}" for name in ("madqn", "mappo")}
 # Only the experiments that name them fly these.
 _NAMED_ONLY = (FORMULA_PLANNER,)
 BOUND = Scheme(name="bound", label="clairvoyant bound", decides=Clairvoyant())
@@ -100,7 +101,7 @@ INFORMED = Scheme(name="informed", label="MPC, told the true links", decides=Inf
 
 def local(name: str) -> Scheme:
     """The policy of that name."""
-    return Scheme(name=name, label=_POLICY_LABELS.get(name, name), decides=Local(policy=name))
+    return Scheme(name=name, label=_POLICY_LABELS.get(name, name), decides=Local(policy=_LEARNED.get(name, name)))
 
 
 def at_full_speed(name: str) -> Scheme:
@@ -113,9 +114,10 @@ def available_locals(*names: str) -> list[Scheme]:
     """The local policies of ``names`` that this version has, in display order; without names, all but variants."""
     from simulator.policies.registry import POLICY_NAMES
 
+    known = {*_LEARNED, *POLICY_NAMES}
     every = (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
     wanted = names or tuple(name for name in every if name not in _NAMED_ONLY)
-    return [local(name) for name in wanted if name in POLICY_NAMES]
+    return [local(name) for name in wanted if name in known]
 
 
 def over_edge(

@@ -11,8 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
+from lab.marl.network_inputs import stacked, width
 from shared.world.scenario import Scenario
-from simulator.policies.network_inputs import stacked, width
 from simulator.world.batch import BatchObservation, VectorWorld
 from simulator.world.observation import Cost
 
@@ -24,7 +24,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
 
     | key | shape, type | meaning |
     |---|---|---|
-    | ``agents, observation`` | ``(B, I, F)`` float32 | each UAV's, by :func:`simulator.policies.network_inputs.view` |
+    | ``agents, observation`` | ``(B, I, F)`` float32 | each UAV's, by :func:`lab.marl.network_inputs.view` |
     | ``agents, action_mask`` | ``(B, I, J + V)`` bool | the slots and velocities allowed |
     | ``agents, action`` | ``(B, I, 2)`` int64 | slot of the sensor in the UAV's own order, velocity in m/s |
     | ``agents, reward`` | ``(B, I, 1)`` float32 | minus the world's cost |

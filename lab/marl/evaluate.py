@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from torch import nn
 
+from lab.marl.network_inputs import of_uav, view, without
+from lab.marl.networks import greedy
 from shared.world.channel import IntArray
 from shared.world.scenario import Scenario
-from simulator.policies.network_inputs import of_uav, view, without
-from simulator.policies.networks import greedy
 from simulator.world.batch import VectorWorld
 
 

@@ -13,9 +13,9 @@ from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss, SoftUpdate
 
 from lab.marl.env import PipelineEnv
+from lab.marl.networks import two_heads
 from lab.marl.training import Round
 from shared.world.scenario import Scenario
-from simulator.policies.networks import two_heads
 
 # The paper's table.
 DISCOUNT = 0.99

@@ -18,10 +18,10 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacem
 from torchrl.objectives.multiagent import MAPPOLoss
 
 from lab.marl.env import PipelineEnv
+from lab.marl.network_inputs import width
+from lab.marl.networks import NEVER, trunk, two_heads
 from lab.marl.training import Round
 from shared.world.scenario import Scenario
-from simulator.policies.network_inputs import width
-from simulator.policies.networks import NEVER, trunk, two_heads
 
 # The paper's table.
 LEARNING_RATE = 3e-4

@@ -12,13 +12,13 @@ import torch
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
+from lab.marl import checkpoint
 from lab.marl.curve import Point
 from lab.marl.evaluate import lost_packets
 from lab.marl.plan import STATE, Plan
 from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.policies import checkpoint
 
 TENSORBOARD = "tensorboard"
 _CURVE_POINTS = 50

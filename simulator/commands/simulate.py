@@ -80,7 +80,7 @@ class Simulate:
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
     (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a planner, extra `planner`),
-    mpc_formula (the same without learning), madqn or mappo (trained networks, extra `service`)."""
+    mpc_formula (the same without learning), or a class of your own as MODULE:CLASS."""
     mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None
     """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or
     policy (the planner). Default: the edge's."""
@@ -168,8 +168,9 @@ def check(options: Simulate) -> None:
 
     check_seed(options.seed)
     check_wait(options.wait_s)
-    if options.policy not in ("edge", *POLICY_NAMES):
-        raise UsageError(f"--policy {options.policy}: choose one of edge, {', '.join(POLICY_NAMES)}")
+    if options.policy not in ("edge", *POLICY_NAMES) and ":" not in options.policy:
+        known = ", ".join(POLICY_NAMES)
+        raise UsageError(f"--policy {options.policy}: choose one of edge, {known}, or MODULE:CLASS")
     check_deadline(options.deadline_ms)
     check_between("--reconnect-s", options.reconnect_s, 0, 3600)
     check_between("--metrics-port", options.metrics_port, 0, 65_535)

@@ -49,7 +49,7 @@ class LocalPilot:
     """The pilot of a local policy, by default that of the name; every decision counts as taken on board."""
 
     def __init__(self, name: str, scenario: Scenario, seed: int, policy: Policy | None = None) -> None:
-        self._reason = f"policy_{name}"
+        self._reason = f"policy_{name.rpartition(':')[2]}"
         self._policy: Policy = policy_named(name) if policy is None else policy
         self._policy.reset(scenario, seed)
         self._steps: dict[int, int] = {}

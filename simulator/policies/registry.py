@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
-from functools import partial
+from importlib import import_module
 
+from simulator.errors import UsageError
 from simulator.policies.eof import EarliestOverflowFirst
-from simulator.policies.learned import Learned
 from simulator.policies.max_gain import MaximumGain
 from simulator.policies.mpc import RecedingHorizon
 from simulator.policies.mpc_formula import FormulaPlanner
@@ -26,20 +28,36 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "mpc": RecedingHorizon,
     "mpc_formula": FormulaPlanner,
 }
-# They need torch (extra `service`), and fly only scenarios of the size of their training.
-LEARNED_NAMES = ("madqn", "mappo")
-_POLICIES |= {name: partial(Learned, name) for name in LEARNED_NAMES}
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)
 
 
 def policy_named(name: str) -> Policy:
-    """A new policy of that name.
+    """A new policy: one of this table by its name, or one's own as ``MODULE:CLASS``.
 
     Raises:
         ValueError: no policy has that name; the message lists the names.
-        UsageError: the policy needs an extra that is not installed; the message names it.
+        UsageError: the module or the class cannot be found, or needs an extra that is not installed.
     """
+    if ":" in name:
+        return _imported(name)
     try:
         return _POLICIES[name]()
     except KeyError:
-        raise ValueError(f"unknown policy {name!r}: choose one of {', '.join(POLICY_NAMES)}") from None
+        known = ", ".join(POLICY_NAMES)
+        raise ValueError(f"unknown policy {name!r}: choose one of {known}, or MODULE:CLASS") from None
+
+
+def _imported(name: str) -> Policy:
+    """The policy that a class without arguments makes; modules of the current folder are found too."""
+    module, _, attribute = name.partition(":")
+    if (here := os.getcwd()) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        made = getattr(import_module(module), attribute)()
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise UsageError(f"policy {name}: {error}") from None
+    for method in ("reset", "decide"):
+        if not callable(getattr(made, method, None)):
+            raise UsageError(f"policy {name}: it has no method {method}; see docs/guides/policy.md")
+    policy: Policy = made
+    return policy

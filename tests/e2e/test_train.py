@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from lab.marl.checkpoint import Checkpoint
 from lab.marl.curve import read_csv
-from simulator.policies.checkpoint import Checkpoint
 from tests.e2e.processes import run, run_here
 from tests.support.waiting import until
 

@@ -16,6 +16,7 @@ from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world.gain_trace import GainTrace
+from simulator.world.observation import Observation
 from tests.lab.experiments.tiny_flights import TINY, declared, flown, run_in
 
 
@@ -121,7 +122,10 @@ def test_a_scheme_that_cannot_fly_is_left_out_and_named(tmp_path: Path, monkeypa
         def reset(self, scenario: Scenario, seed: int) -> None:
             raise ValueError("trained for 4 sensors, this world has 10")
 
-    monkeypatch.setitem(policy_named.__globals__["_POLICIES"], "madqn", Untrained)
+        def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
+            raise AssertionError("it cannot fly")
+
+    monkeypatch.setattr("lab.marl.learned.madqn", Untrained)
     [result] = run_in(tmp_path).make([declared(local("eof"), local("madqn"))])
     assert list(result.schemes) == ["eof"]
     assert any("MADQN on paper cannot fly: trained for 4 sensors" in note for note in result.notes)

@@ -11,14 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from lab.marl import madqn, mappo
+from lab.marl import checkpoint, madqn, mappo
 from lab.marl.curve import Point, plot, read_csv, write_csv
 from lab.marl.plan import STATE, Plan
 from lab.marl.training import _HELD_OUT, Learner, Round, Training
 from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.policies import checkpoint
 
 pytestmark = pytest.mark.long
 

@@ -32,8 +32,7 @@ def unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def without_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate an installation without torch and TorchRL."""
-    learned = tuple(f"simulator.policies.{name}" for name in ("checkpoint", "networks", "network_inputs"))
-    for module in [name for name in sys.modules if name.startswith(("lab.marl", "torchrl.", *learned))]:
+    for module in [name for name in sys.modules if name.startswith(("lab.marl", "torchrl."))]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.setitem(sys.modules, "torchrl", None)

@@ -23,6 +23,7 @@ from simulator.world.truth import Truth
 
 # The paper's world with radios so weak that some sensors stay unheard for a while.
 SCENARIO = SCENARIOS["paper"].model_copy(update={"radio_radius_m": 200.0})
+NAMES = (*POLICY_NAMES, "lab.marl.learned:madqn", "lab.marl.learned:mappo")
 DECISIONS, SEED = 4, 0
 HIDDEN = (PipelineWorld, Sensors, Streams, Fleet, Truth)
 Actions = list[tuple[int, int]]
@@ -79,7 +80,7 @@ def _change_what_is_hidden(sensors: Sensors, unheard: Any) -> None:
     sensors.arrivals = np.where(later, sensors.arrivals + 7, sensors.arrivals)
 
 
-@pytest.mark.parametrize("name", POLICY_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_hidden_differences_of_worlds_do_not_change_decisions(name: str) -> None:
     one = Flight(policy_named(name))
     two = Flight(policy_named(name), one.unheard)
@@ -90,7 +91,7 @@ def test_hidden_differences_of_worlds_do_not_change_decisions(name: str) -> None
     assert two.actions == one.actions
 
 
-@pytest.mark.parametrize("name", POLICY_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_observations_alone_lead_to_the_same_decisions(name: str) -> None:
     """The decisions repeated without a world, and without a way to draw one."""
     flight = Flight(policy_named(name))
@@ -110,7 +111,7 @@ def asked_again(policy: Policy, seen: list[list[Observation]]) -> list[Actions]:
         return [decide(policy, step) for step in seen]
 
 
-@pytest.mark.parametrize("name", POLICY_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_nothing_hidden_is_within_a_policys_reach(name: str) -> None:
     policy = policy_named(name)
     rollout(PipelineWorld(SCENARIO.model_copy(update={"steps": 3})), policy, SEED)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,16 +11,15 @@ import pytest
 
 from shared.world.channel import channel_gain_db
 from shared.world.scenario import SCENARIOS, Scenario
+from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
 from simulator.policies.policy import Policy
-from simulator.policies.registry import LEARNED_NAMES, POLICY_NAMES, policy_named
+from simulator.policies.registry import POLICY_NAMES, policy_named
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
 
 FOUR = Scenario(name="four", sensors=4, uavs=2)
 NONE: frozenset[int] = frozenset()
-# A trained policy flies only scenarios of its size; its tests are in test_learned.py.
-UNTRAINED = [name for name in POLICY_NAMES if name not in LEARNED_NAMES]
 
 
 def seen(queue: list[float], last_heard: list[int], distance: list[float] | None = None, now: int = 5) -> Observation:
@@ -53,13 +54,31 @@ def test_an_unknown_policy_lists_the_known_ones() -> None:
         "nearest",
         "mpc",
         "mpc_formula",
-        "madqn",
-        "mappo",
     )
     with pytest.raises(
         ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs, max_gain"
     ):
         policy_named("best")
+
+
+def test_a_policy_of_ones_own_is_found_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_policy.py").write_text(
+        "class First:\n"
+        "    def reset(self, scenario, seed): pass\n"
+        "    def decide(self, uav, observation, taken): return min({0, 1, 2, 3} - taken), 3\n"
+        "class Half:\n"
+        "    def reset(self, scenario, seed): pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    assert ready("own_policy:First").decide(0, seen([30, 60, 50, 40], [5, 4, 5, 5]), frozenset({0})) == (1, 3)
+    for name, fault in (
+        ("own_policy:Half", "it has no method decide"),
+        ("own_policy:Nothing", "has no attribute 'Nothing'"),
+        ("no_such_policy:First", "No module named 'no_such_policy'"),
+    ):
+        with pytest.raises(UsageError, match=f"policy {name}: .*{fault}"):
+            policy_named(name)
 
 
 def test_eof_takes_the_sensor_in_range_that_overflows_first() -> None:
@@ -161,20 +180,20 @@ def test_random_repeats_with_its_seed_and_not_with_another() -> None:
     assert first(1) != first(2)
 
 
-@pytest.mark.parametrize("name", UNTRAINED)
+@pytest.mark.parametrize("name", POLICY_NAMES)
 def test_with_every_sensor_taken_a_policy_still_answers(name: str) -> None:
     sensor, velocity = ready(name).decide(1, seen([9, 9, 9, 9], [5, 5, 5, 5]), frozenset(range(4)))
     assert 0 <= sensor < 4
     assert 0 <= velocity <= 14
 
 
-@pytest.mark.parametrize("name", UNTRAINED)
+@pytest.mark.parametrize("name", POLICY_NAMES)
 def test_a_policy_keeps_to_a_lower_limit_of_velocity(name: str) -> None:
     policy = ready(name, FOUR.model_copy(update={"max_velocity": 3}))
     assert all(policy.decide(0, seen([9] * 4, [5] * 4), NONE)[1] <= 3 for _ in range(50))
 
 
-@pytest.mark.parametrize("name", UNTRAINED)
+@pytest.mark.parametrize("name", POLICY_NAMES)
 def test_a_policy_leaves_the_observation_alone(name: str) -> None:
     observation: Any = seen([30, 60, 50, 40], [5, 4, 5, -1])
     before = {key: value.copy() for key, value in observation.items()}
@@ -183,7 +202,7 @@ def test_a_policy_leaves_the_observation_alone(name: str) -> None:
 
 
 @pytest.mark.usefixtures("brief")
-@pytest.mark.parametrize("policy", UNTRAINED)
+@pytest.mark.parametrize("policy", POLICY_NAMES)
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_every_policy_flies_every_preset(scenario: str, policy: str) -> None:
     short = SCENARIOS[scenario].model_copy(update={"steps": 5})

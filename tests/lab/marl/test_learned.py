@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from lab.marl.checkpoint import Checkpoint, shipped
 from lab.marl.evaluate import lost_packets
+from lab.marl.learned import Learned
+from lab.marl.networks import two_heads
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
-from simulator.policies.checkpoint import Checkpoint, shipped
-from simulator.policies.learned import Learned
-from simulator.policies.networks import two_heads
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld
 
@@ -31,7 +31,7 @@ def saved(path: Path, scenario: Scenario = SMALL) -> Path:
 
 
 def lost(scheme: str, seed: int) -> int:
-    return sum(t.lost_packets for t in rollout(PipelineWorld(), policy_named(scheme), seed))
+    return sum(t.lost_packets for t in rollout(PipelineWorld(), policy_named(f"lab.marl.learned:{scheme}"), seed))
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -51,7 +51,7 @@ def test_it_is_greedy_so_the_policys_seed_does_not_matter(scheme: str) -> None:
     observations, _ = PipelineWorld().reset(seed=3)
     chosen = set()
     for seed in range(3):
-        policy = policy_named(scheme)
+        policy = policy_named(f"lab.marl.learned:{scheme}")
         policy.reset(PAPER, seed)
         chosen.add(policy.decide(0, observations["uav_0"], frozenset()))
     assert len(chosen) == 1
@@ -73,7 +73,7 @@ def test_it_takes_free_sensors_that_were_heard(tmp_path: Path) -> None:
 
 
 def test_the_error_for_another_size_names_the_training_command() -> None:
-    policy = policy_named("madqn")
+    policy = policy_named("lab.marl.learned:madqn")
     message = "madqn was trained for sensors 10, scenario dense has 100: train one with `python -m lab train madqn"
     with pytest.raises(ValueError, match=message) as refused:
         policy.reset(SCENARIOS["dense"], 0)
@@ -83,10 +83,3 @@ def test_the_error_for_another_size_names_the_training_command() -> None:
 def test_weights_of_ones_own_fly_the_scenario_they_were_trained_in(tmp_path: Path) -> None:
     policy = Learned("madqn", saved(tmp_path / "own.pt"))
     assert len(rollout(PipelineWorld(SMALL), policy, seed=0)) == 6
-
-
-@pytest.mark.usefixtures("without_extra")
-def test_without_torch_the_error_names_the_extra_and_others_fly() -> None:
-    with pytest.raises(UsageError, match=r"policy mappo needs torch, .* pip install 'aic-vds\[service\]'"):
-        policy_named("mappo")
-    assert sum(t.lost_packets for t in rollout(PipelineWorld(), policy_named("eof"), seed=0)) > 0

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lab.marl.networks import two_heads
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.policies.networks import two_heads
 
 
 class Misfit(UsageError, ValueError):
@@ -22,7 +22,7 @@ class Misfit(UsageError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Weights of :func:`simulator.policies.networks.two_heads` in float32, and their origin.
+    """Weights of :func:`lab.marl.networks.two_heads` in float32, and their origin.
 
     Attributes:
         scenario: of the training.
@@ -78,7 +78,7 @@ class Checkpoint:
 
 def shipped(scheme: str) -> Checkpoint:
     """The checkpoint of a scheme that comes with the package."""
-    with as_file(files("simulator").joinpath("checkpoints", f"{scheme}.pt")) as path:
+    with as_file(files("lab.marl").joinpath("checkpoints", f"{scheme}.pt")) as path:
         return Checkpoint.load(path)
 
 

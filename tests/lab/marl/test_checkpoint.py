@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+from lab.marl.checkpoint import shipped
 from lab.marl.curve import read_csv
+from lab.marl.learned import Learned
 from shared.world.scenario import SCENARIOS
-from simulator.policies.checkpoint import shipped
-from simulator.policies.learned import Learned
 from tests.support.places import ROOT
 
 PAPER = SCENARIOS["paper"]
 SCHEMES = ["madqn", "mappo"]
-CHECKPOINTS = ROOT / "simulator" / "checkpoints"
+CHECKPOINTS = ROOT / "lab" / "marl" / "checkpoints"
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

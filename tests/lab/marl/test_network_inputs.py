@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.marl.network_inputs import View, stacked, taken_by, view, width, without
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.policies.network_inputs import View, stacked, taken_by, view, width, without
 from simulator.world.batch import VectorWorld
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation

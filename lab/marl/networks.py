@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from lab.marl.network_inputs import width
 from shared.world.scenario import Scenario
-from simulator.policies.network_inputs import width
 
 TRUNK = (400, 300)
 # The logit or action value of a masked choice: below any other, and finite, so that the softmax is defined.
