@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 
+from shared.client.calls import Exchange
 from shared.client.edge_client import AsyncEdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
-from shared.client.retries_and_redirects import Exchange
 from shared.wire.missions import MissionStatus
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario

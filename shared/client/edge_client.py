@@ -1,44 +1,98 @@
-"""Clients of one edge over HTTP, with bounded retries and timed decisions: a blocking one and one for asyncio."""
+"""Clients of one edge over HTTP, with bounded retries and timed decisions: a blocking one and one for asyncio.
+
+Both have the calls of :class:`shared.client.calls.Calls`, with the same arguments and results.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Collection
-from typing import Self
+from collections.abc import Callable, Coroutine
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
 
-from shared.client.retries_and_redirects import Call, Calls, Exchange, Pause, Result
-from shared.planning.orders import GuidanceAnswer, GuidanceStatus
-from shared.wire.missions import MissionStatus
-from shared.wire.readings import ReadingsRequest, ReadingsResponse
-from shared.wire.schemas import (
-    BatchRequest,
-    BatchResponse,
-    DecideRequest,
-    FeedbackRequest,
-    FeedbackResponse,
-    MissionSpec,
-    Readiness,
-    Uplink,
-)
+from shared.client.calls import Calls
+from shared.client.retries_and_redirects import Requests, Sleep, edge_url
+from shared.wire.schemas import Uplink
 
 # The environment variable with the key for the edge.
 API_KEY = "AICVDS_API_KEY"
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+
+
+class AsyncEdgeClient(Calls):
+    """:class:`EdgeClient` for asyncio: the same calls, retries and errors; use it as an asynchronous context manager.
+
+    A cancelled call is not retried.
+    """
+
+    def __init__(
+        self,
+        base_url: str,
+        *,
+        timeout_s: float = 5.0,
+        attempts: int = 3,
+        api_key: str | None = None,
+        seed: int = 0,
+        transport: httpx.AsyncBaseTransport | None = None,
+        uplink: Uplink = "full",
+        sleep: Sleep = asyncio.sleep,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._http = httpx.AsyncClient(transport=transport, **_http_options(base_url, timeout_s, api_key))
+        super().__init__(Requests(base_url, self._http.request, sleep, attempts, seed), uplink, sleep, clock)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.aclose()
+
+    async def aclose(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+
+def _blocking(
+    call: Callable[Concatenate[Calls, P], Coroutine[Any, Any, Result]],
+) -> Callable[Concatenate[EdgeClient, P], Result]:
+    """The call as a method of the blocking client."""
+
+    @wraps(call)
+    def method(client: EdgeClient, /, *args: P.args, **kwargs: P.kwargs) -> Result:
+        # It never suspends, so that its first step is its last.
+        try:
+            call(client._calls, *args, **kwargs).send(None)
+        except StopIteration as done:
+            result: Result = done.value
+            return result
+        raise AssertionError("a blocking call waits in its own thread")
+
+    return method
+
+
+def _never_suspending(function: Callable[P, Result]) -> Callable[P, Coroutine[Any, Any, Result]]:
+    async def call(*args: P.args, **kwargs: P.kwargs) -> Result:
+        return function(*args, **kwargs)
+
+    return call
 
 
 class EdgeClient:
     """A synchronous client of one edge; use it as a context manager.
 
-    Connection errors, timeouts and 429/502/503/504 are retried, ``attempts`` attempts in all. The pause before a retry
-    is random, at most 0.1 s, and this limit doubles each time up to 2 s; a ``Retry-After`` is honoured up to 5 s. Where
-    several edges share their missions, a 421 names the edge that has the mission, and the request goes there at once.
-    ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network (see
-    :mod:`simulator.flying.lossy_transport`); ``seed`` fixes the draws of the pauses. ``uplink`` selects the part of a
-    report that is sent: all of it (``full``), the changes (``delta``), or the sensors that the mission's attention,
-    computed here, keeps (``pruned``). Every call takes the full report, and the full report is sent where the edge
-    needs it.
+    Connection errors, timeouts and 408/429/502/503/504 are retried, ``attempts`` attempts in all. The pause before a
+    retry is random, at most 0.1 s, and this limit doubles each time up to 2 s; a ``Retry-After`` is honoured up to 5 s.
+    Where several edges share their missions, a 421 names the edge that has the mission, and the request goes there at
+    once. ``timeout_s`` bounds each wait for the network within one attempt. ``transport`` replaces the network (see
+    :mod:`simulator.flying.lossy_transport`), ``sleep`` the pauses and ``clock`` the time; ``seed`` fixes the draws of
+    the pauses. ``uplink`` selects the part of a report that is sent: all of it (``full``), the changes (``delta``), or
+    the sensors that the mission's attention, computed here, keeps (``pruned``). Every call takes the full report, and
+    the full report is sent where the edge needs it.
 
     Raises (every method):
         EdgeUnreachable: no attempt succeeded.
@@ -56,15 +110,13 @@ class EdgeClient:
         seed: int = 0,
         transport: httpx.BaseTransport | None = None,
         uplink: Uplink = "full",
+        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._calls = Calls(base_url, attempts, seed, uplink)
+        self._http = httpx.Client(transport=transport, **_http_options(base_url, timeout_s, api_key))
+        request, pause = _never_suspending(self._http.request), _never_suspending(sleep)
+        self._calls = Calls(Requests(base_url, request, pause, attempts, seed), uplink, pause, clock)
         self.base_url = self._calls.base_url
-        self._http = httpx.Client(
-            headers=_headers(api_key),
-            timeout=_checked(timeout_s),
-            transport=transport,
-            trust_env=_beyond_this_machine(self.base_url),
-        )
 
     def __enter__(self) -> Self:
         return self
@@ -76,199 +128,23 @@ class EdgeClient:
         """Close the connections."""
         self._http.close()
 
-    def _run(self, call: Call[Result]) -> Result:
-        try:
-            todo = next(call)
-            while True:
-                if isinstance(todo, Pause):
-                    time.sleep(todo.seconds)
-                    todo = call.send(None)
-                    continue
-                try:
-                    answer = self._http.request(
-                        todo.method,
-                        (todo.base_url or self.base_url) + todo.path,
-                        content=todo.content,
-                        headers=todo.headers,
-                    )
-                except httpx.RequestError as error:
-                    todo = call.throw(error)
-                else:
-                    todo = call.send(answer)
-        except StopIteration as done:
-            result: Result = done.value
-            return result
-
-    def wait_ready(
-        self,
-        timeout_s: float,
-        wait_out: Collection[str] = ("loading",),
-        on_wait: Callable[[str], None] | None = None,
-    ) -> Readiness:
-        """Poll ``/readyz`` until the edge can decide and its LLM's state is none of ``wait_out``.
-
-        After ``timeout_s`` seconds the readiness of an edge that can decide is returned whatever its LLM's state.
-        ``on_wait`` is called with the cause of the wait before each pause.
-        """
-        return self._run(self._calls.wait_ready(timeout_s, wait_out, on_wait))
-
-    def put_mission(self, mission_id: str, spec: MissionSpec) -> MissionStatus:
-        """Create the mission at the edge."""
-        return self._run(self._calls.put_mission(mission_id, spec))
-
-    def mission(self, mission_id: str) -> MissionStatus:
-        """The mission's status."""
-        return self._run(self._calls.mission(mission_id))
-
-    def delete_mission(self, mission_id: str) -> None:
-        """Delete the mission and its learned state at the edge."""
-        self._run(self._calls.delete_mission(mission_id))
-
-    def guidance(self, mission_id: str) -> GuidanceStatus:
-        """The edge's compilation of the operator's note, and its state."""
-        return self._run(self._calls.guidance(mission_id))
-
-    def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> GuidanceStatus:
-        """Confirm or reject the compiled guidance, or replace it by a structure."""
-        return self._run(self._calls.answer_guidance(mission_id, given))
-
-    def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
-        """Request one decision, and time it; ``attempts`` overrides the client's."""
-        return self._run(self._calls.decide(request, attempts))
-
-    def decide_batch(self, request: BatchRequest) -> BatchResponse:
-        """Request the decisions for all UAVs of a step."""
-        return self._run(self._calls.decide_batch(request))
-
-    def read(self, mission_id: str, readings: ReadingsRequest) -> ReadingsResponse:
-        """Report what sensors said of themselves over another network than the UAVs' radios."""
-        return self._run(self._calls.read(mission_id, readings))
-
-    def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
-        """Send an outcome without a request for a decision."""
-        return self._run(self._calls.feedback(outcome))
+    wait_ready = _blocking(Calls.wait_ready)
+    put_mission = _blocking(Calls.put_mission)
+    mission = _blocking(Calls.mission)
+    delete_mission = _blocking(Calls.delete_mission)
+    guidance = _blocking(Calls.guidance)
+    answer_guidance = _blocking(Calls.answer_guidance)
+    decide = _blocking(Calls.decide)
+    read = _blocking(Calls.read)
+    feedback = _blocking(Calls.feedback)
 
 
-class AsyncEdgeClient:
-    """:class:`EdgeClient` for asyncio: the same calls, retries and errors; use it as an asynchronous context manager.
-
-    A cancelled call is not retried. ``transport`` replaces the network.
-    """
-
-    def __init__(
-        self,
-        base_url: str,
-        *,
-        timeout_s: float = 5.0,
-        attempts: int = 3,
-        api_key: str | None = None,
-        seed: int = 0,
-        transport: httpx.AsyncBaseTransport | None = None,
-        uplink: Uplink = "full",
-    ) -> None:
-        self._calls = Calls(base_url, attempts, seed, uplink)
-        self.base_url = self._calls.base_url
-        self._http = httpx.AsyncClient(
-            headers=_headers(api_key),
-            timeout=_checked(timeout_s),
-            transport=transport,
-            trust_env=_beyond_this_machine(self.base_url),
-        )
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.aclose()
-
-    async def aclose(self) -> None:
-        """Close the connections."""
-        await self._http.aclose()
-
-    async def _run(self, call: Call[Result]) -> Result:
-        try:
-            todo = next(call)
-            while True:
-                if isinstance(todo, Pause):
-                    await asyncio.sleep(todo.seconds)
-                    todo = call.send(None)
-                    continue
-                try:
-                    answer = await self._http.request(
-                        todo.method,
-                        (todo.base_url or self.base_url) + todo.path,
-                        content=todo.content,
-                        headers=todo.headers,
-                    )
-                except httpx.RequestError as error:
-                    todo = call.throw(error)
-                else:
-                    todo = call.send(answer)
-        except StopIteration as done:
-            result: Result = done.value
-            return result
-
-    async def wait_ready(
-        self,
-        timeout_s: float,
-        wait_out: Collection[str] = ("loading",),
-        on_wait: Callable[[str], None] | None = None,
-    ) -> Readiness:
-        """Poll ``/readyz`` until the edge can decide and its LLM's state is none of ``wait_out``.
-
-        After ``timeout_s`` seconds the readiness of an edge that can decide is returned whatever its LLM's state.
-        ``on_wait`` is called with the cause of the wait before each pause.
-        """
-        return await self._run(self._calls.wait_ready(timeout_s, wait_out, on_wait))
-
-    async def put_mission(self, mission_id: str, spec: MissionSpec) -> MissionStatus:
-        """Create the mission at the edge."""
-        return await self._run(self._calls.put_mission(mission_id, spec))
-
-    async def mission(self, mission_id: str) -> MissionStatus:
-        """The mission's status."""
-        return await self._run(self._calls.mission(mission_id))
-
-    async def delete_mission(self, mission_id: str) -> None:
-        """Delete the mission and its learned state at the edge."""
-        await self._run(self._calls.delete_mission(mission_id))
-
-    async def guidance(self, mission_id: str) -> GuidanceStatus:
-        """The edge's compilation of the operator's note, and its state."""
-        return await self._run(self._calls.guidance(mission_id))
-
-    async def answer_guidance(self, mission_id: str, given: GuidanceAnswer) -> GuidanceStatus:
-        """Confirm or reject the compiled guidance, or replace it by a structure."""
-        return await self._run(self._calls.answer_guidance(mission_id, given))
-
-    async def decide(self, request: DecideRequest, attempts: int | None = None) -> Exchange:
-        """Request one decision, and time it; ``attempts`` overrides the client's."""
-        return await self._run(self._calls.decide(request, attempts))
-
-    async def decide_batch(self, request: BatchRequest) -> BatchResponse:
-        """Request the decisions for all UAVs of a step."""
-        return await self._run(self._calls.decide_batch(request))
-
-    async def read(self, mission_id: str, readings: ReadingsRequest) -> ReadingsResponse:
-        """Report what sensors said of themselves over another network than the UAVs' radios."""
-        return await self._run(self._calls.read(mission_id, readings))
-
-    async def feedback(self, outcome: FeedbackRequest) -> FeedbackResponse:
-        """Send an outcome without a request for a decision."""
-        return await self._run(self._calls.feedback(outcome))
-
-
-def _headers(api_key: str | None) -> dict[str, str]:
-    headers = {"Content-Type": "application/json", "Accept": "application/json"}
-    return headers if api_key is None else {**headers, "Authorization": f"Bearer {api_key}"}
-
-
-def _checked(timeout_s: float) -> float:
+def _http_options(base_url: str, timeout_s: float, api_key: str | None) -> dict[str, Any]:
     if not timeout_s > 0:
         raise ValueError(f"timeout_s must be positive, not {timeout_s}")
-    return timeout_s
-
-
-def _beyond_this_machine(base_url: str) -> bool:
+    headers = {"Content-Type": "application/json", "Accept": "application/json"}
+    if api_key is not None:
+        headers["Authorization"] = f"Bearer {api_key}"
     # A proxy named in the environment cannot reach an edge on this machine's loopback.
-    return httpx.URL(base_url).host not in ("localhost", "127.0.0.1", "::1")
+    beyond = httpx.URL(edge_url(base_url)).host not in ("localhost", "127.0.0.1", "::1")
+    return {"headers": headers, "timeout": timeout_s, "trust_env": beyond}

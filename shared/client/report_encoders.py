@@ -42,14 +42,6 @@ class FullReports:
         """The edge lost the earlier reports: the next report is sent in full."""
 
 
-@dataclass(frozen=True)
-class _Answered:
-    mission_id: str
-    step: int
-    decision_id: str
-    sensors: SensorColumns
-
-
 class DeltaReports(FullReports):
     """Uplink ``delta``: the sensors that changed since this UAV's last answered report, without their positions.
 
@@ -57,27 +49,28 @@ class DeltaReports(FullReports):
     """
 
     def __init__(self) -> None:
-        self._answered: dict[int, _Answered] = {}
+        self._answered: dict[int, tuple[SensorColumns, DecideResponse]] = {}
 
     def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
         """The changed rows; the full report without a reference report, or after sensors or positions changed."""
-        reference, now = self._answered.get(uav.uav_id), uav.sensors
+        now = uav.sensors
+        old, answer = self._answered.get(uav.uav_id, (None, None))
         if (
-            reference is None
-            or reference.mission_id != mission_id
-            or reference.step > step
-            or (reference.sensors.id, reference.sensors.x, reference.sensors.y) != (now.id, now.x, now.y)
+            old is None
+            or answer is None
+            or answer.mission_id != mission_id
+            or answer.step > step
+            or (old.id, old.x, old.y) != (now.id, now.x, now.y)
         ):
             return uav.model_copy(update={"uplink": "delta"})
-        old = reference.sensors
         before = zip(old.queue, old.battery, old.channel_gain, old.last_seen, strict=True)
         after = zip(now.queue, now.battery, now.channel_gain, now.last_seen, strict=True)
         changed = [row for row, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
-        return uav.model_copy(update={"base": reference.decision_id, "sensors": without_positions(now, changed)})
+        return uav.model_copy(update={"base": answer.decision_id, "sensors": without_positions(now, changed)})
 
     def answered(self, uav: UavState, response: DecideResponse) -> None:
         """Use it as the reference of the next report."""
-        self._answered[uav.uav_id] = _Answered(response.mission_id, response.step, response.decision_id, uav.sensors)
+        self._answered[uav.uav_id] = uav.sensors, response
 
     def forget(self, uav_id: int) -> None:
         """Send the next report in full."""

@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.progress import track
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from shared.client.calls import Exchange
 from shared.client.edge_client import API_KEY, EdgeClient
 from shared.client.errors import EdgeError
-from shared.client.retries_and_redirects import Exchange
 from shared.wire.schemas import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
 from simulator.commands.options import check_deadline, check_wait, checked_edge
 from simulator.commands.running import command_main

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from shared.client.calls import Exchange
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
-from shared.client.retries_and_redirects import Exchange
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
 from simulator.policies.policy import Learner, Policy

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from shared.client.retries_and_redirects import Exchange
+from shared.client.calls import Exchange
 from shared.wire.schemas import Uplink
 from shared.world.scenario import Scenario
 from simulator.records.decision import Decision

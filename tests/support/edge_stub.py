@@ -18,8 +18,6 @@ from shared.planning.orders import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionStatus
 from shared.wire.problem import Problem
 from shared.wire.schemas import (
-    BatchRequest,
-    BatchResponse,
     Candidate,
     DecideRequest,
     DecideResponse,
@@ -115,14 +113,6 @@ class EdgeStub:
             latency_ms={"llm": 1.0, "total": 2.0},
         )
 
-    async def decide_batch(self, request: Request) -> Response:
-        """POST /decide/batch."""
-        body = BatchRequest.model_validate_json(await request.body())
-        behaviour = self.script.pop(0) if self.script else self.otherwise
-        requests = [DecideRequest(step=body.step, **uav.model_dump()) for uav in body.uavs]
-        answers = [self._answer(one, behaviour) for one in requests]
-        return Response(BatchResponse(decisions=answers).model_dump_json())
-
     async def feedback(self, request: Request) -> Response:
         """POST /feedback."""
         outcome = FeedbackRequest.model_validate_json(await request.body())
@@ -182,7 +172,6 @@ class EdgeStub:
         return Starlette(
             routes=[
                 Route("/decide", self.decide, methods=["POST"]),
-                Route("/decide/batch", self.decide_batch, methods=["POST"]),
                 Route("/feedback", self.feedback, methods=["POST"]),
                 Route("/missions/{mission_id}", self.put_mission, methods=["PUT"]),
                 Route("/missions/{mission_id}", self.mission, methods=["GET", "DELETE"]),

@@ -6,7 +6,6 @@ import socket
 import struct
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -15,7 +14,7 @@ import pytest
 from shared.client.edge_client import AsyncEdgeClient, EdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from shared.client.retries_and_redirects import edge_url
-from shared.wire.schemas import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, UavState
+from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.flying.lossy_transport import LossyTransport
 from simulator.world.environment import PipelineWorld
@@ -59,34 +58,28 @@ class Awaited:
 Opened = Callable[..., EdgeClient]
 
 
-@pytest.fixture(autouse=True)
-def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+@pytest.fixture
+def pauses() -> list[float]:
     """The seconds that a client of either kind would have paused: none of them is waited for."""
-    told: list[float] = []
-
-    async def awaited(seconds: float) -> None:
-        told.append(seconds)
-        await asyncio.sleep(0)
-
-    monkeypatch.setattr("shared.client.edge_client.time", SimpleNamespace(sleep=told.append))
-    monkeypatch.setattr("shared.client.edge_client.asyncio", SimpleNamespace(sleep=awaited))
-    return told
+    return []
 
 
 @pytest.fixture(params=[EdgeClient, Awaited])
-def client(request: pytest.FixtureRequest) -> Opened:
-    def opened(url: str, timeout_s: float = PATIENCE_S, attempts: int = 3, api_key: str | None = None) -> EdgeClient:
-        made: EdgeClient = request.param(url, timeout_s=timeout_s, attempts=attempts, api_key=api_key)
+def client(request: pytest.FixtureRequest, pauses: list[float]) -> Opened:
+    async def awaited(seconds: float) -> None:
+        pauses.append(seconds)
+        await asyncio.sleep(0)
+
+    def opened(url: str, **options: Any) -> EdgeClient:
+        sleep = pauses.append if request.param is EdgeClient else awaited
+        made: EdgeClient = request.param(url, **{"timeout_s": PATIENCE_S, "sleep": sleep, **options})
         return made
 
     return opened
 
 
-def test_an_exchange_is_measured(
-    stub: EdgeStub, request_: DecideRequest, client: Opened, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_exchange_is_measured(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
     clock = Clock()
-    monkeypatch.setattr("shared.client.retries_and_redirects.time", clock)
     stub.script = ["slow"]
 
     def take_an_hour() -> None:
@@ -94,8 +87,8 @@ def test_an_exchange_is_measured(
         clock.ahead_s = 3600.0
         stub.gate.open()
 
-    with client(stub.url, api_key="k3y") as edge, ThreadPoolExecutor(1) as beside:
-        beside.submit(take_an_hour)
+    with client(stub.url, api_key="k3y", clock=clock.perf_counter) as edge, ThreadPoolExecutor(1) as executor:
+        executor.submit(take_an_hour)
         exchange = edge.decide(request_)
     assert exchange.response.step == 0 and exchange.response.uav_id == 1
     assert exchange.rtt_ms >= 3_600_000
@@ -289,17 +282,7 @@ def test_an_edge_that_never_comes(client: Opened) -> None:
         edge.wait_ready(0)
 
 
-def test_a_fleet_at_once(stub: EdgeStub, request_: DecideRequest, client: Opened) -> None:
-    state = UavState.model_validate(request_.model_dump(include=set(UavState.model_fields)))
-    before = BatchRequest(step=0, uavs=[state, state.model_copy(update={"uav_id": 2})])
-    with client(stub.url) as edge:
-        assert [decision.uav_id for decision in edge.decide_batch(before).decisions] == [1, 2]
-        stub.script = ["wrong"]
-        with pytest.raises(EdgeProtocolError, match="/decide/batch chose sensor 9999"):
-            edge.decide_batch(before)
-
-
-async def test_decisions_are_awaited_beside_each_other(stub: EdgeStub, request_: DecideRequest) -> None:
+async def test_decisions_are_awaited_concurrently(stub: EdgeStub, request_: DecideRequest) -> None:
     stub.otherwise = "slow"
     async with AsyncEdgeClient(stub.url) as edge:
         asked = [edge.decide(request_.model_copy(update={"uav_id": uav})) for uav in range(4)]
@@ -312,17 +295,14 @@ async def test_decisions_are_awaited_beside_each_other(stub: EdgeStub, request_:
     assert stub.most_at_once == 4
 
 
-async def test_a_cancelled_call_is_not_sent_again(
-    stub: EdgeStub, request_: DecideRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_cancelled_call_is_not_sent_again(stub: EdgeStub, request_: DecideRequest) -> None:
     pause = Gate()
 
-    async def held(seconds: float) -> None:
+    async def sleep(seconds: float) -> None:
         await pause.passed()
 
-    monkeypatch.setattr("shared.client.edge_client.asyncio", SimpleNamespace(sleep=held))
     stub.otherwise = "busy"
-    async with AsyncEdgeClient(stub.url, attempts=100) as edge:
+    async with AsyncEdgeClient(stub.url, attempts=100, sleep=sleep) as edge:
         call = asyncio.create_task(edge.decide(request_))
         await soon(lambda: pause.came)
         call.cancel()
@@ -369,9 +349,10 @@ def test_a_lossy_uplink_loses_the_same_requests_again() -> None:
 
 def test_a_lossy_uplink_is_retried(stub: EdgeStub, request_: DecideRequest) -> None:
     transport = LossyTransport(httpx.HTTPTransport(), drop=0.5, jitter_ms=5, seed=0)
-    with EdgeClient(stub.url, timeout_s=PATIENCE_S, attempts=12, transport=transport) as edge:
+    pauses: list[float] = []
+    with EdgeClient(stub.url, timeout_s=PATIENCE_S, attempts=12, transport=transport, sleep=pauses.append) as edge:
         attempts = [edge.decide(request_).attempts for _ in range(6)]
-    assert max(attempts) > 1
+    assert max(attempts) > 1 and len(pauses) == sum(attempts) - 6
     assert stub.request_count == 6
 
 

@@ -11,7 +11,7 @@ import pytest
 from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeRefused
 from shared.client.report_encoders import DeltaReports
-from shared.wire.schemas import BatchRequest, DecideRequest, MissionSpec, UavState
+from shared.wire.schemas import DecideRequest, MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request
@@ -39,11 +39,6 @@ def client(request: pytest.FixtureRequest) -> Callable[..., EdgeClient]:
     return made
 
 
-def batch(requests: list[DecideRequest]) -> BatchRequest:
-    uavs = [UavState.model_validate(r.model_dump(include=set(UavState.model_fields))) for r in requests]
-    return BatchRequest(mission_id="m", step=requests[0].step, uavs=uavs)
-
-
 def test_a_first_report_is_full(
     edge: Edge, client: Callable[..., EdgeClient], steps: list[list[DecideRequest]]
 ) -> None:
@@ -65,23 +60,6 @@ def test_an_edge_that_forgot_gets_full_reports(
         again = uavs.decide(steps[1][0])
         assert (again.attempts, again.response.step) == (2, 1) and again.request_bytes > 1000
         assert uavs.decide(steps[2][0]).request_bytes < 600
-
-
-def test_a_fleet_at_once(edge: Edge, client: Callable[..., EdgeClient], steps: list[list[DecideRequest]]) -> None:
-    http, other = edge(), edge()
-    with client(str(http.base_url), uplink="delta") as uavs, client(str(other.base_url)) as full:
-        for calls in (uavs, full):
-            calls.put_mission("m", MissionSpec())
-        for requests in steps:
-            if requests[0].step == 2:
-                # A single request in between: for this edge, the batch's reference report is no longer the last.
-                body = requests[1].model_dump()
-                http.post("/decide", json=body).raise_for_status()
-                other.post("/decide", json=body).raise_for_status()
-            reduced, whole = uavs.decide_batch(batch(requests)), full.decide_batch(batch(requests))
-            assert [(d.sensor_id, d.velocity, d.top_k) for d in reduced.decisions] == [
-                (d.sensor_id, d.velocity, d.top_k) for d in whole.decisions
-            ]
 
 
 def test_another_refusal_is_not_retried(edge: Edge, steps: list[list[DecideRequest]]) -> None:

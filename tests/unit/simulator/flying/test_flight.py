@@ -99,9 +99,8 @@ def test_a_model_that_cannot_be_written_is_no_interrupt(client: EdgeClient) -> N
         fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0), 0, on_decision=fail)
 
 
-def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_summary_has_these_keys(stub: EdgeStub) -> None:
     clock = Clock()
-    monkeypatch.setattr("shared.client.retries_and_redirects.time", clock)
     stub.script = ["slow"]
 
     def take_an_hour() -> None:
@@ -109,8 +108,9 @@ def test_the_summary_has_these_keys(stub: EdgeStub, client: EdgeClient, monkeypa
         clock.ahead_s = 3600.0
         stub.gate.open()
 
-    with ThreadPoolExecutor(1) as beside:
-        beside.submit(take_an_hour)
+    client = EdgeClient(stub.url, timeout_s=PATIENCE_S, clock=clock.perf_counter)
+    with client, ThreadPoolExecutor(1) as executor:
+        executor.submit(take_an_hour)
         flight = fly(Site(SHORT), EdgePilot(client, "m", SHORT, seed=0, deadline_ms=60_000), seed=0)
     summary = summarise(
         facts(flight, deadline_ms=60_000), flight.decisions, {"aic_vds": flight.tally, **baselines(Site(SHORT), 0, 4)}
