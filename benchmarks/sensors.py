@@ -170,17 +170,17 @@ def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) ->
     delta, pruned = DeltaReports(), PrunedReports()
     with EdgeClient(edge.url, timeout_s=60) as client, httpx.Client(base_url=edge.url, timeout=60) as http:
         scenario = Scenario(sensors=len(now.sensors.id), steps=now.step + 1)
-        pruned.take(now.uav_id, now.step, client.put_mission(name, MissionSpec(scenario=scenario)), None)
+        pruned.store(now.uav_id, now.step, client.put_mission(name, MissionSpec(scenario=scenario)), None)
         weights = http.get(f"/missions/{name}/attention", headers={"Accept-Encoding": "identity"}).content
-        pruned.take(now.uav_id, now.step, MissionAttention.model_validate_json(weights), None)
-        first = delta.reduced(name, before.step, before)
-        answer = client.decide(pruned.reduced(name, before.step, first)).response
+        pruned.store(now.uav_id, now.step, MissionAttention.model_validate_json(weights), None)
+        first = delta.encode(name, before.step, before)
+        answer = client.decide(pruned.encode(name, before.step, first)).response
         for reports in (delta, pruned):
-            reports.answered(before, answer)
+            reports.record_answer(before, answer)
         began = time.perf_counter()
-        sent = {"full": now, "pruned": pruned.reduced(name, now.step, now)}
+        sent = {"full": now, "pruned": pruned.encode(name, now.step, now)}
         onboard_ms = (time.perf_counter() - began) * 1e3
-        sent["delta"] = delta.reduced(name, now.step, now)
+        sent["delta"] = delta.encode(name, now.step, now)
         found: dict[str, Any] = {rows: {"sensors": len(sent[rows].sensors.id)} for rows in get_args(Uplink)}
         bodies = {rows: sent[rows].model_dump_json(exclude_defaults=rows != "full").encode() for rows in found}
         took: dict[tuple[str, str], list[float]] = {(rows, e): [] for rows in bodies for e in ENCODINGS}

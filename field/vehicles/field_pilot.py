@@ -137,7 +137,7 @@ class FieldPilot:
         except EdgeRefused as refused:
             # An edge that lost its store knows neither the mission nor the earlier decision, but it can still decide.
             # The mission of this ID that it has since may have other sensors.
-            if not (refused.lacks_mission or refused.blames("outcome") or refused.blames("sensors")):
+            if not (refused.mission_unknown or refused.concerns("outcome") or refused.concerns("sensors")):
                 raise
             self._owed.pop(request.uav_id, None)
             await self.join()

@@ -57,4 +57,4 @@ class SensorUplinks:
         ]
         for start in range(0, len(readings), MAX_READINGS):
             request = ReadingsRequest(readings=readings[start : start + MAX_READINGS])
-            self._client.read(self._mission_id, request)
+            self._client.send_readings(self._mission_id, request)

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from shared.client.report_encoders import DeltaReports, FullReports
-from shared.client.retries_and_redirects import Answer, Requests, Send, Sleep, TryAgain, parsed
+from shared.client.retries_and_redirects import Answer, Requests, Send, Sleep, TryAgain, parse
 from shared.planning.orders import GuidanceAnswer, GuidanceStatus
 from shared.wire.missions import MissionStatus
 from shared.wire.problem import INCOMPLETE
@@ -85,7 +85,7 @@ class Calls:
         while True:
             readiness: Readiness | None = None
             try:
-                readiness = parsed(Readiness, await self._requests.attempt(Send("GET", "/readyz")))
+                readiness = parse(Readiness, await self._requests.attempt(Send("GET", "/readyz")))
                 state = f"the LLM is {readiness.llm}" if readiness.ready else "not ready"
                 cause = f"{state}: {readiness.detail}" if readiness.detail else state
             except TryAgain as again:
@@ -119,7 +119,7 @@ class Calls:
         """Confirm or reject the compiled guidance, or replace it by a structure."""
         return await self._call("POST", f"/missions/{mission_id}/guidance", GuidanceStatus, given)
 
-    async def read(self, mission_id: str, readings: ReadingsRequest) -> ReadingsResponse:
+    async def send_readings(self, mission_id: str, readings: ReadingsRequest) -> ReadingsResponse:
         """Send what sensors reported over another network than the UAVs' radios."""
         return await self._call("POST", f"/missions/{mission_id}/readings", ReadingsResponse, readings)
 
@@ -142,17 +142,17 @@ class Calls:
             answer, tried = await self._decide(body, attempts)
             sent, tried = sent + len(body), 1 + tried
         rtt_ms = (self._clock() - began) * 1000
-        response = parsed(DecideResponse, answer)
+        response = parse(DecideResponse, answer)
         if response.sensor_id not in request.sensors.id:
             raise EdgeProtocolError(f"{answer.url} chose sensor {response.sensor_id}, which was not offered")
         if (response.uav_id, response.step) != (request.uav_id, request.step):
             raise EdgeProtocolError(f"{answer.url} answered for another UAV or step")
-        self._encoder.answered(request, response)
+        self._encoder.record_answer(request, response)
         return Exchange(response, rtt_ms, tried, sent, len(answer.content), fetched)
 
     def _body(self, request: DecideRequest) -> bytes:
-        reduced = self._encoder.reduced(request.mission_id, request.step, request)
-        return reduced.model_dump_json(exclude_defaults=self._terse).encode()
+        report = self._encoder.encode(request.mission_id, request.step, request)
+        return report.model_dump_json(exclude_defaults=self._terse).encode()
 
     async def _decide(self, body: bytes, attempts: int | None) -> tuple[httpx.Response, int]:
         # A retry with the same key after a lost response gets that response.
@@ -166,12 +166,12 @@ class Calls:
         """
         uav_id, step, fetched = request.uav_id, request.step, 0
         try:
-            while (wanted := self._encoder.missing(request.mission_id, step, uav_id)) is not None:
+            while (wanted := self._encoder.next_fetch(request.mission_id, step, uav_id)) is not None:
                 headers = None if wanted.etag is None else {"If-None-Match": wanted.etag}
                 answer, _ = await self._requests.exchange(Send("GET", wanted.path, headers=headers), attempts=1)
                 fetched += answer.num_bytes_downloaded
-                resource = None if answer.status_code == NOT_MODIFIED else parsed(wanted.model, answer)
-                self._encoder.take(uav_id, step, resource, answer.headers.get("ETag"))
+                resource = None if answer.status_code == NOT_MODIFIED else parse(wanted.model, answer)
+                self._encoder.store(uav_id, step, resource, answer.headers.get("ETag"))
         except (EdgeError, ValueError):
             pass
         return fetched
@@ -179,7 +179,7 @@ class Calls:
     async def _call(self, method: str, path: str, model: type[Answer], body: BaseModel | None = None) -> Answer:
         content = None if body is None else body.model_dump_json().encode()
         answer, _ = await self._requests.exchange(Send(method, path, content))
-        return parsed(model, answer)
+        return parse(model, answer)
 
 
 def _encoder_of(uplink: Uplink) -> FullReports:

@@ -135,7 +135,7 @@ class EdgeClient:
     guidance = _blocking(Calls.guidance)
     answer_guidance = _blocking(Calls.answer_guidance)
     decide = _blocking(Calls.decide)
-    read = _blocking(Calls.read)
+    send_readings = _blocking(Calls.send_readings)
     feedback = _blocking(Calls.feedback)
 
 

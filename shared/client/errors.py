@@ -9,7 +9,7 @@ class EdgeError(Exception):
     """A call to the edge yielded no usable answer."""
 
 
-class EdgeAddressWrong(EdgeError, ValueError):
+class InvalidEdgeUrl(EdgeError, ValueError):
     """The text is no edge's URL; it says how to write one."""
 
 
@@ -32,14 +32,14 @@ class EdgeRefused(EdgeError):
         fields = "; ".join(": ".join(error.values()) for error in self.errors)
         super().__init__(f"{url} refused with {status}: {detail}" + (f" ({fields})" if fields else ""))
 
-    def blames(self, field: str) -> bool:
+    def concerns(self, field: str) -> bool:
         """Whether the problem's fields or detail name ``field``."""
         return field in self.detail or any(field in value for error in self.errors for value in error.values())
 
     @property
-    def lacks_mission(self) -> bool:
+    def mission_unknown(self) -> bool:
         """Whether the edge does not have the request's mission."""
-        return self.status == 404 and self.blames("mission_id")
+        return self.status == 404 and self.concerns("mission_id")
 
 
 class EdgeProtocolError(EdgeError):

@@ -14,7 +14,7 @@ from shared.belief.records import Records, take_report
 from shared.client.report_encoders import Fetch, FullReports, Report, without_positions
 from shared.features.augmented_state import FEATURES, State, augment
 from shared.wire.missions import MissionAttention, MissionStatus
-from shared.wire.schemas import DecideResponse, Outcome, UavState
+from shared.wire.schemas import DecideResponse, UavState
 from shared.world.scenario import Scenario
 
 # Steps between a UAV's checks that its weights are still current.
@@ -26,7 +26,7 @@ FloatMatrix = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Attention:
+class AttentionWeights:
     """``W_q``, ``W_k``, ``W_v`` ``(d', d)``, and the score's ``w`` ``(1, d')`` and ``b`` ``(1,)``."""
 
     query: FloatMatrix
@@ -59,7 +59,7 @@ class Attention:
         return scores
 
 
-class OnBoard:
+class UavKnowledge:
     """One UAV's own knowledge of its mission: the beacons that it heard and the answers to it, not other UAVs'."""
 
     def __init__(self, mission_id: str, scenario: Scenario) -> None:
@@ -69,44 +69,39 @@ class OnBoard:
         self.etag: str | None = None
         self.checked_at = 0
         # Sensors and positions of the last answered report: the edge has them.
-        self.surveyed: tuple[list[int], list[float], list[float]] | None = None
-        self._attention: Attention | None = None
+        self.known_positions: tuple[list[int], list[float], list[float]] | None = None
+        self._attention: AttentionWeights | None = None
         self._records = Records(scenario)
         self._belief = FleetBelief(scenario)
-        self._sent: tuple[str, int, int] | None = None
+        self._pending: DecideResponse | None = None
 
-    def refreshed(self, published: MissionAttention, etag: str | None) -> None:
+    def set_weights(self, published: MissionAttention, etag: str | None) -> None:
         """Score by these weights from now on; raises ``ValueError`` for invalid ones."""
-        self._attention = Attention.of(published)
+        self._attention = AttentionWeights.of(published)
         self.published, self.etag = published, etag
 
-    def observe(self, uav: UavState, step: int) -> None:
+    def record_report(self, uav: UavState, step: int) -> None:
         """Record the UAV's report and the outcome of its last decision."""
-        if uav.outcome is not None:
-            self._apply(uav.uav_id, uav.outcome)
+        last, outcome = self._pending, uav.outcome
+        if outcome is not None and last is not None and last.decision_id == outcome.decision_id:
+            self._belief.settle(uav.uav_id, last.step, outcome.failed)
+            if outcome.failed:
+                self._records.withdraw(last.sensor_id, last.decision_id)
+            else:
+                self._records.confirm(last.sensor_id, last.decision_id, last.step)
+            self._pending = None
         take_report(uav, step, self._records, self._belief)
 
-    def decided(self, response: DecideResponse) -> None:
+    def record_decision(self, response: DecideResponse) -> None:
         """Record the edge's decision for the UAV."""
-        if self._sent is not None:
+        if (last := self._pending) is not None:
             # The previous decision has no outcome: its presumed visit is confirmed.
-            self._records.confirm(self._sent[1], self._sent[0], self._sent[2])
-        self._sent = response.decision_id, response.sensor_id, response.step
+            self._records.confirm(last.sensor_id, last.decision_id, last.step)
+        self._pending = response
         self._records.presume(response.sensor_id, response.decision_id, response.step)
         self._belief.tell(response.uav_id, response.step, response.sensor_id, response.velocity)
 
-    def _apply(self, uav_id: int, outcome: Outcome) -> None:
-        if self._sent is None or self._sent[0] != outcome.decision_id:
-            return
-        name, sensor, step = self._sent
-        self._belief.settle(uav_id, step, outcome.failed)
-        if outcome.failed:
-            self._records.withdraw(sensor, name)
-        else:
-            self._records.confirm(sensor, name, step)
-        self._sent = None
-
-    def selected(self, uav: UavState, step: int) -> list[int]:
+    def best_rows(self, uav: UavState, step: int) -> list[int]:
         """Rows of the report to send, best first: the k with the highest attention scores.
 
         With fewer than k admissible sensors, the nearest others follow, since the edge needs some sensors.
@@ -122,10 +117,10 @@ class OnBoard:
             preset=self.published.features,
             belief=self._belief if self.published.belief == "fleet" else None,
         )
-        return _best(state, self._attention.scores(state.features(self.scenario)), self.published.top_k)
+        return _best_rows(state, self._attention.scores(state.features(self.scenario)), self.published.top_k)
 
 
-def _best(state: State, scores: FloatMatrix, k: int) -> list[int]:
+def _best_rows(state: State, scores: FloatMatrix, k: int) -> list[int]:
     admissible = np.flatnonzero(state.admissible)
     best = admissible[np.argsort(-scores, kind="stable")[:k]]
     others = np.setdiff1d(np.arange(len(state.ids)), admissible)
@@ -138,52 +133,52 @@ class PrunedReports(FullReports):
     """Uplink ``pruned``: the sensors that the mission's attention selects, from the UAV's own knowledge.
 
     A UAV's first report has all sensors and their positions. The UAV fetches the weights before its first report and
-    every ten steps, and stores those of its latest mission. Without weights it reports in full.
+    once in ``REFRESH_STEPS`` steps, and stores those of its latest mission. Without weights it reports in full.
     """
 
     def __init__(self) -> None:
-        self._uavs: dict[int, OnBoard] = {}
+        self._uavs: dict[int, UavKnowledge] = {}
 
-    def _of(self, mission_id: str, uav_id: int) -> OnBoard | None:
-        on_board = self._uavs.get(uav_id)
-        return on_board if on_board is not None and on_board.mission_id == mission_id else None
+    def _knowledge(self, mission_id: str, uav_id: int) -> UavKnowledge | None:
+        known = self._uavs.get(uav_id)
+        return known if known is not None and known.mission_id == mission_id else None
 
-    def missing(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
-        """The mission's scenario, once; then its weights, every ``REFRESH_STEPS`` steps."""
-        on_board = self._of(mission_id, uav_id)
-        if on_board is None:
+    def next_fetch(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
+        """The mission's scenario, once; then its weights, once in ``REFRESH_STEPS`` steps."""
+        known = self._knowledge(mission_id, uav_id)
+        if known is None:
             return Fetch(f"/missions/{mission_id}", MissionStatus)
-        if on_board.published is None or not on_board.checked_at <= step < on_board.checked_at + REFRESH_STEPS:
-            return Fetch(f"/missions/{mission_id}/attention", MissionAttention, on_board.etag)
+        if known.published is None or not known.checked_at <= step < known.checked_at + REFRESH_STEPS:
+            return Fetch(f"/missions/{mission_id}/attention", MissionAttention, known.etag)
         return None
 
-    def take(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
+    def store(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
         """Begin a mission with this scenario, or score by these weights."""
         if isinstance(fetched, MissionStatus):
-            self._uavs[uav_id] = OnBoard(fetched.mission_id, fetched.scenario)
+            self._uavs[uav_id] = UavKnowledge(fetched.mission_id, fetched.scenario)
             return
         if isinstance(fetched, MissionAttention):
-            self._uavs[uav_id].refreshed(fetched, etag)
+            self._uavs[uav_id].set_weights(fetched, etag)
         self._uavs[uav_id].checked_at = step
 
-    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+    def encode(self, mission_id: str, step: int, uav: Report) -> Report:
         """The selected rows without their positions; the full report the first time."""
-        on_board = self._of(mission_id, uav.uav_id)
-        if on_board is None:
+        known = self._knowledge(mission_id, uav.uav_id)
+        if known is None:
             return uav
-        on_board.observe(uav, step)
-        if on_board.published is None or on_board.surveyed != (uav.sensors.id, uav.sensors.x, uav.sensors.y):
+        known.record_report(uav, step)
+        if known.published is None or known.known_positions != (uav.sensors.id, uav.sensors.x, uav.sensors.y):
             return uav
-        return uav.model_copy(update={"sensors": without_positions(uav.sensors, on_board.selected(uav, step))})
+        return uav.model_copy(update={"sensors": without_positions(uav.sensors, known.best_rows(uav, step))})
 
-    def answered(self, uav: UavState, response: DecideResponse) -> None:
+    def record_answer(self, uav: UavState, response: DecideResponse) -> None:
         """The edge has the positions of these sensors from now on."""
-        on_board = self._of(response.mission_id, uav.uav_id)
-        if on_board is not None:
-            on_board.surveyed = uav.sensors.id, uav.sensors.x, uav.sensors.y
-            on_board.decided(response)
+        known = self._knowledge(response.mission_id, uav.uav_id)
+        if known is not None:
+            known.known_positions = uav.sensors.id, uav.sensors.x, uav.sensors.y
+            known.record_decision(response)
 
     def forget(self, uav_id: int) -> None:
         """The edge lacks the sensors' positions: the next report is sent in full."""
         if uav_id in self._uavs:
-            self._uavs[uav_id].surveyed = None
+            self._uavs[uav_id].known_positions = None

@@ -24,18 +24,18 @@ class Fetch:
 class FullReports:
     """Uplink ``full``: every report in full. Encoders of the other uplinks send a full report after ``forget``."""
 
-    def missing(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
+    def next_fetch(self, mission_id: str, step: int, uav_id: int) -> Fetch | None:
         """The next resource to fetch before encoding; ``None`` once all are there."""
         return None
 
-    def take(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
+    def store(self, uav_id: int, step: int, fetched: BaseModel | None, etag: str | None) -> None:
         """Use a fetched resource; ``None`` means that it has not changed."""
 
-    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+    def encode(self, mission_id: str, step: int, uav: Report) -> Report:
         """The part of a full report to send."""
         return uav
 
-    def answered(self, uav: UavState, response: DecideResponse) -> None:
+    def record_answer(self, uav: UavState, response: DecideResponse) -> None:
         """The edge decided on this report and can complete it; ``uav`` is the full report, whatever part was sent."""
 
     def forget(self, uav_id: int) -> None:
@@ -49,12 +49,12 @@ class DeltaReports(FullReports):
     """
 
     def __init__(self) -> None:
-        self._answered: dict[int, tuple[SensorColumns, DecideResponse]] = {}
+        self._references: dict[int, tuple[SensorColumns, DecideResponse]] = {}
 
-    def reduced(self, mission_id: str, step: int, uav: Report) -> Report:
+    def encode(self, mission_id: str, step: int, uav: Report) -> Report:
         """The changed rows; the full report without a reference report, or after sensors or positions changed."""
         now = uav.sensors
-        old, answer = self._answered.get(uav.uav_id, (None, None))
+        old, answer = self._references.get(uav.uav_id, (None, None))
         if (
             old is None
             or answer is None
@@ -68,13 +68,13 @@ class DeltaReports(FullReports):
         changed = [row for row, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
         return uav.model_copy(update={"base": answer.decision_id, "sensors": without_positions(now, changed)})
 
-    def answered(self, uav: UavState, response: DecideResponse) -> None:
+    def record_answer(self, uav: UavState, response: DecideResponse) -> None:
         """Use it as the reference of the next report."""
-        self._answered[uav.uav_id] = uav.sensors, response
+        self._references[uav.uav_id] = uav.sensors, response
 
     def forget(self, uav_id: int) -> None:
         """Send the next report in full."""
-        self._answered.pop(uav_id, None)
+        self._references.pop(uav_id, None)
 
 
 def without_positions(sensors: SensorColumns, rows: list[int]) -> SensorColumns:

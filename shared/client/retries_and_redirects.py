@@ -17,7 +17,7 @@ from typing import TypeVar
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from shared.client.errors import EdgeAddressWrong, EdgeProtocolError, EdgeRefused, EdgeUnreachable
+from shared.client.errors import EdgeProtocolError, EdgeRefused, EdgeUnreachable, InvalidEdgeUrl
 from shared.wire.problem import Problem
 
 RETRIED_STATUS = frozenset({408, 429, 502, 503, 504})
@@ -32,17 +32,17 @@ def edge_url(text: str) -> str:
     """The edge's base URL, without a trailing slash.
 
     Raises:
-        EdgeAddressWrong: it is no http or https URL with a host, or it has a password.
+        InvalidEdgeUrl: it is no http or https URL with a host, or it has a password.
     """
     try:
         url = httpx.URL(text)
     except httpx.InvalidURL as error:
-        raise EdgeAddressWrong(f"{text!r} is not a URL: {error}") from None
+        raise InvalidEdgeUrl(f"{text!r} is not a URL: {error}") from None
     if url.scheme not in ("http", "https") or not url.host:
-        raise EdgeAddressWrong(f"{text!r} is not an edge's URL; write it like http://127.0.0.1:8000")
+        raise InvalidEdgeUrl(f"{text!r} is not an edge's URL; write it like http://127.0.0.1:8000")
     if url.userinfo or url.query or url.fragment:
         # The URL goes into summary.json and the report; a secret must not.
-        raise EdgeAddressWrong("an edge's URL has no user, password, query or fragment; set AICVDS_API_KEY for a key")
+        raise InvalidEdgeUrl("an edge's URL has no user, password, query or fragment; set AICVDS_API_KEY for a key")
     return str(url).rstrip("/")
 
 
@@ -153,7 +153,7 @@ class Requests:
         raise EdgeRefused(url, _problem(answer), status)
 
 
-def parsed(model: type[Answer], answer: httpx.Response) -> Answer:
+def parse(model: type[Answer], answer: httpx.Response) -> Answer:
     """The answer's body as that model; raises ``EdgeProtocolError`` if it is none."""
     if not answer.is_success:
         raise EdgeProtocolError(f"{answer.url} answered {answer.status_code}; is that an AIC-VDS edge?")
@@ -170,7 +170,7 @@ def _owner(answer: httpx.Response) -> str | None:
     owner = _problem(answer).owner
     try:
         return None if owner is None else edge_url(owner)
-    except EdgeAddressWrong:
+    except InvalidEdgeUrl:
         return None
 
 

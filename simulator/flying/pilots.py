@@ -154,7 +154,7 @@ class EdgePilot:
             raise
         except EdgeRefused as refused:
             # A restarted edge has neither the mission nor the earlier decision: create it, and omit the outcome.
-            if not (refused.lacks_mission or (request.outcome is not None and refused.blames("outcome"))):
+            if not (refused.mission_unknown or (request.outcome is not None and refused.concerns("outcome"))):
                 raise
             self._client.put_mission(self._mission_id, self.spec)
             exchange = self._client.decide(request.model_copy(update={"outcome": None}))

@@ -38,13 +38,13 @@ def test_half_of_the_sensors_report_every_third_step(edge: Edge, monkeypatch: py
         pilot.spec = MissionSpec(scenario=SCENARIO, mode="policy")
         client.put_mission("test", pilot.spec)
         uplinks = SensorUplinks(client, "test", SCENARIO, 4, UplinkPlan(share=0.5, every=3))
-        read = client.read
+        send_readings = client.send_readings
 
         def noted(mission_id: str, request: ReadingsRequest) -> ReadingsResponse:
             sent.extend((r.step or 0, r.sensor_id, r.queue) for r in request.readings)
-            return read(mission_id, request)
+            return send_readings(mission_id, request)
 
-        monkeypatch.setattr(client, "read", noted)
+        monkeypatch.setattr(client, "send_readings", noted)
 
         def decided(step: int, sensors: Sensors) -> None:
             queues[step] = sensors.queue.tolist()
@@ -75,7 +75,7 @@ class Sink:
     def __init__(self, policy: Hearing) -> None:
         self._policy, self._records = policy, Records(WORLD.scenario)
 
-    def read(self, mission_id: str, request: ReadingsRequest) -> None:
+    def send_readings(self, mission_id: str, request: ReadingsRequest) -> None:
         ids, steps, queue, battery = zip(
             *((r.sensor_id, r.step, r.queue, r.battery) for r in request.readings), strict=True
         )

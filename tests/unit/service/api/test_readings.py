@@ -110,10 +110,10 @@ def test_the_client_reports_readings(edge: Edge, report: Report) -> None:
     http.post("/decide", json=report())
     given = ReadingsRequest(readings=[SensorReading(sensor_id=4, queue=3.0, age_s=1.0)])
     with EdgeClient(str(http.base_url)) as client:
-        answer = client.read("test", given)
+        answer = client.send_readings("test", given)
         assert (answer.results, answer.step) == (["outdated"], 0) or answer.results == ["merged"]
         with pytest.raises(EdgeRefused) as refused:
-            client.read("nobody", given)
+            client.send_readings("nobody", given)
     assert refused.value.status == 404
 
 

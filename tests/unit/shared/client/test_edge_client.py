@@ -172,7 +172,7 @@ def test_a_refusal_carries_the_fields_and_is_not_repeated(
         edge.decide(request_)
     assert refused.value.status == 422
     assert refused.value.errors[0]["field"] == "sensors.queue[0]"
-    assert refused.value.blames("queue") and not refused.value.blames("outcome")
+    assert refused.value.concerns("queue") and not refused.value.concerns("outcome")
     assert stub.request_count == 1
 
 

@@ -18,7 +18,7 @@ from service.learning.modules import top_k
 from service.mission.mission import Mission
 from service.mission.mission_status import status_of
 from shared.client.edge_client import EdgeClient
-from shared.client.pruned_reports import REFRESH_STEPS, Attention, PrunedReports
+from shared.client.pruned_reports import REFRESH_STEPS, AttentionWeights, PrunedReports
 from shared.features.augmented_state import FEATURES
 from shared.wire.missions import MissionAttention
 from shared.wire.schemas import Belief, Features, FeedbackRequest, MissionSpec, Outcome
@@ -34,10 +34,10 @@ PAPER = SCENARIOS["paper"]
 @pytest.mark.parametrize("features", get_args(Features))
 def test_the_same_features_have_the_same_scores(features: Features, n: int) -> None:
     mission = Mission("test", MissionSpec(features=features), Settings(mode="value"))
-    told = MissionAttention.model_validate_json(attention_of(mission).model_dump_json())
+    published = MissionAttention.model_validate_json(attention_of(mission).model_dump_json())
     x = np.random.default_rng(n).random((n, FEATURES[features]), dtype=np.float32)
     expected = mission.learner.weights.attend(x).scores
-    scores = Attention.of(told).scores(x)
+    scores = AttentionWeights.of(published).scores(x)
     assert scores.shape == (n,) and np.abs(scores - expected).max() < 1e-5
     assert np.argsort(-scores, kind="stable")[:5].tolist() == top_k(expected, 5)
 
@@ -50,24 +50,26 @@ def test_a_lone_uav_selects_the_edges_sensors(
     """A single UAV knows all that the edge knows: from full reports, the edge ranks the sensors alike."""
     # The learning ends before the weights are fetched, so the fetched ones are those that decide.
     monkeypatch.setattr(LearningQueue, "add", LearningQueue._train)
-    alone = PAPER.model_copy(update={"uavs": 1, "steps": 10})
-    world, reports = PipelineWorld(alone), PrunedReports()
+    scenario = PAPER.model_copy(update={"uavs": 1, "steps": 10})
+    world, reports = PipelineWorld(scenario), PrunedReports()
     observations, _ = world.reset(seed=3)
     outcome: Outcome | None = None
     compared = 0
     with EdgeClient(str(edge().base_url)) as client:
-        client.put_mission("m", MissionSpec(scenario=alone, mode="value", features=features, belief=belief, top_k=10))
-        reports.take(0, 0, client.mission("m"), None)
-        for step in range(alone.steps):
+        client.put_mission(
+            "m", MissionSpec(scenario=scenario, mode="value", features=features, belief=belief, top_k=10)
+        )
+        reports.store(0, 0, client.mission("m"), None)
+        for step in range(scenario.steps):
             if outcome is not None:
                 client.feedback(FeedbackRequest(mission_id="m", **outcome.model_dump()))
             fetched = httpx.get(f"{client.base_url}/missions/m/attention").content
-            reports.take(0, step, MissionAttention.model_validate_json(fetched), None)
+            reports.store(0, step, MissionAttention.model_validate_json(fetched), None)
             request = decide_request(0, observations["uav_0"], "m", outcome=outcome)
-            kept = reports.reduced("m", step, request).sensors
+            kept = reports.encode("m", step, request).sensors
             exchange = client.decide(request)
             answer = exchange.response
-            reports.answered(request, answer)
+            reports.record_answer(request, answer)
             scores = {candidate.sensor_id: candidate.score for candidate in answer.top_k}
             if step:
                 # Equal sensors have equal scores, and so no order.
@@ -82,27 +84,27 @@ def test_a_lone_uav_selects_the_edges_sensors(
 def test_weights_are_refreshed_after_some_steps() -> None:
     reports = PrunedReports()
     mission = Mission("m", MissionSpec(), Settings(mode="value"))
-    wanted = reports.missing("m", 4, 0)
+    wanted = reports.next_fetch("m", 4, 0)
     assert wanted is not None and wanted.path == "/missions/m"
-    reports.take(0, 4, status_of(mission), None)
-    wanted = reports.missing("m", 4, 0)
+    reports.store(0, 4, status_of(mission), None)
+    wanted = reports.next_fetch("m", 4, 0)
     assert wanted is not None and (wanted.path, wanted.etag) == ("/missions/m/attention", None)
-    reports.take(0, 4, attention_of(mission), '"v1"')
-    assert all(reports.missing("m", step, 0) is None for step in range(4, 4 + REFRESH_STEPS))
-    wanted = reports.missing("m", 4 + REFRESH_STEPS, 0)
+    reports.store(0, 4, attention_of(mission), '"v1"')
+    assert all(reports.next_fetch("m", step, 0) is None for step in range(4, 4 + REFRESH_STEPS))
+    wanted = reports.next_fetch("m", 4 + REFRESH_STEPS, 0)
     assert wanted is not None and wanted.etag == '"v1"'
     # 304: the weights are still current.
-    reports.take(0, 4 + REFRESH_STEPS, None, '"v1"')
-    assert reports.missing("m", 5 + REFRESH_STEPS, 0) is None
+    reports.store(0, 4 + REFRESH_STEPS, None, '"v1"')
+    assert reports.next_fetch("m", 5 + REFRESH_STEPS, 0) is None
     # Each UAV fetches them separately, for each mission.
-    assert reports.missing("m", 4, 1) is not None and reports.missing("other", 4, 0) is not None
+    assert reports.next_fetch("m", 4, 1) is not None and reports.next_fetch("other", 4, 0) is not None
 
 
 @pytest.mark.parametrize("change", [{"features": "paper"}, {"weights": []}])
 def test_weights_that_are_none_are_refused(change: dict[str, Any]) -> None:
-    told = attention_of(Mission("m", MissionSpec(features="reach"), Settings(mode="value")))
+    published = attention_of(Mission("m", MissionSpec(features="reach"), Settings(mode="value")))
     with pytest.raises(ValueError, match="no attention of preset"):
-        Attention.of(told.model_copy(update=change))
+        AttentionWeights.of(published.model_copy(update=change))
 
 
 def test_it_needs_neither_torch_nor_scipy(edge: Edge) -> None:

@@ -82,9 +82,9 @@ def test_a_delta_refers_only_to_the_last_answered_report(
     reports = DeltaReports()
     with EdgeClient(str(edge().base_url)) as uavs:
         uavs.put_mission("m", MissionSpec())
-        reports.answered(steps[1][0], uavs.decide(steps[1][0]).response)
+        reports.record_answer(steps[1][0], uavs.decide(steps[1][0]).response)
     now = steps[2][0]
-    assert reports.reduced("m", 2, now).base is not None
+    assert reports.encode("m", 2, now).base is not None
     mission_id, step = change.get("mission_id", "m"), change.get("step", 2)
     if "uav_id" in change:
         now = steps[2][change["uav_id"]]
@@ -92,5 +92,5 @@ def test_a_delta_refers_only_to_the_last_answered_report(
         rows = now.sensors.model_dump()
         rows = {name: values[:9] for name, values in rows.items()} if column == "id" else {**rows, "x": [1.0] * 10}
         now = now.model_copy(update={"sensors": type(now.sensors).model_validate(rows)})
-    reduced = reports.reduced(mission_id, step, now)
+    reduced = reports.encode(mission_id, step, now)
     assert reduced.base is None and reduced.uplink == "delta" and reduced.sensors == now.sensors
