@@ -51,11 +51,11 @@ class Mqtt:
 def main(argv: list[str]) -> int:
     """Forward until SIGTERM or Ctrl-C; returns the exit code."""
     options = tyro.cli(Mqtt, prog="aicvds mqtt", args=argv)
-    from field.lorawan.configuration import BadConfiguration, read_configuration
+    from field.lorawan.configuration import ConfigurationError, read_configuration
 
     try:
         configuration = read_configuration(options.file, options.broker)
-    except BadConfiguration as error:
+    except ConfigurationError as error:
         return _refused(str(error))
     if options.check == "on":
         print(_in_words(configuration))
@@ -79,23 +79,23 @@ def main(argv: list[str]) -> int:
 def _forward(configuration: Configuration, options: Mqtt) -> int:
     from prometheus_client import start_http_server
 
-    from field.lorawan.counts import Counts
-    from field.lorawan.edge_sender import Reporting
+    from field.lorawan.edge_sender import EdgeSender
+    from field.lorawan.mqtt_metrics import MqttMetrics
+    from field.lorawan.pending_readings import ReadingBuffer
     from field.lorawan.subscription import Subscription
-    from field.lorawan.waiting_readings import Intake
 
-    counts = Counts()
-    intake = Intake(configuration, counts)
+    metrics = MqttMetrics()
+    pending = ReadingBuffer(configuration, metrics)
     try:
-        subscription = Subscription(configuration, os.environ.get(_PASSWORD) or None, intake, counts)
+        subscription = Subscription(configuration, os.environ.get(_PASSWORD) or None, pending, metrics)
     except OSError as error:
         return _refused(f"{options.file}: broker: ca_file, certificate or key: {error}")
     if options.metrics_port:
         try:
-            start_http_server(options.metrics_port, options.metrics_host, counts.registry)
+            start_http_server(options.metrics_port, options.metrics_host, metrics.registry)
         except OSError as error:
             return _refused(f"--metrics-port {options.metrics_port}: {error.strerror or error}")
-    reporting = Reporting(options.edge.rstrip("/"), os.environ.get(_API_KEY) or None, intake, counts)
+    sender = EdgeSender(options.edge.rstrip("/"), os.environ.get(_API_KEY) or None, pending, metrics)
     ended = threading.Event()
     for each in (signal.SIGTERM, signal.SIGINT):
         signal.signal(each, lambda *_: ended.set())
@@ -103,10 +103,10 @@ def _forward(configuration: Configuration, options: Mqtt) -> int:
     print(f"aicvds mqtt: {_in_words(configuration)}", file=sys.stderr, flush=True)
     pause_s = 0.0
     while not ended.wait(pause_s):
-        pause_s = reporting.report()
+        pause_s = sender.send_pending()
     subscription.stop()
-    reporting.report()
-    reporting.close()
+    sender.send_pending()
+    sender.close()
     return 0
 
 

@@ -22,7 +22,7 @@ Name = Annotated[str, Field(pattern=r"^[^/+#@\s]{1,100}$")]
 FieldName = Annotated[str, Field(pattern=r"^[^.\s]+(\.[^.\s]+)*$", max_length=200)]
 
 
-class BadConfiguration(Exception):
+class ConfigurationError(Exception):
     """The file cannot be used; the message names the file and the field."""
 
 
@@ -55,7 +55,7 @@ class Broker(_Table):
         return url
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _tls_files(self) -> Self:
         if (self.certificate is None) != (self.key is None):
             raise ValueError("certificate and key belong together: give both")
         if not self.encrypted and (self.ca_file or self.certificate):
@@ -84,7 +84,7 @@ class Network(_Table):
 
     @property
     def topics(self) -> list[str]:
-        """What to subscribe to."""
+        """The MQTT topics of the application's uplinks."""
         if self.server == "chirpstack":
             return [f"application/{self.application}/device/+/event/{event}" for event in ("up", "status")]
         tenant = f"@{self.tenant}" if self.tenant else ""
@@ -100,7 +100,7 @@ class Payload(_Table):
     battery_full_j: float | None = Field(None, gt=0, le=1e9)
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _battery_scale(self) -> Self:
         if self.battery is not None and self.battery_full_j is None:
             raise ValueError(
                 "battery_full_j is missing: the joules of a full battery, which `battery` is a percentage of"
@@ -147,33 +147,33 @@ def read_configuration(path: Path, broker_url: str | None = None) -> Configurati
         broker_url: instead of the file's.
 
     Raises:
-        BadConfiguration: the file or one that it names cannot be read, or a field is wrong.
+        ConfigurationError: the file or one that it names cannot be read, or a field is wrong.
     """
     try:
         with path.open("rb") as file:
             raw = file.read(_MAX_BYTES + 1)
         if len(raw) > _MAX_BYTES:
-            raise BadConfiguration(f"{path} is larger than {_MAX_BYTES} bytes")
+            raise ConfigurationError(f"{path} is larger than {_MAX_BYTES} bytes")
         found = Configuration.model_validate(_with_broker(tomllib.loads(raw.decode()), broker_url))
     except OSError as error:
-        raise BadConfiguration(f"{path}: {error.strerror or error}") from None
+        raise ConfigurationError(f"{path}: {error.strerror or error}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
         known = [name for table in (Broker, Network, Payload, Device, Configuration) for name in table.model_fields]
-        raise BadConfiguration(f"{path}: {field}{': ' if field else ''}{problem_of(first, known)}") from None
+        raise ConfigurationError(f"{path}: {field}{': ' if field else ''}{problem_of(first, known)}") from None
     except (ValueError, RecursionError) as error:
-        raise BadConfiguration(f"{path} is no TOML: {' '.join(str(error).split())}") from None
+        raise ConfigurationError(f"{path} is no TOML: {' '.join(str(error).split())}") from None
     files: dict[str, Path] = {}
     for name in ("ca_file", "certificate", "key"):
         if (given := getattr(found.broker, name)) is not None:
             files[name] = path.parent.absolute() / given.expanduser()
             if not files[name].is_file():
-                raise BadConfiguration(f"{path}: broker.{name}: there is no file {files[name]}")
+                raise ConfigurationError(f"{path}: broker.{name}: there is no file {files[name]}")
     return found.model_copy(update={"broker": found.broker.model_copy(update=files)})
 
 
-def _with_broker(told: dict[str, Any], url: str | None) -> dict[str, Any]:
-    if url is None or not isinstance(told.get("broker", {}), dict):
-        return told
-    return {**told, "broker": {**told.get("broker", {}), "url": url}}
+def _with_broker(document: dict[str, Any], url: str | None) -> dict[str, Any]:
+    if url is None or not isinstance(document.get("broker", {}), dict):
+        return document
+    return {**document, "broker": {**document.get("broker", {}), "url": url}}

@@ -1,4 +1,4 @@
-"""Readings sent to the edge: in batches by mission, again while it is away, and not again where it refuses them."""
+"""Readings sent to the edge: in batches by mission, retried while it is unavailable, dropped where it refuses them."""
 
 from __future__ import annotations
 
@@ -10,38 +10,43 @@ from datetime import UTC, datetime
 import httpx
 from pydantic import ValidationError
 
-from field.lorawan.counts import Counts
-from field.lorawan.waiting_readings import Intake, Waiting
+from field.lorawan.mqtt_metrics import MqttMetrics
+from field.lorawan.pending_readings import PendingReading, ReadingBuffer
 from shared.wire.problem import Problem
 from shared.wire.readings import MAX_AGE_S, ReadingsRequest, ReadingsResponse, SensorReading
 
 log = logging.getLogger(__name__)
 
 _TIMEOUT_S = 10.0
-_MOST = 500
-# Seconds until a mission is asked again that has not begun, or that the edge does not know.
-_AGAIN_S = 5.0
+_BATCH_SIZE = 500
 # The pause after a failure of the edge: the first, and the longest after doubling.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 30.0
 # Answers to readings that the edge can never take.
-_HOPELESS = frozenset((400, 413, 415, 422))
+_PERMANENT_STATUS = frozenset((400, 413, 415, 422))
 _MISDIRECTED = 421
 
 
-class EdgeAway(Exception):
+class EdgeUnavailable(Exception):
     """The edge did not answer, or cannot serve now; the text says why."""
 
 
-class Reporting:
-    """Sends what waits in an intake to an edge; one thread uses it.
+class EdgeSender:
+    """Sends the buffered readings to an edge; one thread uses it.
 
     Args:
         edge: base URL, without a slash at its end.
         key: an API key with the scope ``readings``, if the edge needs one.
+        retry_s: pause before readings of a mission that is unknown or has not begun are sent again.
     """
 
     def __init__(
-        self, edge: str, key: str | None, intake: Intake, counts: Counts, transport: httpx.BaseTransport | None = None
+        self,
+        edge: str,
+        key: str | None,
+        pending: ReadingBuffer,
+        metrics: MqttMetrics,
+        transport: httpx.BaseTransport | None = None,
+        retry_s: float = 5.0,
     ) -> None:
         headers = {"Content-Type": "application/json"} | ({} if key is None else {"Authorization": f"Bearer {key}"})
         # A proxy named in the environment cannot reach an edge on this machine.
@@ -49,97 +54,98 @@ class Reporting:
         self._http = httpx.Client(
             base_url=edge, headers=headers, timeout=_TIMEOUT_S, transport=transport, trust_env=beyond
         )
-        self._intake = intake
-        self._counts = counts
-        self._again_at: dict[str, float] = {}
+        self._pending = pending
+        self._metrics = metrics
+        self._retry_s = retry_s
+        self._retry_at: dict[str, float] = {}
         self._pause_s = 0.0
-        self._refused: set[str] = set()
+        self._reported_sensors: set[str] = set()
 
     def close(self) -> None:
         """Close the connections."""
         self._http.close()
 
-    def report(self) -> float:
-        """Send everything that waits, once; returns the seconds until the next time that is worth it."""
+    def send_pending(self) -> float:
+        """Send all buffered readings once; returns the seconds to wait before the next call."""
         now = time.monotonic()
-        due = self._intake.due()
+        due = self._pending.drain()
         try:
             while due:
                 mission_id, readings = next(iter(due.items()))
-                if self._again_at.get(mission_id, 0.0) > now:
-                    self._intake.put_back(readings)
+                if self._retry_at.get(mission_id, 0.0) > now:
+                    self._pending.put_back(readings)
                 else:
-                    for start in range(0, len(readings), _MOST):
-                        self._send(mission_id, readings[start : start + _MOST])
+                    for start in range(0, len(readings), _BATCH_SIZE):
+                        self._send(mission_id, readings[start : start + _BATCH_SIZE])
                     self._pause_s = 0.0
                 del due[mission_id]
-        except EdgeAway as error:
-            # Those that the edge has already are duplicates next time.
+        except EdgeUnavailable as error:
+            # The edge counts those that it already has as duplicates.
             for unsent in due.values():
-                self._intake.put_back(unsent)
-            self._counts.failures.inc()
+                self._pending.put_back(unsent)
+            self._metrics.failures.inc()
             self._pause_s = min(max(_FIRST_PAUSE_S, 2 * self._pause_s), _LONGEST_PAUSE_S)
             log.warning("the edge takes no readings, the next attempt is in %g s: %s", self._pause_s, error)
             return self._pause_s
         return _FIRST_PAUSE_S
 
-    def _send(self, mission_id: str, readings: Sequence[Waiting]) -> None:
-        """Send readings of one mission, one by one where the edge refuses them together; raises ``EdgeAway``."""
-        body = ReadingsRequest(readings=[_wire(reading) for reading in readings]).model_dump_json(exclude_none=True)
+    def _send(self, mission_id: str, readings: Sequence[PendingReading]) -> None:
+        """Send readings of one mission, one by one where the edge refuses them together; raises ``EdgeUnavailable``."""
+        body = ReadingsRequest(readings=[_to_wire(reading) for reading in readings]).model_dump_json(exclude_none=True)
         try:
             answer = self._http.post(f"/missions/{mission_id}/readings", content=body)
             if answer.status_code == _MISDIRECTED and "Location" in answer.headers:
                 # Of several edges, another one has the mission.
                 answer = self._http.post(answer.headers["Location"], content=body)
         except httpx.HTTPError as error:
-            raise EdgeAway(str(error) or type(error).__name__) from None
-        # 409: the mission cannot be loaded from the edge's store, until somebody deletes it.
+            raise EdgeUnavailable(str(error) or type(error).__name__) from None
+        # 409: the edge cannot load the mission from its store; only deleting the mission cures that.
         if answer.status_code in (404, 409):
-            self._wait(mission_id, readings, "no_mission")
-        elif answer.status_code in _HOPELESS:
+            self._put_back(mission_id, readings, "no_mission")
+        elif answer.status_code in _PERMANENT_STATUS:
             if len(readings) == 1:
-                self._refuse(readings[0], answer)
+                self._count_refused(readings[0], answer)
             else:
                 for reading in readings:
                     self._send(mission_id, [reading])
         elif answer.is_success:
-            self._count(mission_id, readings, answer)
+            self._count_results(mission_id, readings, answer)
         else:
-            raise EdgeAway(f"{answer.status_code} {_problem(answer)}")
+            raise EdgeUnavailable(f"{answer.status_code} {_problem(answer)}")
 
-    def _count(self, mission_id: str, readings: Sequence[Waiting], answer: httpx.Response) -> None:
+    def _count_results(self, mission_id: str, readings: Sequence[PendingReading], answer: httpx.Response) -> None:
         try:
             results = ReadingsResponse.model_validate_json(answer.content).results
             answered = list(zip(readings, results, strict=True))
         except ValueError:
-            raise EdgeAway("it answered with something else: is that an AIC-VDS edge?") from None
+            raise EdgeUnavailable("the answer has no result for each reading: is that an AIC-VDS edge?") from None
         early = []
         now = datetime.now(UTC)
         for reading, result in answered:
             if result == "early":
                 early.append(reading)
                 continue
-            self._counts.readings.labels(result).inc()
-            self._counts.age_s.observe(max(0.0, (now - reading.at).total_seconds()))
+            self._metrics.readings.labels(result).inc()
+            self._metrics.age_s.observe(max(0.0, (now - reading.at).total_seconds()))
         if early:
-            self._wait(mission_id, early, "early")
+            self._put_back(mission_id, early, "early")
 
-    def _wait(self, mission_id: str, readings: Sequence[Waiting], why: str) -> None:
-        """Keep readings of a mission that is not there yet, or has not begun; a newer one replaces each."""
-        self._counts.readings.labels(why).inc(len(readings))
-        self._again_at[mission_id] = time.monotonic() + _AGAIN_S
-        self._intake.put_back(list(readings))
+    def _put_back(self, mission_id: str, readings: Sequence[PendingReading], why: str) -> None:
+        """Buffer readings of a mission that does not exist yet or has not begun; newer ones replace them."""
+        self._metrics.readings.labels(why).inc(len(readings))
+        self._retry_at[mission_id] = time.monotonic() + self._retry_s
+        self._pending.put_back(list(readings))
 
-    def _refuse(self, reading: Waiting, answer: httpx.Response) -> None:
-        self._counts.readings.labels("refused").inc()
+    def _count_refused(self, reading: PendingReading, answer: httpx.Response) -> None:
+        self._metrics.readings.labels("refused").inc()
         sensor = f"sensor {reading.sensor_id} of mission {reading.mission_id}"
         # A wrong mapping refuses every reading of its sensor; its first line in the log is enough.
-        if sensor not in self._refused:
-            self._refused.add(sensor)
+        if sensor not in self._reported_sensors:
+            self._reported_sensors.add(sensor)
             log.warning("%s: the edge refuses its readings: %s", sensor, _problem(answer))
 
 
-def _wire(reading: Waiting) -> SensorReading:
+def _to_wire(reading: PendingReading) -> SensorReading:
     age_s = (datetime.now(UTC) - reading.at).total_seconds()
     return SensorReading(
         sensor_id=reading.sensor_id,

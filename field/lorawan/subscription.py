@@ -11,22 +11,22 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from field.lorawan.configuration import Configuration
-from field.lorawan.counts import Counts
-from field.lorawan.waiting_readings import Intake
+from field.lorawan.mqtt_metrics import MqttMetrics
+from field.lorawan.pending_readings import ReadingBuffer
 
 log = logging.getLogger(__name__)
 
 _KEEPALIVE_S = 30
-# The pause before a connection is tried again: the first, and the longest after doubling.
+# The pause before a reconnection: the first, and the longest after doubling.
 _PAUSES_S = (1, 60)
 
 
 class Subscription:
-    """Brings every message of the network's topics to an intake, in a thread of its own.
+    """Adds every message of the network's topics to a buffer, in a separate thread.
 
-    The session stays at the broker while this process is away, as far as the broker keeps it, so that uplinks of
-    meanwhile are delivered late, with their age. The thread reads a message only after the one before is taken, so a
-    flood waits in the network and not in memory.
+    The broker keeps the session while this process is down, as far as its settings allow, and then delivers the uplinks
+    of that time with their age. The thread reads a message only after it has processed the one before, so that a flood
+    fills the network's queues and not the memory.
 
     Args:
         password: of the broker's user, if it has one.
@@ -35,12 +35,14 @@ class Subscription:
         OSError: a file for TLS cannot be read. ``ssl.SSLError`` is one.
     """
 
-    def __init__(self, configuration: Configuration, password: str | None, intake: Intake, counts: Counts) -> None:
+    def __init__(
+        self, configuration: Configuration, password: str | None, pending: ReadingBuffer, metrics: MqttMetrics
+    ) -> None:
         broker = configuration.broker
         self._topics = configuration.network.topics
         self._broker = broker
-        self._intake = intake
-        self._counts = counts
+        self._pending = pending
+        self._metrics = metrics
         # The Things Stack speaks MQTT 3.1.1 only.
         self._client = Client(
             CallbackAPIVersion.VERSION2, client_id=broker.client_id, clean_session=False, protocol=MQTTv311
@@ -74,11 +76,11 @@ class Subscription:
     def _connected(
         self, client: Client, _: Any, flags: ConnectFlags, reason: ReasonCode, properties: Properties | None
     ) -> None:
-        self._counts.connects.labels("refused" if reason.is_failure else "connected").inc()
+        self._metrics.connects.labels("refused" if reason.is_failure else "connected").inc()
         if reason.is_failure:
             log.error("the broker %s refuses the connection: %s", self._broker.url, reason)
             return
-        # Quality of service 1 where the broker has it: it delivers again what it has no acknowledgement of.
+        # Quality of service 1 where the broker has it: it repeats messages without an acknowledgement.
         client.subscribe([(topic, 1) for topic in self._topics])
 
     def _subscribed(
@@ -88,25 +90,25 @@ class Subscription:
             if reason.is_failure:
                 log.error("the broker %s refuses the topic %s: %s", self._broker.url, topic, reason)
         if not all(reason.is_failure for reason in reasons):
-            self._counts.connected.set(1)
+            self._metrics.connected.set(1)
             log.info("subscribed at %s", self._broker.url)
 
     def _unreachable(self, client: Client, _: Any) -> None:
-        self._counts.connects.labels("unreachable").inc()
-        log.warning("the broker %s cannot be reached; it is tried again", self._broker.url)
+        self._metrics.connects.labels("unreachable").inc()
+        log.warning("the broker %s cannot be reached; retrying", self._broker.url)
 
     def _disconnected(
         self, client: Client, _: Any, flags: DisconnectFlags, reason: ReasonCode, properties: Properties | None
     ) -> None:
-        self._counts.connected.set(0)
+        self._metrics.connected.set(0)
         if reason.is_failure:
-            log.warning("the connection to %s is lost: %s; it is tried again", self._broker.url, reason)
+            log.warning("the connection to %s is lost: %s; retrying", self._broker.url, reason)
 
     def _received(self, client: Client, _: Any, message: MQTTMessage) -> None:
         try:
-            taken = self._intake.take(bytes(message.payload))
+            result = self._pending.add_message(bytes(message.payload))
         except Exception:
             # An error would end the client's thread, and no further message would come.
-            log.exception("a message of %s could not be taken", message.topic)
+            log.exception("a message of %s could not be processed", message.topic)
             return
-        log.debug("%s: %s", message.topic, taken)
+        log.debug("%s: %s", message.topic, result)

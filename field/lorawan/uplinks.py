@@ -1,4 +1,4 @@
-"""The messages of two LoRaWAN network servers, as their documentation has them: an uplink, and a battery's state.
+"""The messages of two LoRaWAN network servers by their documentation: an uplink, and a battery status.
 
 ChirpStack v4 (``integration.proto``, as JSON) and The Things Stack v3 (data formats, MQTT server). Fields that are
 empty or zero may be missing.
@@ -17,16 +17,16 @@ from pydantic.alias_generators import to_camel
 
 
 @dataclass(frozen=True, slots=True)
-class Uplink:
+class DeviceMessage:
     """One message of a device.
 
     Attributes:
         dev_eui: 16 hexadecimal digits, lower case.
         message_id: the same for each delivery of the message.
         at: when the network received it.
-        fields: the decoded payload; None for a message that only tells the battery.
-        battery_percent: the battery's level as the device told the network, 0..100, if known.
-        rssi_dbm, snr_db: those of the gateway that heard it best, if known.
+        fields: the decoded payload; None for a message with nothing but the battery level.
+        battery_percent: the battery level that the device reported to the network, 0..100, if known.
+        rssi_dbm, snr_db: at the gateway with the strongest reception, if known.
     """
 
     dev_eui: str
@@ -41,22 +41,22 @@ class Uplink:
     simulated: bool = False
 
 
-class _Message(BaseModel):
+class _ChirpStackModel(BaseModel):
     model_config = ConfigDict(extra="ignore", alias_generator=to_camel, frozen=True)
 
 
-class _DeviceInfo(_Message):
+class _DeviceInfo(_ChirpStackModel):
     tenant_id: str = ""
     application_id: str
     dev_eui: str = Field(pattern=r"^[0-9A-Fa-f]{16}$")
 
 
-class _Reception(_Message):
+class _Reception(_ChirpStackModel):
     rssi: float | None = None
     snr: float | None = None
 
 
-class _ChirpStack(_Message):
+class _ChirpStack(_ChirpStackModel):
     """``UplinkEvent`` or ``StatusEvent``."""
 
     deduplication_id: str = ""
@@ -70,28 +70,28 @@ class _ChirpStack(_Message):
     external_power_source: bool = False
 
 
-class _Snake(BaseModel):
+class _TtsModel(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class _ApplicationIds(_Snake):
+class _ApplicationIds(_TtsModel):
     application_id: str
 
 
-class _DeviceIds(_Snake):
+class _DeviceIds(_TtsModel):
     application_ids: _ApplicationIds
     dev_eui: str = Field(pattern=r"^[0-9A-Fa-f]{16}$")
 
 
-class _Battery(_Snake):
+class _Battery(_TtsModel):
     value: float = Field(0.0, ge=0, le=100)
 
 
-class _NetworkIds(_Snake):
+class _NetworkIds(_TtsModel):
     tenant_id: str = ""
 
 
-class _UplinkMessage(_Snake):
+class _TtsUplink(_TtsModel):
     f_cnt: int = 0
     received_at: AwareDatetime
     decoded_payload: dict[str, Any] | None = None
@@ -100,37 +100,37 @@ class _UplinkMessage(_Snake):
     network_ids: _NetworkIds = _NetworkIds()
 
 
-class _TheThingsStack(_Snake):
+class _TheThingsStack(_TtsModel):
     """``ApplicationUp`` with an ``uplink_message``."""
 
     end_device_ids: _DeviceIds
-    uplink_message: _UplinkMessage
+    uplink_message: _TtsUplink
     simulated: bool = False
 
 
-def chirpstack(payload: bytes) -> Uplink:
+def chirpstack(payload: bytes) -> DeviceMessage:
     """An event ``up`` or ``status`` of ChirpStack v4 in JSON; raises pydantic's ``ValidationError``."""
-    told = _ChirpStack.model_validate_json(payload)
-    device = told.device_info
-    mains = told.external_power_source or told.battery_level_unavailable
-    return Uplink(
+    event = _ChirpStack.model_validate_json(payload)
+    device = event.device_info
+    mains = event.external_power_source or event.battery_level_unavailable
+    return DeviceMessage(
         dev_eui=device.dev_eui.lower(),
         tenant=device.tenant_id or None,
         application=device.application_id,
-        message_id=_message_id(device.dev_eui, told.deduplication_id or told.f_cnt, told.time),
-        at=told.time,
-        fields=None if told.object is None and told.battery_level is not None else told.object or {},
-        battery_percent=None if mains else told.battery_level,
-        **_heard_best(told.rx_info),
+        message_id=_message_id(device.dev_eui, event.deduplication_id or event.f_cnt, event.time),
+        at=event.time,
+        fields=None if event.object is None and event.battery_level is not None else event.object or {},
+        battery_percent=None if mains else event.battery_level,
+        **_best_reception(event.rx_info),
     )
 
 
-def the_things_stack(payload: bytes) -> Uplink:
+def the_things_stack(payload: bytes) -> DeviceMessage:
     """An uplink message of The Things Stack v3; raises pydantic's ``ValidationError``."""
-    told = _TheThingsStack.model_validate_json(payload)
-    device, message = told.end_device_ids, told.uplink_message
+    uplink = _TheThingsStack.model_validate_json(payload)
+    device, message = uplink.end_device_ids, uplink.uplink_message
     battery = message.last_battery_percentage
-    return Uplink(
+    return DeviceMessage(
         dev_eui=device.dev_eui.lower(),
         tenant=message.network_ids.tenant_id or None,
         application=device.application_ids.application_id,
@@ -138,8 +138,8 @@ def the_things_stack(payload: bytes) -> Uplink:
         at=message.received_at,
         fields=message.decoded_payload or {},
         battery_percent=None if battery is None else battery.value,
-        simulated=told.simulated,
-        **_heard_best(message.rx_metadata),
+        simulated=uplink.simulated,
+        **_best_reception(message.rx_metadata),
     )
 
 
@@ -151,6 +151,6 @@ def _message_id(dev_eui: str, number: str | int, at: datetime) -> str:
     return hashlib.sha256(f"{dev_eui.lower()} {number} {at.isoformat()}".encode()).hexdigest()[:32]
 
 
-def _heard_best(receptions: list[_Reception]) -> dict[str, Any]:
+def _best_reception(receptions: list[_Reception]) -> dict[str, Any]:
     best = max(receptions, key=lambda one: -1e9 if one.rssi is None else one.rssi, default=_Reception())
     return {"rssi_dbm": best.rssi, "snr_db": best.snr}

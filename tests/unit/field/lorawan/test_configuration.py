@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from field.lorawan.configuration import BadConfiguration, Configuration, read_configuration
+from field.lorawan.configuration import Configuration, ConfigurationError, read_configuration
 from tests.support.places import ROOT
 
 EXAMPLE = ROOT / "examples" / "lorawan" / "lorawan.toml"
@@ -90,7 +90,7 @@ def test_an_address_has_the_usual_port_unless_it_names_one(tmp_path: Path, url: 
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, named: str) -> None:
-    with pytest.raises(BadConfiguration) as error:
+    with pytest.raises(ConfigurationError) as error:
         read(tmp_path, (old, new))
     assert str(error.value).startswith(str(tmp_path / "lorawan.toml"))
     assert named in str(error.value)
@@ -103,5 +103,5 @@ def test_files_for_tls_are_beside_the_file(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(BadConfiguration, match="No such file"):
+    with pytest.raises(ConfigurationError, match="No such file"):
         read_configuration(tmp_path / "none.toml")

@@ -1,4 +1,4 @@
-"""What ``aicvds mqtt`` tells Prometheus. No label names a device, sensor or mission."""
+"""The Prometheus metrics of ``aicvds mqtt``. No label names a device, sensor or mission."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _RSSI_BUCKETS_DBM = (-140, -130, -125, -120, -115, -110, -105, -100, -90, -80, -
 _SNR_BUCKETS_DB = (-20, -17.5, -15, -12.5, -10, -7.5, -5, -2.5, 0, 2.5, 5, 10)
 
 
-class Counts:
+class MqttMetrics:
     """The metrics of one process, in their own registry."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""What comes of a broker's messages: the newest reading of each device waits for the edge, and the rest is counted."""
+"""A broker's messages: the newest reading of each device is buffered for the edge, and every message is counted."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from field.lorawan.configuration import Configuration, Device
-from field.lorawan.counts import Counts
-from field.lorawan.uplinks import DECODERS, Uplink
+from field.lorawan.mqtt_metrics import MqttMetrics
+from field.lorawan.uplinks import DECODERS, DeviceMessage
 
 # The largest LoRaWAN payload has 242 bytes; the metadata of many gateways is some kilobytes.
-_MOST_BYTES = 65_536
-# The clocks of network server and edge may differ by so much.
-_AHEAD = timedelta(seconds=60)
-# Messages of a device that are known again.
-_KNOWN = 8
+_MAX_BYTES = 65_536
+# The most that the clocks of network server and edge may differ.
+_MAX_CLOCK_SKEW = timedelta(seconds=60)
+# Message IDs remembered for each device, to detect duplicates.
+_REMEMBERED_IDS = 8
 
-Taken = Literal[
+MessageResult = Literal[
     "accepted", "battery", "duplicate", "foreign", "future", "no_queue", "outdated", "simulated", "too_large",
     "too_old", "unknown_device", "unreadable",
 ]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Waiting:
+class PendingReading:
     """A reading that waits for the edge; ``battery`` in J, if known."""
 
     mission_id: str
@@ -42,39 +42,39 @@ class Waiting:
 
 
 @dataclass(slots=True)
-class _Known:
-    """What is known of a device: its newest message, and its battery as the network told it."""
+class _DeviceState:
+    """A device's newest message, and the battery level that the network reported."""
 
     device: Device
     newest: datetime = datetime.min.replace(tzinfo=UTC)
-    messages: deque[str] = field(default_factory=lambda: deque(maxlen=_KNOWN))
+    messages: deque[str] = field(default_factory=lambda: deque(maxlen=_REMEMBERED_IDS))
     battery_percent: float | None = None
 
 
-class Intake:
+class ReadingBuffer:
     """Takes messages in the MQTT client's thread, and hands readings to another.
 
-    It holds one reading a device, the newest, however many messages come and however long the edge is away.
+    It stores one reading a device, the newest, however many messages arrive and however long the edge is unavailable.
     """
 
-    def __init__(self, configuration: Configuration, counts: Counts) -> None:
+    def __init__(self, configuration: Configuration, metrics: MqttMetrics) -> None:
         self._configuration = configuration
         self._decode = DECODERS[configuration.network.server]
-        self._counts = counts
-        self._devices = {device.dev_eui.lower(): _Known(device) for device in configuration.device}
+        self._metrics = metrics
+        self._devices = {device.dev_eui.lower(): _DeviceState(device) for device in configuration.device}
         self._lock = threading.Lock()
-        self._waiting: dict[tuple[str, int], Waiting] = {}
+        self._readings: dict[tuple[str, int], PendingReading] = {}
 
-    def take(self, payload: bytes, now: datetime | None = None) -> Taken:
-        """Take a message, whatever it is; returns and counts what became of it."""
+    def add_message(self, payload: bytes, now: datetime | None = None) -> MessageResult:
+        """Decode a message and buffer its reading; returns and counts the result."""
         with self._lock:
-            taken = self._take(payload, now or datetime.now(UTC))
-            self._counts.waiting.set(len(self._waiting))
-        self._counts.uplinks.labels(taken).inc()
-        return taken
+            result = self._result_of(payload, now or datetime.now(UTC))
+            self._metrics.waiting.set(len(self._readings))
+        self._metrics.uplinks.labels(result).inc()
+        return result
 
-    def _take(self, payload: bytes, now: datetime) -> Taken:
-        if len(payload) > _MOST_BYTES:
+    def _result_of(self, payload: bytes, now: datetime) -> MessageResult:
+        if len(payload) > _MAX_BYTES:
             return "too_large"
         try:
             uplink = self._decode(payload)
@@ -83,41 +83,41 @@ class Intake:
         network = self._configuration.network
         if uplink.application != network.application or (network.tenant and uplink.tenant != network.tenant):
             return "foreign"
-        known = self._devices.get(uplink.dev_eui)
-        if known is None:
+        state = self._devices.get(uplink.dev_eui)
+        if state is None:
             return "unknown_device"
         if uplink.simulated:
             return "simulated"
-        if uplink.at > now + _AHEAD:
+        if uplink.at > now + _MAX_CLOCK_SKEW:
             return "future"
-        if uplink.message_id in known.messages:
+        if uplink.message_id in state.messages:
             return "duplicate"
         if uplink.battery_percent is not None:
-            known.battery_percent = uplink.battery_percent
+            state.battery_percent = uplink.battery_percent
         if uplink.fields is None:
             return "battery"
         if (now - uplink.at).total_seconds() > network.max_age_s:
             return "too_old"
-        if uplink.at <= known.newest:
+        if uplink.at <= state.newest:
             return "outdated"
-        return self._accept(uplink, known, uplink.fields)
+        return self._add_reading(uplink, state, uplink.fields)
 
-    def _accept(self, uplink: Uplink, known: _Known, fields: Mapping[str, Any]) -> Taken:
+    def _add_reading(self, uplink: DeviceMessage, state: _DeviceState, fields: Mapping[str, Any]) -> MessageResult:
         payload = self._configuration.payload
         queue = _number(fields, payload.queue)
         if queue is None or queue < 0:
             return "no_queue"
-        percent = known.battery_percent
+        percent = state.battery_percent
         if payload.battery is not None:
             own = _number(fields, payload.battery)
             percent = own if own is not None and 0 <= own <= 100 else percent
         full_j = payload.battery_full_j
-        known.newest = uplink.at
-        known.messages.append(uplink.message_id)
-        self._await(
-            Waiting(
-                mission_id=self._configuration.mission_of(known.device),
-                sensor_id=known.device.sensor_id,
+        state.newest = uplink.at
+        state.messages.append(uplink.message_id)
+        self._keep_newest(
+            PendingReading(
+                mission_id=self._configuration.mission_of(state.device),
+                sensor_id=state.device.sensor_id,
                 queue=queue * payload.packets_per_unit,
                 battery=None if percent is None or full_j is None else percent / 100 * full_j,
                 at=uplink.at,
@@ -125,37 +125,37 @@ class Intake:
             )
         )
         if uplink.rssi_dbm is not None:
-            self._counts.rssi_dbm.observe(uplink.rssi_dbm)
+            self._metrics.rssi_dbm.observe(uplink.rssi_dbm)
         if uplink.snr_db is not None:
-            self._counts.snr_db.observe(uplink.snr_db)
+            self._metrics.snr_db.observe(uplink.snr_db)
         return "accepted"
 
-    def _await(self, reading: Waiting) -> None:
+    def _keep_newest(self, reading: PendingReading) -> None:
         key = reading.mission_id, reading.sensor_id
-        there = self._waiting.get(key)
+        there = self._readings.get(key)
         if there is None or there.at < reading.at:
-            self._waiting[key] = reading
+            self._readings[key] = reading
 
-    def due(self, now: datetime | None = None) -> dict[str, list[Waiting]]:
-        """The waiting readings by mission; they wait no longer. Those that have become too old are dropped."""
+    def drain(self, now: datetime | None = None) -> dict[str, list[PendingReading]]:
+        """Remove and return the buffered readings, by mission; those that have become too old are dropped."""
         now = now or datetime.now(UTC)
         with self._lock:
-            waiting, self._waiting = self._waiting, {}
-            self._counts.waiting.set(0)
-        by_mission: dict[str, list[Waiting]] = {}
+            waiting, self._readings = self._readings, {}
+            self._metrics.waiting.set(0)
+        by_mission: dict[str, list[PendingReading]] = {}
         for reading in waiting.values():
             if (now - reading.at).total_seconds() > self._configuration.network.max_age_s:
-                self._counts.readings.labels("too_old").inc()
+                self._metrics.readings.labels("too_old").inc()
             else:
                 by_mission.setdefault(reading.mission_id, []).append(reading)
         return by_mission
 
-    def put_back(self, readings: list[Waiting]) -> None:
-        """Let readings wait again, unless newer ones of their sensors wait already."""
+    def put_back(self, readings: list[PendingReading]) -> None:
+        """Buffer readings again, unless newer ones of their sensors are buffered already."""
         with self._lock:
             for reading in readings:
-                self._await(reading)
-            self._counts.waiting.set(len(self._waiting))
+                self._keep_newest(reading)
+            self._metrics.waiting.set(len(self._readings))
 
 
 def _number(fields: Mapping[str, Any], name: str) -> float | None:
