@@ -6,4 +6,4 @@ from simulator.errors import RunFailed
 
 
 class VehicleError(RunFailed):
-    """A vehicle cannot be reached, or did not do what it was told; the text says which and what to do."""
+    """A vehicle cannot be reached or did not carry out a command; the text says which, and what to do."""

@@ -26,7 +26,7 @@ from simulator.errors import INTERRUPTED, UsageError
 from simulator.records.run_folder import DECISIONS, refuse_old_result
 
 if TYPE_CHECKING:
-    from field.vehicles.field_flight import Flown
+    from field.vehicles.field_flight import RealFlight
     from field.vehicles.field_run import FieldJob
     from simulator.sites.site import Site
 
@@ -41,12 +41,12 @@ class Fly:
 
     Each UAV flies the mission that you uploaded to its autopilot, and this program sets its speed: at every waypoint of
     the world (each step_s seconds) it reads the position, hears the sensors' beacons, asks the edge which sensor to
-    collect from and how fast to fly, and reports what came of it. At 0 m/s the UAV holds, then goes on with its
+    collect from and how fast to fly, and reports the outcome. At 0 m/s the UAV holds, then goes on with its
     mission. While the edge is silent the UAV decides on board (EOF).
 
     It never arms, takes off, lands or sends a position: the path is the uploaded mission, and failsafes are the
-    autopilot's. A UAV that somebody else flies (a pilot, a failsafe), that is off its path or outside the world's fence
-    is told nothing until it flies its mission again. Ctrl-C and SIGTERM leave the UAVs on their missions.
+    autopilot's. A UAV that a pilot or a failsafe flies, or that is off its path or outside the world's fence, gets no
+    command until it flies its mission again. Ctrl-C and SIGTERM leave the UAVs on their missions.
 
     Write the plans of a world in the folder `line`, and upload each with QGroundControl:
 
@@ -62,7 +62,7 @@ class Fly:
 
     Written to --out, as by `aicvds simulate`: summary.json, decisions.jsonl (one decision a line, written at once),
     report.html (open it in a browser) and requests.jsonl (for `aicvds replay`). The losses are those that the beacons
-    told of. Ctrl-C and SIGTERM still write the report of the steps flown. The environment variable AICVDS_API_KEY
+    reported. Ctrl-C and SIGTERM still write the report of the steps flown. The environment variable AICVDS_API_KEY
     has the key for an edge that needs one. It needs the extra `mavlink`: pip install 'aic-vds[mavlink]'. Exit code: 0
     flown, 1 no vehicle, 2 bad use, 130 interrupted.
     """
@@ -119,22 +119,22 @@ def fly(options: Fly, command: str, console: Console) -> int:
         UsageError: the options, the world, a vehicle's mission or the folder are unusable.
         VehicleError: a vehicle is not heard, or does not fly its mission.
     """
-    job = job_of(options)
-    from field.vehicles.field_run import FlightCut, conduct_field
+    job = job_from_options(options)
+    from field.vehicles.field_run import FlightInterrupted, run_field_mission
 
     code = 0
-    flown: Flown | None
+    flown: RealFlight | None
     try:
-        flown = asyncio.run(conduct_field(job))
-    except FlightCut as cut:
-        flown, code = cut.flown, INTERRUPTED
+        flown = asyncio.run(run_field_mission(job))
+    except FlightInterrupted as cut:
+        flown, code = cut.flight, INTERRUPTED
         console.print("interrupted; the UAVs are on their missions", highlight=False)
     if flown is not None:
         conclude(flown, job, command, console)
     return code
 
 
-def job_of(options: Fly) -> FieldJob:
+def job_from_options(options: Fly) -> FieldJob:
     """The flight that the options describe; raises ``UsageError`` for the first that is unusable."""
     mission_id = check(options)
     edge = checked_edge(options.edge)
@@ -143,7 +143,7 @@ def job_of(options: Fly) -> FieldJob:
     from field.vehicles.mavlink_vehicle import require_mavsdk
 
     require_mavsdk()
-    site = flown_site(options)
+    site = checked_site(options)
     from field.vehicles.field_run import FieldJob
     from field.vehicles.radio import SIMULATED, radio_named
 
@@ -187,19 +187,21 @@ def check(options: Fly) -> str:
     return options.mission
 
 
-def flown_site(options: Fly) -> Site:
+def checked_site(options: Fly) -> Site:
     """The world; raises ``UsageError`` if it is unusable or has no trajectory for one of the UAVs."""
     site = chosen_site(None, options.world, options.steps)
     last = site.scenario.uavs - len(options.mavlink)
-    of = f"{len(options.mavlink)} connections, and the world has {site.scenario.uavs} trajectories"
+    trajectories = f"the world has {site.scenario.uavs} trajectories"
     if last < 0:
-        raise UsageError(f"--mavlink: there are {of}; leave some out")
+        raise UsageError(f"--mavlink: {len(options.mavlink)} connections, but {trajectories}; leave some out")
     if not 0 <= options.uav <= last:
-        raise UsageError(f"--uav {options.uav}: there are {of}; the first UAV is 0 to {last}")
+        raise UsageError(
+            f"--uav {options.uav}: {trajectories} and --mavlink names {len(options.mavlink)}; choose 0 to {last}"
+        )
     return site
 
 
-def conclude(flown: Flown, job: FieldJob, command: str, console: Console) -> None:
+def conclude(flown: RealFlight, job: FieldJob, command: str, console: Console) -> None:
     """Write a flight's summary and report, and print its outcome; raises ``UsageError``: the folder is unusable."""
     from field.vehicles.simulated_radio import SimulatedRadio
     from simulator.records.real_uavs import RealUavs, sums_by_uav
@@ -220,8 +222,8 @@ def conclude(flown: Flown, job: FieldJob, command: str, console: Console) -> Non
     real = RealUavs(
         uavs=sums_by_uav(flown.decisions),
         late=flown.late,
-        undecided=dict(flown.untold.most_common()),
-        not_carried_out=flown.disobeyed,
+        undecided=dict(flown.undecided.most_common()),
+        not_carried_out=flown.not_carried_out,
         simulated_lost=job.radio.lost if isinstance(job.radio, SimulatedRadio) else None,
     )
     summary = summarise(facts, flown.decisions, tallies).model_copy(update={"real_uavs": real})

@@ -29,20 +29,20 @@ from simulator.world.observation import StepTally
 
 
 @dataclass
-class Flown(Flight):
-    """A flight so far. Its ``tally`` counts a sensor's losses once, when a UAV hears of them; its ``track`` is empty.
+class RealFlight(Flight):
+    """A flight so far; its ``tally`` counts a sensor's losses once, when a beacon reports them, and ``track`` is empty.
 
     Attributes:
-        mode: the mission's at the edge; ``None`` where neither the command nor the edge said it.
+        mode: the mission's at the edge; ``None`` where neither the command nor the edge gave it.
         late: decisions that came after their step.
-        untold: waypoints at which a UAV was told nothing, by the reason.
-        disobeyed: texts of the commands that a vehicle did not carry out.
+        undecided: waypoints at which a UAV got no command, by the reason.
+        not_carried_out: texts of the commands that a vehicle did not carry out.
     """
 
     mode: Mode | None = None
     late: int = 0
-    untold: Counter[str] = field(default_factory=Counter)
-    disobeyed: list[str] = field(default_factory=list)
+    undecided: Counter[str] = field(default_factory=Counter)
+    not_carried_out: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class FieldFlight:
         pilot: decides for them.
         clock: of the mission.
         on_decision: called with each decision once its outcome is known.
-        on_event: called with a UAV's index and a text when it is told nothing, is told something again, or disobeys.
+        on_event: called with a UAV's index and a text when commands to it stop, resume or fail.
     """
 
     def __init__(
@@ -77,51 +77,51 @@ class FieldFlight:
         on_decision: Callable[[Decision], None] = lambda decision: None,
         on_event: Callable[[int, str], None] = lambda uav, text: None,
     ) -> None:
-        self.flown = Flown(site.scenario, None, sensor_xy=np.array(site.scenario.sites))
+        self.result = RealFlight(site.scenario, None, sensor_xy=np.array(site.scenario.sites))
         self._scenario, self._uavs, self._radio, self._pilot = site.scenario, uavs, radio, pilot
         self._clock = clock or MissionClock()
         self._on_decision, self._on_event = on_decision, on_event
-        self._away: dict[int, str | None] = {}
+        self._unavailable_reasons: dict[int, str | None] = {}
         self._counters = LossCounters()
 
-    async def fly(self) -> Flown:
+    async def fly(self) -> RealFlight:
         """Fly the steps, or until every UAV has landed. A cancelled flight ends like a flown one, and then raises."""
         legs: list[_Leg] = []
         took_off = time.monotonic()
         step_s, began = self._scenario.step_s, self._clock.now()
         try:
-            await self._look(step_s)
+            await self._update_uavs(step_s)
             for step in range(self._scenario.steps):
                 if step == 0:
                     await self._listen(0)
                 legs = await self._decide(step, began + step * step_s)
                 if self._clock.now() > began + (step + 1) * step_s:
-                    self.flown.late += len(legs)
+                    self.result.late += len(legs)
                 await self._clock.until(began + (step + 1) * step_s)
-                await self._look(step_s)
+                await self._update_uavs(step_s)
                 await self._collect(legs, step)
                 legs = []
                 if all(uav.landed for uav in self._uavs):
                     break
         finally:
             # If the flight is cut short, the outcomes of its last decisions stay unknown.
-            await self._end()
-            self.flown.mode = self._pilot.mode
-            self.flown.duration_s = time.monotonic() - took_off
-        return self.flown
+            await self._finish()
+            self.result.mode = self._pilot.mode
+            self.result.duration_s = time.monotonic() - took_off
+        return self.result
 
-    async def _look(self, seconds: float) -> None:
-        await asyncio.gather(*(uav.look(seconds) for uav in self._uavs))
+    async def _update_uavs(self, seconds: float) -> None:
+        await asyncio.gather(*(uav.update(seconds) for uav in self._uavs))
 
     async def _decide(self, step: int, since_s: float) -> list[_Leg]:
-        """Decide for the UAVs that fly their missions, and tell them; their waypoint was at ``since_s``."""
-        flying = {uav.index: uav for uav in self._uavs if uav.away is None}
+        """Decide for the UAVs that fly their missions, and command them; their waypoint was at ``since_s``."""
+        flying = {uav.index: uav for uav in self._uavs if uav.unavailable_reason is None}
         for uav in self._uavs:
-            if uav.away is not None:
-                self.flown.untold[uav.away] += 1
-            if uav.away != self._away.get(uav.index):
-                self._on_event(uav.index, uav.away or "it flies its mission")
-            self._away[uav.index] = uav.away
+            if uav.unavailable_reason is not None:
+                self.result.undecided[uav.unavailable_reason] += 1
+            if uav.unavailable_reason != self._unavailable_reasons.get(uav.index):
+                self._on_event(uav.index, uav.unavailable_reason or "it flies its mission")
+            self._unavailable_reasons[uav.index] = uav.unavailable_reason
         choices = await self._pilot.decide({index: uav.observation(step) for index, uav in flying.items()})
         legs = [_Leg(flying[index], choice, flying[index].spot(step)) for index, choice in choices.items()]
         await asyncio.gather(*(self._command(leg, self._clock.now() - since_s) for leg in legs))
@@ -131,15 +131,15 @@ class FieldFlight:
         try:
             await leg.uav.command(leg.choice.velocity, decided_s)
         except VehicleError as error:
-            self.flown.disobeyed.append(str(error))
+            self.result.not_carried_out.append(str(error))
             self._on_event(leg.uav.index, str(error))
 
     async def _collect(self, legs: Sequence[_Leg], step: int) -> None:
-        """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record what came of it."""
+        """Collect in the order of the UAVs, hear the sensors at the next waypoint, and record the outcomes."""
         collected = {}
         for leg in legs:
-            if leg.uav.away in (LINK_LOST, NO_POSITION):
-                leg.uav.expect(leg.choice.velocity, self._scenario.step_s)
+            if leg.uav.unavailable_reason in (LINK_LOST, NO_POSITION):
+                leg.uav.dead_reckon(leg.choice.velocity, self._scenario.step_s)
             collected[leg.uav.index] = await self._radio.collect(leg.uav.spot(step), leg.choice.sensor)
         lost, grown = await self._listen(step + 1)
         for leg in legs:
@@ -160,9 +160,9 @@ class FieldFlight:
                 cost=cost,
                 **exchange_fields(leg.choice.exchange),
             )
-            self.flown.decisions.append(decision)
+            self.result.decisions.append(decision)
             self._on_decision(decision)
-        self.flown.tally.append(self._tally(step, legs, collected, grown))
+        self.result.tally.append(self._tally(step, legs, collected, grown))
 
     def _tally(
         self, step: int, legs: Sequence[_Leg], collected: Mapping[int, Collected], lost: Mapping[int, int]
@@ -191,12 +191,12 @@ class FieldFlight:
         own = {uav.index: uav.heard.hear(step, heard[uav.index]) for uav in self._uavs}
         return own, self._counters.grow(counters)
 
-    async def _end(self) -> None:
+    async def _finish(self) -> None:
         """Let the UAVs go on with their missions, and send the last outcomes."""
         for uav in self._uavs:
-            if uav.away is None:
+            if uav.unavailable_reason is None:
                 try:
-                    await uav.hand_back()
+                    await uav.resume_mission()
                 except VehicleError as error:
-                    self.flown.disobeyed.append(str(error))
+                    self.result.not_carried_out.append(str(error))
         await self._pilot.land()

@@ -31,10 +31,10 @@ class FieldPilot:
 
     Attributes:
         spec: the mission to make at the edge.
-        mode: the mission's, as far as this command or the edge has said it.
+        mode: the mission's, once this command or the edge has given it.
         on_request: called with each request before it is sent.
         last_error: the text of the last failure of asking the edge.
-        outcomes_told: the number of outcomes that the edge has taken.
+        outcomes_sent: the number of outcomes that the edge has accepted.
     """
 
     def __init__(
@@ -50,14 +50,14 @@ class FieldPilot:
         self.mode = mode
         self.on_request: Callable[[DecideRequest], None] = lambda request: None
         self.last_error: str | None = None
-        self.outcomes_told = 0
+        self.outcomes_sent = 0
         self._client, self._mission_id, self._scenario = client, mission_id, scenario
         self._patience_s, self._deadline_ms = patience_s, deadline_ms
         self._fallback = policy_named(FALLBACK)
         self._fallback.reset(scenario, 0)
-        self._owed: dict[int, Outcome] = {}
+        self._pending_outcomes: dict[int, Outcome] = {}
         # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
-        self._undurable: list[Outcome] = []
+        self._unstored_outcomes: list[Outcome] = []
         self._joined = False
 
     async def join(self) -> MissionStatus:
@@ -97,21 +97,21 @@ class FieldPilot:
     def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
         """Store the outcome for this UAV's next request."""
         if choice.exchange is not None:
-            self._owed[uav] = choice.exchange.outcome(cost, failed)
+            self._pending_outcomes[uav] = choice.exchange.outcome(cost, failed)
 
     async def land(self) -> None:
         """Send the outcomes that no later request carried, for as long as the patience lasts."""
         try:
             async with asyncio.timeout(self._patience_s):
-                for outcome in (*self._undurable, *self._owed.values()):
+                for outcome in (*self._unstored_outcomes, *self._pending_outcomes.values()):
                     await self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
-                    self.outcomes_told += outcome in self._owed.values()
+                    self.outcomes_sent += outcome in self._pending_outcomes.values()
         except (EdgeError, TimeoutError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
 
     async def _answer(self, uav: int, observation: Observation) -> Choice | str:
         """The edge's choice, or the reason why there is none."""
-        outcome = self._owed.get(uav)
+        outcome = self._pending_outcomes.get(uav)
         request = decide_request(uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=outcome)
         self.on_request(request)
         try:
@@ -123,10 +123,10 @@ class FieldPilot:
             self._joined = False
             return reason_on_board(error if isinstance(error, EdgeError) else EdgeUnreachable(self.last_error))
         answer = exchange.response
-        if outcome is not None and self._owed.pop(uav, None) is not None:
-            self.outcomes_told += 1
+        if outcome is not None and self._pending_outcomes.pop(uav, None) is not None:
+            self.outcomes_sent += 1
             if not answer.stored:
-                self._undurable.append(outcome)
+                self._unstored_outcomes.append(outcome)
         return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
     async def _ask(self, request: DecideRequest) -> Exchange:
@@ -139,7 +139,7 @@ class FieldPilot:
             # The mission of this ID that it has since may have other sensors.
             if not (refused.mission_unknown or refused.concerns("outcome") or refused.concerns("sensors")):
                 raise
-            self._owed.pop(request.uav_id, None)
+            self._pending_outcomes.pop(request.uav_id, None)
             await self.join()
             exchange = await self._client.decide(request.model_copy(update={"outcome": None}))
         limit = self._scenario.max_velocity

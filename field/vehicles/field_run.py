@@ -11,13 +11,13 @@ from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextma
 from dataclasses import dataclass
 from pathlib import Path
 
-from field.vehicles.field_flight import FieldFlight, Flown
+from field.vehicles.field_flight import FieldFlight, RealFlight
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.mavlink_vehicle import mavlink_vehicle
 from field.vehicles.mission_clock import MissionClock
 from field.vehicles.radio import Radio
-from field.vehicles.take_off import await_missions
+from field.vehicles.take_off import wait_for_missions
 from field.vehicles.uploaded_path import check_uploaded
 from shared.client.edge_client import API_KEY, AsyncEdgeClient
 from shared.client.errors import EdgeError
@@ -52,15 +52,15 @@ class FieldJob:
     wait_s: float
 
 
-class FlightCut(Exception):
-    """The flight was ended by a signal; ``flown`` is what had been flown, ``None`` before the first waypoint."""
+class FlightInterrupted(Exception):
+    """The flight was ended by a signal; ``flight`` is the part flown, ``None`` before the first waypoint."""
 
-    def __init__(self, flown: Flown | None) -> None:
+    def __init__(self, flight: RealFlight | None) -> None:
         super().__init__()
-        self.flown = flown
+        self.flight = flight
 
 
-async def conduct_field(job: FieldJob) -> Flown:
+async def run_field_mission(job: FieldJob) -> RealFlight:
     """Connect to the vehicles, wait until they fly their missions, fly, and write the log as it happens.
 
     SIGINT and SIGTERM end the flight after the present commands; vehicles that wait are sent on.
@@ -68,34 +68,34 @@ async def conduct_field(job: FieldJob) -> Flown:
     Raises:
         UsageError: a connection, a vehicle's mission or the folder is unusable.
         VehicleError: a vehicle is not heard, or does not fly its mission.
-        FlightCut: a signal ended the flight.
+        FlightInterrupted: a signal ended the flight.
     """
     flight: FieldFlight | None = None
     try:
-        with signals_cancel():
+        with cancel_on_signals():
             async with AsyncExitStack() as stack:
-                uavs = [await stack.enter_async_context(connected(job, number)) for number in range(len(job.mavlink))]
+                uavs = [await stack.enter_async_context(connect_uav(job, number)) for number in range(len(job.mavlink))]
                 client = await stack.enter_async_context(edge_client(job))
                 pilot = FieldPilot(client, job.mission_id, job.site.scenario, job.patience_s, job.mode, job.deadline_ms)
-                await join(pilot, job)
-                logs = stack.enter_context(opened_logs(job, pilot))
-                await await_missions(uavs, job.wait_s, lambda uav, why: tell(f"waiting for UAV {uav}: {why}"))
+                await join_mission(pilot, job)
+                logs = stack.enter_context(open_logs(job, pilot))
+                await wait_for_missions(uavs, job.wait_s, lambda uav, why: print_line(f"waiting for UAV {uav}: {why}"))
                 flight = FieldFlight(
                     job.site, uavs, job.radio, pilot, MissionClock(job.speedup),
-                    lambda decision: record(decision, logs), lambda uav, text: tell(f"UAV {uav}: {text}"),
+                    lambda decision: log_decision(decision, logs), lambda uav, text: print_line(f"UAV {uav}: {text}"),
                 )  # fmt: skip
                 flown = await flight.fly()
                 if pilot.last_error is not None:
-                    tell(f"the edge's last failure: {pilot.last_error}")
+                    print_line(f"the edge's last failure: {pilot.last_error}")
                 return flown
     except asyncio.CancelledError:
         if flight is not None:
-            flight.flown.interrupted = True
-        raise FlightCut(None if flight is None else flight.flown) from None
+            flight.result.interrupted = True
+        raise FlightInterrupted(None if flight is None else flight.result) from None
 
 
 @asynccontextmanager
-async def connected(job: FieldJob, number: int) -> AsyncIterator[FieldUav]:
+async def connect_uav(job: FieldJob, number: int) -> AsyncIterator[FieldUav]:
     """The UAV at one of the job's connections, its mission checked."""
     index = job.first_uav + number
     async with mavlink_vehicle(job.mavlink[number], job.wait_s) as vehicle:
@@ -108,18 +108,18 @@ def edge_client(job: FieldJob) -> AsyncEdgeClient:
     return AsyncEdgeClient(job.edge, timeout_s=job.patience_s, attempts=2, api_key=os.environ.get(API_KEY) or None)
 
 
-async def join(pilot: FieldPilot, job: FieldJob) -> None:
+async def join_mission(pilot: FieldPilot, job: FieldJob) -> None:
     """Make or find the mission at the edge; without an edge the UAVs begin on board."""
     try:
         status = await pilot.join()
         pilot.spec = resolved(pilot.spec, status)
-        tell(f"mission {job.mission_id}, mode {status.mode}; watch it at {job.edge}/?mission={job.mission_id}")
+        print_line(f"mission {job.mission_id}, mode {status.mode}; watch it at {job.edge}/?mission={job.mission_id}")
     except EdgeError as error:
-        tell(f"{error}; the UAVs decide on board until it answers")
+        print_line(f"{error}; the UAVs decide on board until it answers")
 
 
 @contextmanager
-def opened_logs(job: FieldJob, pilot: FieldPilot) -> Iterator[DecisionLog]:
+def open_logs(job: FieldJob, pilot: FieldPilot) -> Iterator[DecisionLog]:
     """The log of decisions; requests are logged as they are sent."""
     fresh_folder(job.out)
     with ExitStack() as stack:
@@ -130,24 +130,24 @@ def opened_logs(job: FieldJob, pilot: FieldPilot) -> Iterator[DecisionLog]:
         yield decisions
 
 
-def record(decision: Decision, log: DecisionLog) -> None:
+def log_decision(decision: Decision, log: DecisionLog) -> None:
     """Write and show a decision."""
     log.append(decision)
     d = decision
     by = d.source if d.reason is None else f"{d.source}, {d.reason}"
-    tell(
+    print_line(
         f"step {d.step}, UAV {d.uav_id}: sensor {d.sensor_id} at {d.velocity} m/s ({by}), "
         f"{'failed' if d.failed else f'{d.collected} packets'}, cost {d.cost:.2f}"
     )
 
 
-def tell(text: str) -> None:
+def print_line(text: str) -> None:
     """Print a line of the flight to stderr, at once."""
     print(text, file=sys.stderr, flush=True)
 
 
 @contextmanager
-def signals_cancel() -> Iterator[None]:
+def cancel_on_signals() -> Iterator[None]:
     """Within the context SIGINT and SIGTERM cancel the present task."""
     loop, task = asyncio.get_running_loop(), asyncio.current_task()
     assert task is not None, "a coroutine runs in a task"

@@ -1,4 +1,4 @@
-"""One UAV of a flight: its vehicle, its path, what it heard, and whether it may be told anything now."""
+"""One UAV of a flight: its vehicle, its path, what it heard, and whether it can be commanded now."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from shared.world.trajectory import trajectories
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 
-# Farther from its trajectory than this a UAV is told nothing.
+# Farther from its trajectory than this a UAV gets no command.
 OFF_PATH_M = 100.0
 # Below this height above its take-off place a UAV has not taken off, or lands.
 AIRBORNE_M = 5.0
@@ -28,23 +28,23 @@ LINK_LOST = "the link is lost"
 NO_POSITION = "its heartbeat arrives, but no position, which was asked for"
 # Below this speed a UAV waits in place instead, m/s.
 LEAST_SPEED_M_S = 0.5
-# The mode comes with the heartbeat, once a second: after a command of its own the flight reads the old one so long.
+# The mode comes with the heartbeat, once a second: so long after its own command the flight still reads the old mode.
 MODE_LAG_S = 2.5
 
 
 class FieldUav:
     """A UAV on its mission.
 
-    A UAV that somebody else flies is told nothing: the pilot, a failsafe, or an autopilot that has landed it. The same
-    holds for one that is lost, off its path or outside the fence, and until it has climbed to the height of its path.
+    A UAV gets no command while a pilot, a failsafe or a landing has control of it, while its link is lost, while it is
+    off its path or outside the fence, and until it has climbed to the height of its path.
 
     Args:
         height_m: of its lowest waypoint above the take-off place; infinite where that is unknown.
 
     Attributes:
         index: among the world's trajectories.
-        waits: whether it was told to wait in place, by this flight.
-        away: why it is told nothing now; ``None`` while it flies its mission.
+        waits: whether this flight commanded it to wait in place.
+        unavailable_reason: why it gets no command now; ``None`` while it flies its mission.
         landed: whether it has ended its mission for good.
     """
 
@@ -52,7 +52,7 @@ class FieldUav:
         self.index, self.vehicle = index, vehicle
         self.waits = False
         self.landed = False
-        self.away: str | None = "no telemetry yet"
+        self.unavailable_reason: str | None = "no telemetry yet"
         self._site = site
         self._follower = PathFollower(trajectories(site.scenario)[index], float(site.scenario.max_velocity))
         self._here: Point = (0.0, 0.0)
@@ -62,18 +62,20 @@ class FieldUav:
         self._climbs_at: Point | None = None
         self._begun = False
         # Since the last position that was near its trajectory.
-        self._unseen_s = 0.0
+        self._since_located_s = 0.0
         self._mode_changed_s = -math.inf
         # The last commanded ground speed, m/s; unknown before the first command.
         self._speed: float | None = None
         self.heard = HeardBeacons(np.array(site.scenario.sites))
 
-    async def look(self, seconds: float) -> None:
-        """Take the newest telemetry, that many seconds after the last."""
-        self._unseen_s += seconds
+    async def update(self, seconds: float) -> None:
+        """Read the newest telemetry, that many seconds after the last."""
+        self._since_located_s += seconds
         state = await self.vehicle.state()
-        self.away = self._taken(state) or self._misplaced(state.position) or self._climbing(state.height_m)
-        if self.away is None and state.mode == "mission" and not self._mode_is_old:
+        self.unavailable_reason = (
+            self._control_fault(state) or self._position_fault(state.position) or self._climb_fault(state.height_m)
+        )
+        if self.unavailable_reason is None and state.mode == "mission" and not self._mode_is_old:
             # The pilot may have resumed the mission too.
             self.waits = False
 
@@ -82,11 +84,11 @@ class FieldUav:
         return Spot(self.index, step, self._here, self._degrees)
 
     def observation(self, step: int) -> Observation:
-        """What it knows."""
+        """The observation from the beacons that it heard."""
         return self.heard.observation(step, self._here, self._follower.progress_m or 0.0)
 
-    def expect(self, velocity: int, seconds: float) -> None:
-        """Reckon with the position that it should have now; for a UAV whose telemetry has stopped."""
+    def dead_reckon(self, velocity: int, seconds: float) -> None:
+        """Assume the position along its path after these seconds; for a UAV whose telemetry has stopped."""
         assert self._site.frame is not None, "a site with vehicles has a place on the globe"
         self._here = self._follower.ahead(velocity * seconds)
         longitude, latitude = self._site.frame.degrees([self._here])[0].tolist()
@@ -101,19 +103,19 @@ class FieldUav:
                 commanded speed makes up for the difference. A speed below ``LEAST_SPEED_M_S`` is a wait in place.
 
         Raises:
-            VehicleError: the vehicle did not do it, or is not to be told: somebody took it over during the decision.
+            VehicleError: the vehicle did not carry it out, or a pilot or failsafe took control during the decision.
         """
         speed = self._speed_for(velocity, decided_s)
-        why = self._taken(await self.vehicle.state())
+        why = self._control_fault(await self.vehicle.state())
         if why is not None:
-            raise VehicleError(f"{self.vehicle.name} was not told to fly at {speed:g} m/s: {why}")
+            raise VehicleError(f"{self.vehicle.name} got no command to fly at {speed:g} m/s: {why}")
         if speed < LEAST_SPEED_M_S:
             if not self.waits:
                 await self.vehicle.hold()
                 self.waits, self._mode_changed_s = True, time.monotonic()
             return
         # Some autopilots forget the speed when the mode changes.
-        await self.hand_back()
+        await self.resume_mission()
         await self.vehicle.set_speed(speed)
         self._speed = speed
 
@@ -127,7 +129,7 @@ class FieldUav:
         speed = (velocity * world.step_s - last * decided_s) / left_s
         return round(min(max(speed, 0.0), float(world.max_velocity)), 2)
 
-    async def hand_back(self) -> None:
+    async def resume_mission(self) -> None:
         """Let it go on with its mission if this flight made it wait; raises :class:`VehicleError`."""
         if self.waits:
             await self.vehicle.resume()
@@ -137,8 +139,8 @@ class FieldUav:
     def _mode_is_old(self) -> bool:
         return time.monotonic() - self._mode_changed_s < MODE_LAG_S
 
-    def _taken(self, state: VehicleState) -> str | None:
-        """Why the UAV is told nothing wherever it is, or ``None``."""
+    def _control_fault(self, state: VehicleState) -> str | None:
+        """Why the UAV gets no command, whatever its position, or ``None``."""
         if not state.connected:
             return LINK_LOST
         if state.position is None:
@@ -147,7 +149,7 @@ class FieldUav:
             self.landed = True
             return "it lands" if state.armed else "it is not armed"
         if state.mode != "mission" and not (state.mode == "hold" and (self.waits or self._mode_is_old)):
-            # Whoever flies it now decides when its mission goes on.
+            # The pilot who flies it now decides when its mission goes on.
             self.waits = False
             return "it does not fly its mission"
         if state.height_m < AIRBORNE_M:
@@ -155,8 +157,8 @@ class FieldUav:
             return "it is on the ground"
         return None
 
-    def _climbing(self, height_m: float) -> str | None:
-        """Why the UAV is told nothing before it flies along its path, or ``None``; it was located."""
+    def _climb_fault(self, height_m: float) -> str | None:
+        """Why the UAV gets no command before it flies along its path, or ``None``; its position is known."""
         self._climbs_at = self._climbs_at or self._here
         moved_m = math.dist(self._here, self._climbs_at)
         self._begun = self._begun or height_m >= _BEGUN_SHARE * self._height_m or moved_m >= _BEGUN_M
@@ -164,16 +166,16 @@ class FieldUav:
             return None
         return f"it climbs to {self._height_m:.0f} m" if math.isfinite(self._height_m) else "it climbs"
 
-    def _misplaced(self, degrees: Point | None) -> str | None:
-        """Why the UAV is told nothing at this position, or ``None``."""
+    def _position_fault(self, degrees: Point | None) -> str | None:
+        """Why the UAV gets no command at this position, or ``None``."""
         assert self._site.frame is not None, "a site with vehicles has a place on the globe"
         assert degrees is not None, "without a position the link counts as lost"
         x, y = self._site.frame.metres([degrees])[0].tolist()
         self._here, self._degrees = (x, y), degrees
         if not all(fence.allows(self._here) for fence in self._site.fences):
             return "it is outside the fence"
-        gap = self._follower.follow(self._here, self._unseen_s)
+        gap = self._follower.follow(self._here, self._since_located_s)
         if gap > OFF_PATH_M:
             return "it is off its path"
-        self._unseen_s = 0.0
+        self._since_located_s = 0.0
         return None

@@ -112,7 +112,7 @@ class MavlinkVehicle:
     async def ask_for_positions(self, ended: asyncio.Event) -> None:
         """Ask for positions whenever none has come for a second, until the flight has ended.
 
-        A denied or unanswered request is no failure: the positions tell whether it was obeyed.
+        A denied or unanswered request is no failure: arriving positions show whether it took effect.
         """
         from mavsdk.asyncio import MavsdkError
 
@@ -139,23 +139,23 @@ class MavlinkVehicle:
 
     async def mission(self) -> list[MissionItem]:
         """The mission on board, without ArduPilot's home."""
-        items = await self._told("give its mission", self._mission.download_mission())
+        items = await self._command("give its mission", self._mission.download_mission())
         flown = items[1:] if self._home_is_first else items
         return [_item(item) for item in flown]
 
     async def set_speed(self, speed_m_s: float) -> None:
         """``MAV_CMD_DO_CHANGE_SPEED``, ground speed."""
-        await self._told(f"fly at {speed_m_s:g} m/s", self._action.set_current_speed(speed_m_s))
+        await self._command(f"fly at {speed_m_s:g} m/s", self._action.set_current_speed(speed_m_s))
 
     async def hold(self) -> None:
         """Mode hold."""
-        await self._told("hold", self._mission.pause_mission())
+        await self._command("hold", self._mission.pause_mission())
 
     async def resume(self) -> None:
         """Mode mission."""
-        await self._told("go on with its mission", self._mission.start_mission())
+        await self._command("go on with its mission", self._mission.start_mission())
 
-    async def _told(self, what: str, doing: Any) -> Any:
+    async def _command(self, what: str, doing: Any) -> Any:
         from mavsdk.asyncio import MavsdkError
 
         try:

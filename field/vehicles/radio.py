@@ -1,4 +1,4 @@
-"""The data link to the ground sensors, which MAVLink does not have: what an operator's own radio has to do."""
+"""The interface of the data link to the ground sensors, which MAVLink does not have."""
 
 from __future__ import annotations
 

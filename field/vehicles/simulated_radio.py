@@ -1,4 +1,4 @@
-"""Simulated sensors and their radios, for trials: the vehicles are real, what they collect is not."""
+"""Simulated sensors and their radios, for trials: the vehicles are real, the packets are not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SimulatedRadio:
         return {j: self._beacon(j, float(gain[j])) for j in heard}
 
     async def collect(self, spot: Spot, sensor: int) -> Collected:
-        """One step's packets, if the link holds and the sensor served nobody in this step."""
+        """One step's packets, if the link carries data and the sensor has served no UAV in this step."""
         self._arrive(spot.step)
         distance = self._distances(spot.position)[sensor]
         moved = None

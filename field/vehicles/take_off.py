@@ -12,7 +12,7 @@ from field.vehicles.field_uav import FieldUav
 POLL_S = 0.2
 
 
-async def await_missions(
+async def wait_for_missions(
     uavs: Sequence[FieldUav], wait_s: float, on_wait: Callable[[int, str], None] = lambda uav, why: None
 ) -> None:
     """Wait until each UAV is in the air and flies its mission.
@@ -25,16 +25,16 @@ async def await_missions(
         VehicleError: after ``wait_s`` seconds one still does not; the text says why.
     """
     ends = time.monotonic() + wait_s
-    told: dict[int, str] = {}
+    reported: dict[int, str] = {}
     while True:
-        await asyncio.gather(*(uav.look(POLL_S) for uav in uavs))
-        waiting = {uav.index: (uav, uav.away) for uav in uavs if uav.away is not None}
+        await asyncio.gather(*(uav.update(POLL_S) for uav in uavs))
+        waiting = {uav.index: (uav, uav.unavailable_reason) for uav in uavs if uav.unavailable_reason is not None}
         if not waiting:
             return
         for index, (uav, why) in waiting.items():
             uav.landed = False
-            if why is not None and told.get(index) != why:
-                told[index] = why
+            if why is not None and reported.get(index) != why:
+                reported[index] = why
                 on_wait(index, why)
             if time.monotonic() >= ends:
                 raise VehicleError(

@@ -1,4 +1,4 @@
-"""What the flight of real UAVs needs of a vehicle and of its autopilot."""
+"""The interface of a vehicle and its autopilot that the flight of real UAVs uses."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class VehicleState:
 
 
 class Vehicle(Protocol):
-    """A vehicle with an autopilot that has a mission. It is told nothing but a speed, to wait, and to go on.
+    """A vehicle with an autopilot that has a mission. The commands are a speed, wait, and go on.
 
     Every method may raise :class:`simulator.errors.VehicleError`.
     """

@@ -35,7 +35,7 @@ def refused(out: Path, **changes: str | None) -> str:
         ("mission", "a b", "--mission 'a b': use letters"),
         ("world", None, "--world is missing: give the folder"),
         ("world", "/nowhere", "--world /nowhere is no folder"),
-        ("uav", "3", "--uav 3: there are 1 connections, and the world has 3 trajectories; the first UAV is 0 to 2"),
+        ("uav", "3", "--uav 3: the world has 3 trajectories and --mavlink names 1; choose 0 to 2"),
         ("speedup", "0", "--speedup 0 is not between 0.1 and 100.0"),
         ("patience_s", "11", "--patience-s 11 is not between 0.05 and 10.0"),
         ("deadline_ms", "5", "--deadline-ms 5 is not between 10 and 60000"),

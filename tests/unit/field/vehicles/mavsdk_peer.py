@@ -21,7 +21,7 @@ SPEED, SET_MODE = 178, 176
 
 
 class MavsdkPeer:
-    """A vehicle that sends to a UDP port of loopback. MAVSDK's action server denies mode hold, whatever it is told.
+    """A vehicle that sends to a UDP port of loopback. MAVSDK's action server denies mode hold, whatever it receives.
 
     Attributes:
         received: names and fields of all messages that came, without heartbeats.
@@ -61,10 +61,10 @@ class MavsdkPeer:
 
     def commands(self) -> list[tuple[int, float]]:
         """The commands that fly it: number, and speed or PX4 sub-mode."""
-        told = [fields for name, fields in self.received if name in ("COMMAND_LONG", "COMMAND_INT")]
+        commands = [fields for name, fields in self.received if name in ("COMMAND_LONG", "COMMAND_INT")]
         return [
             (fields["command"], fields["param2"] if fields["command"] == SPEED else fields["param3"])
-            for fields in told
+            for fields in commands
             if fields["command"] in (SPEED, SET_MODE)
         ]
 

@@ -28,17 +28,17 @@ class SimulatedClock(Clock):
 
 
 class StubVehicle:
-    """Flies its trajectory at the speed that it is told, times ``wind``.
+    """Flies its trajectory at the speed that it is commanded, times ``wind``.
 
     Attributes:
-        told: every command.
+        commands: every command.
         lands_at_s: from then on it lands.
         shift_m: how far north of its path it reports itself.
     """
 
     def __init__(self, site: Site, uav: int, clock: SimulatedClock, wind: float = 1.0) -> None:
         self.name = f"stub {uav}"
-        self.told: list[str | float] = []
+        self.commands: list[str | float] = []
         self.lands_at_s = float("inf")
         self.shift_m = 0.0
         self.deaf = False
@@ -77,7 +77,7 @@ class StubVehicle:
 
     def _obey(self, command: str | float) -> None:
         self._advance()
-        self.told.append(command)
+        self.commands.append(command)
         if self.deaf:
             raise VehicleError(f"{self.name} did not do {command}: TIMEOUT")
 

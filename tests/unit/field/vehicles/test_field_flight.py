@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from field.errors import VehicleError
-from field.vehicles.field_flight import FieldFlight, Flown
+from field.vehicles.field_flight import FieldFlight, RealFlight
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.radio import Beacon, Collected, Radio, Spot, radio_named
@@ -46,7 +46,7 @@ class Trial:
         self.requests: list[DecideRequest] = []
         self.last_error: str | None = None
 
-    async def fly(self, url: str, on_decision: object = None, attempts: int = 2) -> Flown:
+    async def fly(self, url: str, on_decision: object = None, attempts: int = 2) -> RealFlight:
         def decided(decision: Decision) -> None:
             if callable(on_decision):
                 on_decision(decision)
@@ -78,13 +78,15 @@ async def test_the_edge_decides_every_waypoint_and_hears_every_outcome(edge: Edg
     with EdgeClient(url) as operator:
         status = operator.mission("field")
     assert (status.decisions, status.feedback) == (3 * STEPS, 3 * STEPS)
-    assert sum(d.collected for d in flown.decisions) > 0 and flown.late == 0 and not flown.untold
+    assert sum(d.collected for d in flown.decisions) > 0 and flown.late == 0 and not flown.undecided
     assert flown.mode == "policy" and flown.steps_flown == STEPS
     assert isinstance(trial.radio, SimulatedRadio)
     assert sum(t.lost_packets for t in flown.tally) <= trial.radio.lost
     for uav, vehicle in enumerate(trial.vehicles):
         own = [d for d in flown.decisions if d.uav_id == uav]
-        assert [told for told in vehicle.told if isinstance(told, float)] == [d.velocity for d in own if d.velocity]
+        assert [command for command in vehicle.commands if isinstance(command, float)] == [
+            d.velocity for d in own if d.velocity
+        ]
         assert vehicle.mode == "mission"
         for decision in own:
             assert trajectories(trial.site.scenario)[uav].locate(decision.position)[1] < 0.1
@@ -108,39 +110,39 @@ async def test_the_speed_makes_up_for_the_time_of_the_decision(
 ) -> None:
     trial = Trial()
     uav, vehicle, clock = trial.uavs[0], trial.vehicles[0], trial.clock
-    await uav.look(10.0)
+    await uav.update(10.0)
     await uav.command(10)
     await clock.until(10.0)
-    await uav.look(10.0)
+    await uav.update(10.0)
     assert vehicle.flown_m == pytest.approx(100.0)
     await clock.until(12.0)
     await uav.command(velocity, decided_s=2.0)
     await clock.until(20.0)
     await vehicle.state()
-    assert vehicle.told[-1] == commanded
+    assert vehicle.commands[-1] == commanded
     assert vehicle.flown_m == pytest.approx(100.0 + flown_m)
 
 
 async def test_a_uav_that_waited_during_the_decision_flies_faster_after_it() -> None:
     trial = Trial()
     uav, vehicle, clock = trial.uavs[0], trial.vehicles[0], trial.clock
-    await uav.look(10.0)
+    await uav.update(10.0)
     await uav.command(0)
     await clock.until(12.0)
     await uav.command(8, decided_s=2.0)
     await clock.until(20.0)
     await vehicle.state()
-    assert vehicle.told == ["hold", "resume", 10.0]
+    assert vehicle.commands == ["hold", "resume", 10.0]
     assert vehicle.flown_m == pytest.approx(80.0)
 
 
 async def test_the_first_speed_and_that_of_a_late_decision_are_the_decided_ones() -> None:
     trial = Trial()
     uav, vehicle = trial.uavs[0], trial.vehicles[0]
-    await uav.look(10.0)
+    await uav.update(10.0)
     await uav.command(6, decided_s=2.0)
     await uav.command(9, decided_s=10.0)
-    assert vehicle.told == [6.0, 9.0]
+    assert vehicle.commands == [6.0, 9.0]
 
 
 class Counting:
@@ -214,20 +216,20 @@ async def test_against_the_wind_the_progress_is_the_true_one() -> None:
         assert path.at(request.progress_m) == pytest.approx(request.position, abs=1.0)
 
 
-async def test_who_lands_is_told_nothing_more_and_the_others_fly_on() -> None:
+async def test_a_uav_that_lands_gets_no_more_commands_and_the_others_fly_on() -> None:
     trial = Trial()
     trial.vehicles[1].lands_at_s = 35.0
     flown = await trial.fly(nobody(), attempts=1)
     assert [d.step for d in flown.decisions if d.uav_id == 1] == [0, 1, 2, 3]
-    assert flown.untold == {"it lands": STEPS - 4} and (1, "it lands") in trial.events
+    assert flown.undecided == {"it lands": STEPS - 4} and (1, "it lands") in trial.events
     assert len([d for d in flown.decisions if d.uav_id != 1]) == 2 * STEPS
 
 
-async def test_who_is_off_its_path_or_outside_the_fence_is_told_nothing() -> None:
+async def test_a_uav_off_its_path_or_outside_the_fence_gets_no_command() -> None:
     trial = Trial()
     trial.vehicles[0].shift_m = 150.0
     flown = await trial.fly(nobody(), attempts=1)
-    assert trial.vehicles[0].told == [] and flown.untold == {"it is off its path": STEPS}
+    assert trial.vehicles[0].commands == [] and flown.undecided == {"it is off its path": STEPS}
 
 
 async def test_the_simulated_sensors_are_those_of_simulate() -> None:
@@ -261,27 +263,27 @@ async def test_the_simulated_sensors_are_those_of_simulate() -> None:
 async def test_a_pilot_who_takes_a_waiting_uav_over_keeps_it() -> None:
     trial = Trial()
     uav, vehicle = trial.uavs[0], trial.vehicles[0]
-    await uav.look(0.0)
+    await uav.update(0.0)
     await uav.command(0)
     vehicle.mode = "other"
-    await uav.look(10.0)
-    assert uav.away == "it does not fly its mission"
-    await uav.hand_back()
-    assert vehicle.told == ["hold"]
+    await uav.update(10.0)
+    assert uav.unavailable_reason == "it does not fly its mission"
+    await uav.resume_mission()
+    assert vehicle.commands == ["hold"]
     vehicle.mode = "mission"
-    await uav.look(10.0)
-    assert uav.away is None
+    await uav.update(10.0)
+    assert uav.unavailable_reason is None
     vehicle.mode = "other"
-    with pytest.raises(VehicleError, match="stub 0 was not told to fly at 0 m/s: it does not fly its mission"):
+    with pytest.raises(VehicleError, match="stub 0 got no command to fly at 0 m/s: it does not fly its mission"):
         await uav.command(0)
-    assert vehicle.told == ["hold"]
+    assert vehicle.commands == ["hold"]
 
 
-async def test_a_command_that_is_not_carried_out_is_told() -> None:
+async def test_a_command_that_is_not_carried_out_is_reported() -> None:
     trial = Trial()
     trial.vehicles[2].deaf = True
     flown = await trial.fly(nobody(), attempts=1)
-    assert len(flown.disobeyed) == STEPS and (2, "stub 2 did not do 7.0: TIMEOUT") in trial.events
+    assert len(flown.not_carried_out) == STEPS and (2, "stub 2 did not do 7.0: TIMEOUT") in trial.events
     assert len(flown.decisions) == 3 * STEPS
 
 

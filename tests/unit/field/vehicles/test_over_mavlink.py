@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from field.errors import VehicleError
-from field.vehicles.field_run import FieldJob, conduct_field
+from field.vehicles.field_run import FieldJob, run_field_mission
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
 from field.vehicles.simulated_radio import SimulatedRadio
-from field.vehicles.take_off import await_missions
+from field.vehicles.take_off import wait_for_missions
 from field.vehicles.uploaded_path import check_uploaded
 from shared.client.edge_client import EdgeClient
 from simulator.commands.replay import logged_mission
@@ -106,21 +106,21 @@ def test_a_vehicle_of_mavsdk_flies_as_the_edge_decides(
     commanded = Commanded(monkeypatch)
     url = str(edge(mode="policy").base_url).rstrip("/")
     with mavsdk_peer(missions[0], port, speedup=20.0, start_m=300.0) as peer:
-        flown = asyncio.run(conduct_field(patient_job(port, url, tmp_path, steps=8)))
+        flown = asyncio.run(run_field_mission(patient_job(port, url, tmp_path, steps=8)))
         decisions = read_decisions(tmp_path / "decisions.jsonl")
         # MAVSDK hands on a message after it has obeyed it.
         until(lambda: len(once(peer.commands())) >= len(once(commanded.all)))
         received = list(peer.received)
     assert [(d.step, d.source) for d in decisions] == [(step, "policy") for step in range(8)]
-    assert decisions == flown.decisions and not flown.untold
+    assert decisions == flown.decisions and not flown.undecided
     assert once(peer.commands()) == once(commanded.all)
     first = decisions[0].velocity
     assert len(commanded.all) <= len(decisions)
     assert commanded.all[0] == ((SPEED, first) if first else (SET_MODE, 3.0))
     assert {kind for kind, _ in commanded.all} <= {SPEED, SET_MODE} and max(speed for _, speed in commanded.all) <= 14
-    assert len(flown.disobeyed) == commanded.all.count((SET_MODE, 3.0)), "MAVSDK's action server denies hold"
-    told = [fields for name, fields in received if name.startswith("COMMAND")]
-    assert {fields["command"] for fields in told} <= HARMLESS
+    assert len(flown.not_carried_out) == commanded.all.count((SET_MODE, 3.0)), "MAVSDK's action server denies hold"
+    commands = [fields for name, fields in received if name.startswith("COMMAND")]
+    assert {fields["command"] for fields in commands} <= HARMLESS
     assert {name for name, _ in received} <= {
         "COMMAND_LONG", "PING", "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_REQUEST_LIST", "MISSION_REQUEST_INT",
         "MISSION_ACK",
@@ -168,7 +168,7 @@ def test_the_wire_by_pymavlink_positions_speeds_and_a_lost_link(
 
 
 async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> None:
-    """A UAV holds at 0 m/s and goes on; one that a pilot holds, that left its path, or that lands is told nothing."""
+    """A UAV holds at 0 m/s and goes on; one that a pilot holds, that left its path, or that lands gets no command."""
     with pymavlink_peer(missions[0], port, start_m=200.0) as peer:
         async with mavlink_vehicle(f"udpin://127.0.0.1:{port}", PATIENCE_S) as vehicle:
             uav = FieldUav(0, vehicle, site_from_folder(EXAMPLE))
@@ -176,8 +176,8 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
             async def becomes(away: str | None) -> None:
                 async with asyncio.timeout(PATIENCE_S):
                     while True:
-                        await uav.look(0.1)
-                        if uav.away == away:
+                        await uav.update(0.1)
+                        if uav.unavailable_reason == away:
                             return
                         await asyncio.sleep(0.05)
 
@@ -187,8 +187,8 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
             await uav.command(0)
             await uav.command(9)
             assert (peer.airframe.mode, peer.airframe.speed) == ("mission", 9.0)
-            told = once((m.command, m.param2 if m.command == SPEED else m.param3) for _, m in peer.commands())
-            assert told == [(SET_MODE, 3.0), (SET_MODE, 4.0), (SPEED, 9.0)]
+            commands = once((m.command, m.param2 if m.command == SPEED else m.param3) for _, m in peer.commands())
+            assert commands == [(SET_MODE, 3.0), (SET_MODE, 4.0), (SPEED, 9.0)]
             count = len(peer.commands())
             peer.airframe.drift_m = 150.0
             await becomes("it is off its path")
@@ -204,8 +204,8 @@ async def test_who_flies_the_vehicle(missions: list[list[Item]], port: int) -> N
 async def becomes(uav: FieldUav, away: str | None) -> None:
     async with asyncio.timeout(PATIENCE_S):
         while True:
-            await uav.look(0.1)
-            if uav.away == away:
+            await uav.update(0.1)
+            if uav.unavailable_reason == away:
                 return
             await asyncio.sleep(0.05)
 
@@ -244,7 +244,7 @@ async def test_decisions_begin_at_the_height_of_the_path_or_on_the_way(missions:
             peer.airframe.climbs_m = 6.0
             await becomes(uav, "it climbs to 100 m")
             with pytest.raises(VehicleError, match="does not fly its mission: it climbs"):
-                await await_missions([uav], wait_s=0.3)
+                await wait_for_missions([uav], wait_s=0.3)
             peer.airframe.climbs_m = 92.0
             await becomes(uav, None)
             # A descent on the way is none to the ground.
