@@ -22,7 +22,7 @@ help:
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
 	@echo "make bench     measure the edge and its LLM, side by side with others: runs/*.json"
-	@echo "make faults    fail, kill and starve real processes, and write docs/faults.md: 10 minutes"
+	@echo "make faults    fail, kill and starve real processes, and write docs/results/faults.md: 10 minutes"
 	@echo "make fuzz      send 10,000 requests that schemathesis generates, with keys and without: none may break the edge"
 	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
 	@echo "make compose   build the containers and fly a mission in them (needs a Docker engine)"
@@ -65,7 +65,7 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# The figures in docs/benchmarks.md have more rounds. These took 15:27 on a slow day, with two more rounds of startup.py, 20 s each.
+# The figures in docs/results/benchmarks.md have more rounds. These took 15:27 on a slow day, with two more rounds of startup.py, 20 s each.
 bench: install
 	$(BIN)/python benchmarks/startup.py --rounds 3
 	$(BIN)/python benchmarks/overhead.py --rounds 5

@@ -82,7 +82,7 @@ class Fly:
     radio: Annotated[str, arg(metavar="simulated|MODULE:NAME")] = "simulated"
     """The link to the ground sensors, which MAVLink does not have. simulated: sensors made up as `aicvds simulate`
     does, for trials. MODULE:NAME: your own, a callable that takes the site and returns a Radio
-    (field/vehicles/radio.py; docs/your-uav.md has an example)."""
+    (field/vehicles/radio.py; docs/guides/uav.md has an example)."""
     seed: Annotated[int, arg(metavar="N")] = 0
     """Seed of the simulated sensors, 0 to 4294967295."""
     mode: Annotated[Mode | None, arg(metavar="guided|llm|value|policy", help_behavior_hint="")] = None

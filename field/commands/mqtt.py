@@ -26,7 +26,7 @@ class Mqtt:
 
     Subscribes to the uplinks of ChirpStack v4 or The Things Stack, and sends each sensor's newest queue and battery to
     the edge, which merges them into its mission's belief by their age. FILE says which device is which sensor: see
-    docs/lorawan.md, and examples/lorawan/lorawan.toml to begin with.
+    docs/guides/lorawan.md, and examples/lorawan/lorawan.toml to begin with.
 
     The environment variable AICVDS_MQTT_PASSWORD has the broker user's password, and AICVDS_API_KEY a key of the edge
     with the scope `readings`. Ends by SIGTERM or Ctrl-C. Exit code: 0 ended, 2 bad use.

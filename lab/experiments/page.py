@@ -34,14 +34,14 @@ class Options:
 
     Experiments that were not run are listed as such. The command replaces an existing page and its figures.
 
-    Try it:  python -m lab experiment page --runs runs/experiments --out docs/results.md
+    Try it:  python -m lab experiment page --runs runs/experiments --out docs/results/experiments.md
 
     Exit code: 0 written, 2 bad use.
     """
 
     runs: Annotated[Path, arg(metavar="DIR")] = Path("runs/experiments")
     """Folder of the experiments' results (their --out)."""
-    out: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/results.md")
+    out: Annotated[Path, arg(metavar="FILE.md")] = Path("docs/results/experiments.md")
     """The page; its figures go to the folder figures beside it."""
 
 

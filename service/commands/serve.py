@@ -30,7 +30,7 @@ class Serve:
 
     Decides at once by its LLM-free policy, and by the LLM as soon as that is loaded (watch /readyz). With no LLM server
     it embeds SmolLM2-135M; `aicvds model fetch` brings the file. Everything else is set by environment variables
-    AICVDS_*: see the table in docs/operations.md. `aicvds doctor` looks for what may be in the way.
+    AICVDS_*: see the table in docs/reference/settings.md. `aicvds doctor` looks for what may be in the way.
 
     Try it:  curl localhost:8000/readyz
     """

@@ -93,7 +93,7 @@ def caution(runs: Sequence[Run]) -> str:
         return "Real UAVs know only the losses that beacons told them of, so these losses cannot be compared."
     if len(worlds) > 1:
         return "These missions flew different worlds or numbers of steps, so their losses cannot be compared."
-    return "One world is an example, not a result: docs/results.md compares over many."
+    return "One world is an example, not a result: docs/results/ compares over many."
 
 
 def render_comparison(runs: Sequence[Run]) -> str:

@@ -182,7 +182,7 @@ done
 say "/metrics counts 90 decisions, and Prometheus has scraped them from the edge and from the simulator"
 
 # --- sensors' uplinks ------------------------------------------------------------------------------------------------
-# As docs/lorawan.md says it, with the example's file: its second device is sensor 1 of mission `patrol`.
+# As docs/guides/lorawan.md says it, with the example's file: its second device is sensor 1 of mission `patrol`.
 quietly compose --profile mqtt up --detach --no-deps mosquitto uplinks
 docker exec "$edge" python -c '
 import json, urllib.request as u

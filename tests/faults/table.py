@@ -1,18 +1,15 @@
-"""The table of what the fault suite found, in ``docs/faults.md``."""
+"""The table of what the fault suite found, in ``docs/results/faults.md``."""
 
 from __future__ import annotations
 
-import subprocess
-from datetime import UTC, datetime
-
 from tests.support.places import ROOT
 
-PAGE = ROOT / "docs" / "faults.md"
+PAGE = ROOT / "docs" / "results" / "faults.md"
 
-_INTRODUCTION = """# What goes wrong, and what the edge does
+_INTRODUCTION = """# Faults, as measured
 
-Made by `make faults` on {day}, commit `{commit}`: real processes, real sockets, real files. A run in which anything
-fails does not change this page.
+Written by `make faults`, which fails, kills and starves real processes on real sockets and files. A run in which a
+test fails does not change this page. What the edge promises in each case: [Faults](../reference/faults.md).
 
 """
 
@@ -29,11 +26,8 @@ class Tables:
         rows.append(tuple(str(row.get(column, "")) for column in columns))
 
     def page(self) -> str:
-        """All tables, with the day and the commit."""
-        commit = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=False
-        ).stdout.strip()
-        text = _INTRODUCTION.format(day=f"{datetime.now(UTC):%Y-%m-%d}", commit=commit or "unknown")
+        """All tables."""
+        text = _INTRODUCTION
         for title, (columns, rows) in self._tables.items():
             names = [column.replace("_", " ") for column in columns]
             lines = [names, ["---"] * len(names), *rows]

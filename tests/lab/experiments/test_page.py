@@ -38,7 +38,7 @@ def scheduler() -> Result:
         ],
         labels={"llm": "AIC-VDS, mode llm", "eof": "EOF", "lost_packets": "lost packets", "events": "loss events"},
         seeds_of={"llm": list(range(10))},
-        notes=["A note of the run."],
+        notes=["A note of the run.", "Flights of several commits: 0123, 4567. Delete the folder flights/."],
     )
 
 
@@ -74,8 +74,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_experiment_with_a_result_has_figures_numbers_and_origin(written: Path) -> None:
     shown = section(written.read_text(), "scheduler")
     for part in (
-        "python -m lab experiment scheduler --llm none", "0 to 29 (30)", "2026-01-02", "version 0.1.0",
-        "commit 0123456789",
+        "python -m lab experiment scheduler --llm none", "0 to 29 (30)",
         "tiny.gguf", "A note of the run.", "![The scheduler experiment](figures/scheduler/losses.svg)",
         "| AIC-VDS, mode llm (10 seeds) † | 12.0 | 5.0 |", "| EOF | 176 | – |",
         "| clairvoyant bound (proven) | 0.8 | – |",
@@ -83,6 +82,7 @@ def test_an_experiment_with_a_result_has_figures_numbers_and_origin(written: Pat
         "| clairvoyant bound (proven) | lost packets | 11.0 [9.0, 13.0] | – |",
     ):  # fmt: skip
         assert part in shown, part
+    assert "commit" not in shown and "2026-01-02" not in shown
 
 
 def test_the_figures_that_it_shows_are_there_and_no_others(written: Path) -> None:

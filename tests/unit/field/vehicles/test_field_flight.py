@@ -299,7 +299,7 @@ async def test_a_mission_of_another_world_is_not_joined(edge: Edge) -> None:
             await FieldPilot(client, "m", site.scenario, PATIENCE_S, mode="llm").join()
 
 
-PAGE = ROOT / "docs" / "your-uav.md"
+PAGE = ROOT / "docs" / "guides" / "uav.md"
 
 
 async def test_the_radio_shown_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,7 +67,7 @@ def test_without_an_llm_no_breaker_is_open(edge: Edge) -> None:
 
 
 def test_the_docs_name_every_metric_with_its_labels() -> None:
-    page = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "metrics.md").read_text(encoding="utf-8")
     named = {
         row[1].strip(" `"): (row[2].strip(), re.findall(r"`(\w+)`", row[3]))
         for row in (line.split("|") for line in page.splitlines() if line.startswith("| `aicvds_"))

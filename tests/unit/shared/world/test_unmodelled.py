@@ -53,5 +53,5 @@ def test_every_field_is_off_by_default_and_described(name: str) -> None:
 
 
 def test_the_documentation_has_every_scenario_and_field() -> None:
-    page = (ROOT / "docs" / "worlds.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "worlds.md").read_text(encoding="utf-8")
     assert [name for name in (*SCENARIOS, *sorted(HIDDEN)) if f"`{name}`" not in page] == []
