@@ -1,7 +1,7 @@
 """``make release``: builds wheel, sdist, SBOM and checksums into dist/, and both Docker images.
 
 The version comes from git: from the tag v1.2.3 on this commit, otherwise it is a development version.
-docs/guides/release.md says how to cut one.
+CONTRIBUTING.md says how to cut one.
 """
 
 from __future__ import annotations

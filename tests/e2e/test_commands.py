@@ -25,25 +25,28 @@ from tests.support.edge_stub import free_port
 from tests.support.places import ROOT
 from tests.support.waiting import PATIENCE_S
 
-PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md")), *sorted(ROOT.glob("examples/*/README.md"))]
+PAGES = [
+    *(ROOT / "README.md", ROOT / "CONTRIBUTING.md"),
+    *sorted(ROOT.glob("docs/**/*.md")),
+    *sorted(ROOT.glob("examples/*/README.md")),
+]
 EDGE = "http://localhost:8000"
 BIN = ".venv/bin/"
 
 # Run as they stand, in this order, beside an edge: what is added makes them short.
 FLOWN = {
     f"{BIN}aicvds simulate --edge {EDGE} --scenario paper --seed 0 --out runs/mission": "--steps 2",
-    f"{BIN}aicvds replay runs/mission --edge {EDGE} --format json --top-k 3 --out runs/again": "",
+    f"{BIN}aicvds replay runs/mission --edge {EDGE} --top-k 3 --out runs/again": "",
     f"{BIN}aicvds simulate --world examples/pipeline_world --edge {EDGE}": "--steps 2",
     f"{BIN}aicvds simulate --world examples/pipeline_world --policy eof --out runs/pipeline_world": "--steps 2",
     f"{BIN}aicvds simulate --policy eof --no-bound --out runs/eof": "--steps 2",
     f"{BIN}aicvds simulate --edge {EDGE} --mission patrol --out runs/patrol": "--steps 2 --no-bound",
     f"{BIN}aicvds compare runs/mission runs/eof": "",
-    f"{BIN}aicvds compare runs/mission runs/pipeline_world": "",
     f"{BIN}aicvds mission create --edge {EDGE} --world examples/pipeline_world": "",
     f"{BIN}aicvds world export examples/pipeline_world --plan runs/plans": "",
     f"{BIN}aicvds world import runs/plans/*.plan --out runs/from_plans": "",
 }
-# The edge that the others are flown against is this one; the commands of "Authentication" have an edge of their own.
+# The edge that the others are flown against is this one; the commands of "Keys" have an edge of their own.
 SERVED = [
     f"{BIN}aicvds serve",
     f"AICVDS_LLM_URL=http://localhost:11434/v1 AICVDS_LLM_MODEL=qwen3:8b {BIN}aicvds serve",
@@ -60,7 +63,7 @@ PARSED = {
     "aicvds doctor": "its result is this machine's; tests/unit/service/commands/test_doctor.py runs it",
     "aicvds serve --ray": "it needs a PostgreSQL; tests/faults/test_ray.py runs it",
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
-    "aicvds fly": "it waits for vehicles; tests/simulator/vehicles and tests/e2e/test_fly.py fly it",
+    "aicvds fly": "it waits for vehicles; tests/unit/field/vehicles and tests/e2e/test_fly.py fly it",
     "python -m lab experiment": "minutes to hours; tests/e2e/test_experiment.py runs them small",
     "python -m lab explore": "minutes; tests/e2e/test_pretrain.py runs it small",
     "python -m lab distill": "an hour; tests/lab/distilling/test_distill.py runs it small",
@@ -75,6 +78,7 @@ MADE = {
     "make demo": "`aicvds demo` is `serve` and `simulate`, which are run here",
     "make test": "this is part of it",
     "make test-long": "minutes; CI runs it",
+    "make check": "CI runs it",
     "make compose": "it needs a Docker engine; CI runs it",
     "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
@@ -85,12 +89,13 @@ MADE = {
 }
 # Programs that this package does not bring.
 OTHERS = {
+    "docker compose ": "it needs a Docker engine; `make compose` does the same",
     "kubectl ": "it needs a cluster",
     "helm install": "it needs a cluster; a test has Helm and Kubernetes' schemas check the chart",
     "llama-server ": "it needs a model of the reader's; the tests' servers are those of the embedded llama.cpp",
 }
 # Run by tests/e2e/test_readme.py, as they stand.
-CURLED, CURLED_ON = "curl ", ("README.md", "docs/guidance.md")
+CURLED, CURLED_ON = "curl ", ("README.md", "docs/guides/operator.md")
 
 
 def commands(page: Path) -> list[str]:
@@ -213,16 +218,22 @@ def test_an_edge_with_keys_is_flown_as_shown(workspace: Path) -> None:
 @pytest.mark.parametrize("command", [command for _, command in TOLD if begins(command, PARSED)])
 def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     program, *args = shlex.split(command.removeprefix(BIN))
-    if args[:1] == ["experiment"]:
-        assert args[1] in (*EXPERIMENTS, "all")
+    if args[:3] == ["-m", "lab", "experiment"]:
+        assert args[3] in (*EXPERIMENTS, "all", "page")
     with monkeypatch.context() as patched:
         patched.setattr(tyro, "cli", only_parsed(tyro.cli))
         if program == "aicvds":
             patched.setattr(sys, "argv", [program, *args])
             with pytest.raises(Understood):
                 cli.main()
+        elif args[0] == "-m":
+            patched.setattr(sys, "argv", args[1:])
+            with pytest.raises(Understood):
+                runpy.run_module(args[1], run_name="__main__")
         else:
             patched.setattr(sys, "argv", args)
+            # As Python does with a script's folder: benchmarks import each other.
+            patched.syspath_prepend(str((ROOT / args[0]).parent))
             with pytest.raises(Understood):
                 runpy.run_path(str(ROOT / args[0]), run_name="__main__")
 

@@ -16,8 +16,9 @@ from tests.e2e.processes import serving_edge
 from tests.support.places import ROOT
 from tests.support.waiting import until
 
-README, DECIDING, GUIDANCE, OPERATIONS = (
-    (ROOT / page).read_text() for page in ("README.md", "docs/deciding.md", "docs/guidance.md", "docs/operations.md")
+README, DECIDING, OPERATOR, SETTINGS = (
+    (ROOT / page).read_text()
+    for page in ("README.md", "docs/reference/deciding.md", "docs/guides/operator.md", "docs/reference/settings.md")
 )
 
 
@@ -27,7 +28,7 @@ def curls(page: str) -> str:
     return str(block).strip()
 
 
-DECIDE, GUIDE = curls(README), curls(GUIDANCE)
+DECIDE, GUIDE = curls(README), curls(OPERATOR)
 
 
 def pasted(command: str, url: str) -> str:
@@ -58,7 +59,7 @@ def test_a_note_is_understood_and_confirmed_as_pasted() -> None:
 
 
 def test_every_setting_and_its_default_is_in_the_table() -> None:
-    listed = dict(re.findall(r"^\| `(AICVDS_\w+)` \| ([^|]*?) ?\|", OPERATIONS, re.MULTILINE))
+    listed = dict(re.findall(r"^\| `(AICVDS_\w+)` \| ([^|]*?) ?\|", SETTINGS, re.MULTILINE))
     assert listed.keys() == {f"AICVDS_{name.upper()}" for name in Settings.model_fields}
     defaults = Settings().model_dump(mode="json") | {
         "cache_dir": "~/.cache/aicvds",

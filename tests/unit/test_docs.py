@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,13 @@ from tests.support.places import ROOT
 
 # Where a reader is led, not what a page loads.
 LINKS = re.compile(r"<a [^>]*>")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-CODE_PATH = re.compile(r"(?<![\w./-])(?:service|simulator|shared)/[\w./-]*")
-CODE_NAME = re.compile(r"`((?:service|simulator|shared)/[\w/]+\.py):([\w.]+)`")
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted(DOCS.glob("**/*.md"))]
+CODE = "benchmarks|docker|examples|field|lab|service|shared|simulator|tests"
+CODE_PATH = re.compile(rf"(?<![\w./-])(?:{CODE})/[\w./-]*")
+CODE_NAME = re.compile(rf"`((?:{CODE})/[\w/]+\.py):([\w.]+)`")
+COMMIT = re.compile(r"`[0-9a-f]{7,12}`|\bcommit [0-9a-f]{7}")
+DAY = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 LOADED = re.compile(r'(?:src|href)="((?:https?:)?//[^"]+)"')
 
 
@@ -39,8 +44,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_page_is_built(site: Path) -> None:
-    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
-    assert pages and all((site / f"{page}.html").exists() for page in pages)
+    pages = {path.relative_to(DOCS).with_suffix(".html") for path in DOCS.glob("**/*.md")}
+    assert pages and all((site / page).exists() for page in pages)
     assert (site / "search" / "search_index.json").stat().st_size > 10_000
 
 
@@ -50,21 +55,21 @@ def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
 
 
 def test_equations_are_drawn(site: Path) -> None:
-    method = (site / "method.html").read_text(encoding="utf-8")
-    asked = (ROOT / "docs" / "method.md").read_text(encoding="utf-8").count("$$") // 2
+    method = (site / "reference" / "method.html").read_text(encoding="utf-8")
+    asked = (DOCS / "reference" / "method.md").read_text(encoding="utf-8").count("$$") // 2
     assert asked > 5
     assert method.count('<p class="equation"><svg') == asked
     assert "arithmatex" not in method and "merror" not in method
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_every_path_of_the_code_exists(page: Path) -> None:
     paths = {path.rstrip(".-/") for path in CODE_PATH.findall(page.read_text(encoding="utf-8"))}
     assert not [path for path in paths if not (ROOT / path).exists()]
 
 
 def test_every_name_in_the_architecture_is_in_its_file() -> None:
-    named = CODE_NAME.findall((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    named = CODE_NAME.findall((DOCS / "reference" / "architecture.md").read_text(encoding="utf-8"))
     assert len(named) > 30
     defined = {path: (ROOT / path).read_text(encoding="utf-8") for path, _ in named}
     for path, name in named:
@@ -73,8 +78,39 @@ def test_every_name_in_the_architecture_is_in_its_file() -> None:
             assert re.search(definition, defined[path], re.MULTILINE), f"{path} defines no {name}"
 
 
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+def test_the_architecture_names_every_room() -> None:
+    named = (DOCS / "reference" / "architecture.md").read_text(encoding="utf-8")
+    rooms = [
+        f"{path.parent.name}/{path.name}/"
+        for package in ("field", "lab", "service", "shared", "simulator")
+        for path in sorted((ROOT / package).iterdir())
+        if path.is_dir() and path.name not in ("__pycache__", "checkpoints")
+    ]
+    assert len(rooms) > 30
+    assert [room for room in rooms if f"`{room}`" not in named] == []
+
+
+def test_the_readme_and_the_docs_are_short() -> None:
+    assert lines([ROOT / "README.md"]) <= 110
+    assert lines(path for path in DOCS.glob("**/*.md") if "results" not in path.parts) <= 1900
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("decisions/*.md")), ids=lambda page: page.stem)
+def test_a_decision_is_a_screen_long(page: Path) -> None:
+    assert lines([page]) <= 40
+    listed = (DOCS / "decisions" / "index.md").read_text(encoding="utf-8")
+    assert page.name == "index.md" or f"]({page.name})" in listed
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_no_page_has_a_commit_or_a_day(page: Path) -> None:
+    # The release guide shows the changelog's form.
+    text = page.read_text(encoding="utf-8").replace("## [1.2.3] - 2026-11-30", "")
+    assert COMMIT.findall(text) + DAY.findall(text) == []
+
+
+def lines(pages: Iterable[Path]) -> int:
+    return sum(len(page.read_text(encoding="utf-8").splitlines()) for page in pages)
 
 
 def blocks(page: str) -> str:
@@ -85,14 +121,14 @@ def blocks(page: str) -> str:
 
 def test_the_policy_shown_flies(capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
-    exec(blocks("docs/your-policy.md").replace("range(5)", "range(1)"), names)
+    exec(blocks("docs/guides/policy.md").replace("range(5)", "range(1)"), names)
     assert re.match(r"mine \[\d+\]\neof \[\d+\]\n$", capsys.readouterr().out)
 
 
 def test_the_client_shown_asks(edge: Edge, capsys: pytest.CaptureFixture[str]) -> None:
     url = edge(mode="policy").base_url
     for page, printed in (
-        ("docs/quick-start.md", r"collect from [012] at \d+ m/s: policy\n$"),
+        ("docs/guides/quick-start.md", r"collect from [012] at \d+ m/s: policy\n$"),
         ("README.md", r"0 \d+ policy\n$"),
     ):
         shown = blocks(page)
