@@ -7,8 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from field.vehicles.radio import Beacon, Collected, Spot
-from shared.world.channel import FloatArray, channel_gain_db, link_holds, packets_per_step, rate_bps
+from shared.world.channel import FloatArray, Links, channel_gain_db
 from shared.world.scenario import Point
+from shared.world.step_rule import joules_a_packet, transfer
 from simulator.sites.site import Site
 from simulator.world.sensors import Sensors, Streams
 
@@ -25,7 +26,7 @@ class SimulatedRadio:
 
     def __init__(self, site: Site, seed: int) -> None:
         self._scenario = site.scenario
-        self._sensors = Sensors(site.scenario, Streams.of(np.random.SeedSequence(seed)), site.arrivals)
+        self._sensors = Sensors.draw(site.scenario, Streams.of(np.random.SeedSequence(seed)), site.arrivals)
         self._step = 0
         self._served: set[int] = set()
 
@@ -45,20 +46,18 @@ class SimulatedRadio:
     async def collect(self, spot: Spot, sensor: int) -> Collected:
         """One step's packets, if the link carries data and the sensor has served no UAV in this step."""
         self._arrive(spot.step)
-        distance = self._distances(spot.position)[sensor]
-        moved = None
-        if sensor not in self._served and link_holds(distance, self._scenario):
-            budget, rate = packets_per_step(distance, self._scenario), rate_bps(distance, self._scenario)
-            moved = self._sensors.transmit(sensor, int(budget), float(rate))
-        if moved is None:
-            return Collected(0, failed=True)
-        self._served.add(sensor)
-        return Collected(moved, failed=False)
+        link = Links.at(self._distances(spot.position)[[sensor]], self._scenario)
+        holds, joules = link.hold & (sensor not in self._served), joules_a_packet(link.rate_bps, self._scenario)
+        now, named = self._sensors, np.array([sensor])
+        served, moved = transfer(now.queue, now.battery, named, holds, link.packets, joules)
+        if served[0]:
+            self._served.add(sensor)
+        return Collected(int(moved[0]), failed=not served[0])
 
     def _arrive(self, step: int) -> None:
         """Let the packets arrive that a later step finds."""
         while self._step < min(step, self._scenario.steps):
-            self._sensors.arrive(self._step)
+            self._sensors.arrive(self._step, self._scenario.queue_capacity)
             self._step += 1
             self._served.clear()
 

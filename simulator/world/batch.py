@@ -1,21 +1,24 @@
-"""A batch of worlds of one scenario in numpy, for training: the numbers of :class:`PipelineWorld` to the bit."""
+"""Worlds of one scenario that step together, in numpy; :class:`PipelineWorld` is a batch of one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypedDict
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, TypedDict, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared.world.channel import FloatArray, IntArray
+from shared.world.channel import FloatArray, IntArray, Links
 from shared.world.scenario import SCENARIOS, Scenario
+from shared.world.step_rule import joules_a_packet, transfer
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
-from simulator.world.observation import Cost
+from simulator.world.observation import Cost, StepTally
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth
+
+_T = TypeVar("_T")
 
 
 class BatchObservation(TypedDict):
@@ -68,43 +71,71 @@ class BatchStep:
         """Eq. 5's loss of each world, ``(B,)``."""
         return self.failures + self.overflows
 
+    def tally(self, world: int, step: int) -> StepTally:
+        """The step of one of the worlds."""
+        failures, overflows = int(self.failed[world].sum()), int(self.overflows[world])
+        return StepTally(step, failures, overflows, int(self.lost_packets[world]), self.collected[world])
+
+    def of_uavs(self, world: int) -> list[list[Any]]:
+        """One of the worlds' ``failed``, ``moved``, ``blamed`` and cost, by UAV."""
+        return [column[world].tolist() for column in (self.failed, self.moved, self.blamed, -self.reward)]
+
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """The random part of B worlds, as ``PipelineWorld.reset`` draws it from each seed.
+    """The random part of one world, or of B worlds, as it is drawn from their seeds."""
 
-    ``positions`` ``(B, J, 2)`` and ``start_m`` ``(B, I)``, metres; ``initial_queue`` ``(B, J)`` and ``arrivals``
-    ``(B, T, J)``, packets; ``truth``, of the B worlds.
-    """
-
-    positions: FloatArray
-    initial_queue: IntArray
-    arrivals: IntArray
-    start_m: FloatArray
+    sensors: Sensors
+    fleet: Fleet
     truth: Truth
 
     @classmethod
     def of(
-        cls, scenario: Scenario, seeds: Sequence[int], trace: IntArray | None = None, gains: GainTrace | None = None
+        cls,
+        scenario: Scenario,
+        seeds: Sequence[int | np.random.SeedSequence],
+        trace: IntArray | None = None,
+        gains: GainTrace | None = None,
     ) -> Draw:
         """The worlds of these seeds; the traces of arrivals and gains act as they do in ``PipelineWorld``."""
-        streams = [Streams.of(np.random.SeedSequence(int(seed))) for seed in seeds]
-        sensors = [Sensors(scenario, stream, trace) for stream in streams]
+        return stacked([cls.one(scenario, seed, trace, gains) for seed in seeds])
+
+    @classmethod
+    def one(
+        cls,
+        scenario: Scenario,
+        seed: int | np.random.SeedSequence,
+        trace: IntArray | None = None,
+        gains: GainTrace | None = None,
+    ) -> Draw:
+        """The world of a seed."""
+        root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(int(seed))
+        streams = Streams.of(root)
         return cls(
-            positions=np.stack([one.positions for one in sensors]),
-            initial_queue=np.stack([one.initial_queue for one in sensors]),
-            arrivals=np.stack([one.arrivals for one in sensors]),
-            start_m=np.stack([Fleet.draw(scenario, stream.angles).start_m for stream in streams]),
-            truth=Truth.stack([Truth.draw(scenario, stream, gains) for stream in streams]),
+            Sensors.draw(scenario, streams, trace),
+            Fleet.draw(scenario, streams.angles),
+            Truth.draw(scenario, streams, gains),
         )
 
 
+def stacked(worlds: Sequence[_T]) -> _T:
+    """A part of each of B worlds as the same part of all: its arrays get a first dimension B."""
+    first: Any = worlds[0]
+    if isinstance(first, np.ndarray):
+        # For a few small arrays np.stack takes several times as long.
+        return np.array(worlds)  # type: ignore[return-value]
+    if not is_dataclass(first):
+        return worlds[0]
+    parts = {field.name: stacked([getattr(world, field.name) for world in worlds]) for field in fields(first)}
+    return replace(first, **parts)  # type: ignore[type-var]
+
+
 class VectorWorld:
-    """B worlds that step together, with the rules and the numbers of :class:`PipelineWorld`.
+    """B worlds that step together, by the rules in :class:`PipelineWorld`.
 
     All worlds have the scenario's T steps and end together. Observations are the world's own arrays, not copies, and
-    are valid until the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and the true
-    ``queue`` ``(B, J)`` and ``battery`` ``(B, J)``.
+    are valid until the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B
+    worlds the true ``sensors`` and the ``fleet``.
 
     Args:
         arrivals: a trace, shape ``(at least T, J)``, instead of drawn arrivals.
@@ -129,33 +160,30 @@ class VectorWorld:
         self.scenario = scenario
         self.cost = cost
         self.steps_flown = 0
-        self.queue: IntArray
-        self.battery: FloatArray
+        self.sensors: Sensors
+        self.fleet: Fleet
         self._trace = arrivals
         self._gains = gains
-        self._fleet = Fleet.draw(scenario, np.random.default_rng(0))
-        self._draw: Draw | None = None
+        self._truth: Truth | None = None
 
     def reset(self, seeds: Sequence[int]) -> BatchObservation:
         """Draw one world a seed, and return the first observations."""
         return self.start(Draw.of(self.scenario, seeds, self._trace, self._gains))
 
     def start(self, draw: Draw) -> BatchObservation:
-        """Begin worlds that are drawn already, and return the first observations."""
-        self._draw = draw
+        """Begin B worlds that are drawn already, and return the first observations."""
+        self._truth = draw.truth
         self.steps_flown = 0
-        self.queue = draw.initial_queue.copy()
-        self.battery = np.full(draw.initial_queue.shape, self.scenario.battery_j)
-        self._progress = draw.start_m
-        self._world = np.arange(len(draw.start_m))
-        shape = (*draw.start_m.shape, self.scenario.sensors)
+        self.sensors, self.fleet = draw.sensors.copy(), draw.fleet
+        shape = (*draw.fleet.start_m.shape, self.scenario.sensors)
+        # Of a UAV's link to the sensor that it names.
+        self._rows = np.arange(shape[0])[:, None], np.arange(shape[1])
         self._heard_queue, self._heard_battery, self._heard_gain = np.zeros((3, *shape))
         self._last_heard: IntArray = np.full(shape, -1)
-        # Row b * J + j of the flattened true state, for entry (b, i, j) of the UAVs' observations.
-        columns = np.arange(draw.initial_queue.size).reshape(-1, 1, shape[-1])
-        self._row_of: IntArray = np.broadcast_to(columns, shape).ravel()
-        self._update_links(0)
-        return self._observe()
+        # The place among the sensors of all worlds, for each entry of the observations.
+        self._sensor_of: IntArray = np.broadcast_to(np.arange(draw.sensors.queue.size).reshape(-1, 1, shape[2]), shape)
+        self._surveyed = np.broadcast_to(draw.sensors.positions[:, None], (*shape, 2))
+        return self._observe(*self._links(draw.truth))
 
     def step(self, sensors: ArrayLike, velocities: ArrayLike) -> tuple[BatchObservation, BatchStep]:
         """Fly one step of every world.
@@ -164,25 +192,42 @@ class VectorWorld:
             sensors: the sensor that each UAV collects from, integers ``(B, I)``.
             velocities: of each UAV, m/s, integers ``(B, I)``.
         """
-        draw, chosen, velocity = self._checked(np.asarray(sensors), np.asarray(velocities))
-        present = draw.truth.faults.present(self.steps_flown)
-        paths = self._fleet.trajectories
-        flown = draw.truth.wind.flown_m(velocity * present, self._progress, paths, self.steps_flown)
-        self._progress = self._progress + flown
-        self._update_links(self.steps_flown + 1)
-        failed, moved, collected = self._collect(chosen, present)
-        filled = self.queue + draw.arrivals[:, self.steps_flown]
-        self.queue = np.minimum(filled, self.scenario.queue_capacity)
-        lost: IntArray = filled - self.queue
-        blamed = np.matmul(self._usable, lost[:, :, None])[:, :, 0] * present
-        overflows, lost_packets = np.count_nonzero(lost, axis=1), lost.sum(axis=1)
-        if self.cost == "paper":
-            events = (failed.sum(axis=1) + overflows).astype(np.float64)
-            cost = events[:, None] * present
-        else:
-            cost = failed + blamed / self.scenario.queue_capacity
+        if self._truth is None:
+            raise ValueError("step before reset")
+        if self.steps_flown == self.scenario.steps:
+            raise ValueError("step after the mission's end: reset first")
+        last_sensor, fastest = self.scenario.sensors - 1, self.scenario.max_velocity
+        chosen = self._checked("sensors", np.asarray(sensors), last_sensor)
+        return self.fly(chosen, self._checked("velocities", np.asarray(velocities), fastest))
+
+    def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[BatchObservation, BatchStep]:
+        """As :meth:`step`, of actions known to be right."""
+        assert self._truth is not None
+        truth, fleet, ground, scenario, step = (
+            self._truth,
+            self.fleet,
+            self.sensors,
+            self.scenario,
+            self.steps_flown,
+        )
+        present = truth.faults.present(step)
+        flown = truth.wind.flown_m(velocity * present, fleet.progress_m, fleet.trajectories, step)
+        self.fleet = Fleet(fleet.trajectories, fleet.start_m, fleet.progress_m + flown)
         self.steps_flown += 1
-        return self._observe(), BatchStep(failed, moved, blamed, -cost, overflows, lost_packets, collected)
+        position, links = self._links(truth)
+        named, before = links[(*self._rows, chosen)], ground.queue.copy()
+        joules = joules_a_packet(named.rate_bps, scenario)
+        served, moved = transfer(ground.queue, ground.battery, chosen, named.hold & present, named.packets, joules)
+        failed, collected = (present & ~served).astype(np.int64), before - ground.queue
+        lost = ground.arrive(step, scenario.queue_capacity)
+        blamed = np.matmul(links.hold, lost[:, :, None])[:, :, 0] * present
+        overflows, lost_packets = np.add.reduce(lost > 0, axis=1), np.add.reduce(lost, axis=1)
+        if self.cost == "paper":
+            cost = (failed.sum(axis=1) + overflows).astype(np.float64)[:, None] * present
+        else:
+            cost = failed + blamed / scenario.queue_capacity
+        outcome = BatchStep(failed, moved, blamed, -cost, overflows, lost_packets, collected)
+        return self._observe(position, links), outcome
 
     def state(self) -> NDArray[np.float32]:
         """``PipelineWorld.state()`` of every world, ``(B, 1 + 2 I + 4 J)``.
@@ -190,98 +235,47 @@ class VectorWorld:
         Raises:
             ValueError: before the first ``reset``.
         """
-        if self._draw is None:
+        if self._truth is None:
             raise ValueError("state before reset")
-        worlds, side = len(self._world), self.scenario.area_m
+        sensors, side = self.sensors, self.scenario.area_m
+        worlds = len(sensors.queue)
         parts = (
             np.full((worlds, 1), self.steps_flown / self.scenario.steps),
-            (self._position / side).reshape(worlds, -1),
-            (self._draw.positions / side).reshape(worlds, -1),
-            self.queue / self.scenario.queue_capacity,
-            self.battery / self.scenario.battery_j,
+            (self.fleet.positions / side).reshape(worlds, -1),
+            (sensors.positions / side).reshape(worlds, -1),
+            sensors.queue / self.scenario.queue_capacity,
+            sensors.battery / self.scenario.battery_j,
         )
         return np.concatenate(parts, axis=1).astype(np.float32)
 
-    def _checked(self, sensors: IntArray, velocities: IntArray) -> tuple[Draw, IntArray, IntArray]:
-        if self._draw is None:
-            raise ValueError("step before reset")
-        if self.steps_flown == self.scenario.steps:
-            raise ValueError("step after the missions' end: reset first")
-        shape = self._draw.start_m.shape
-        last_sensor, fastest = self.scenario.sensors - 1, self.scenario.max_velocity
-        for name, values, last in (("sensors", sensors, last_sensor), ("velocities", velocities, fastest)):
-            if values.shape != shape or values.dtype.kind not in "iu":
-                raise ValueError(f"{name} of shape {values.shape} and type {values.dtype}, not integers {shape}")
-            if values.min() < 0 or values.max() > last:
-                raise ValueError(f"{name} are not all in 0..{last}")
-        return self._draw, sensors.astype(np.int64, copy=False), velocities
+    def _checked(self, name: str, values: IntArray, last: int) -> IntArray:
+        shape = self.fleet.start_m.shape
+        if values.shape != shape or values.dtype.kind not in "iu":
+            raise ValueError(f"{name} of shape {values.shape} and type {values.dtype}, not integers {shape}")
+        if values.min() < 0 or values.max() > last:
+            raise ValueError(f"{name} are not all in 0..{last}")
+        return values.astype(np.int64, copy=False)
 
-    def _update_links(self, instant: int) -> None:
-        """Update the UAVs' positions, their distances to the sensors, the sensors heard and the usable links."""
-        assert self._draw is not None
-        self._position = self._fleet.at(self._progress)
-        sensors = self._draw.positions[:, None]
-        self._distance = np.hypot(
-            self._position[..., 0, None] - sensors[..., 0], self._position[..., 1, None] - sensors[..., 1]
-        )
-        # The path loss is the costliest number of a step, and is needed only within the radio radius.
-        self._heard = np.flatnonzero(self._distance <= self.scenario.radio_radius_m)
-        channel = self._draw.truth.channel
-        self._excess = channel.excess_db(self._position, self._progress, instant)
-        self._share = np.broadcast_to(channel.share(self._distance, instant), self._distance.shape)
-        heard = self._heard
-        links = channel.at(*(array.ravel()[heard] for array in (self._distance, self._excess, self._share)))
-        self._gain = links.gain_db
-        self._usable = np.zeros(self._distance.shape, dtype=np.bool_)
-        self._usable.ravel()[heard] = links.hold
+    def _links(self, truth: Truth) -> tuple[FloatArray, Links]:
+        """The UAVs' positions, and the links of every UAV to every sensor, ``(B, I, J)``."""
+        position, sensors = self.fleet.positions, self.sensors.positions[:, None]
+        distance = np.hypot(position[..., 0, None] - sensors[..., 0], position[..., 1, None] - sensors[..., 1])
+        return position, truth.channel.links(distance, position, self.fleet.progress_m, self.steps_flown)
 
-    def _collect(self, chosen: IntArray, present: NDArray[np.bool_]) -> tuple[IntArray, IntArray, IntArray]:
-        """Serve the UAVs in order; returns f and the packets moved, each ``(B, I)``, and by sensor, ``(B, J)``."""
-        assert self._draw is not None
-        reach, excess, share, usable = (
-            np.take_along_axis(of_all, chosen[..., None], axis=2)[..., 0]
-            for of_all in (self._distance, self._excess, self._share, self._usable)
-        )
-        usable &= present
-        budget = np.zeros(chosen.shape, dtype=np.int64)
-        energy = np.full(chosen.shape, np.inf)
-        links = self._draw.truth.channel.at(reach[usable], excess[usable], share[usable])
-        budget[usable] = links.packets
-        with np.errstate(divide="ignore"):
-            airtime_s = self.scenario.packet_bits / links.rate_bps
-        energy[usable] = self.scenario.transmit_power_w * airtime_s
-        served = np.zeros(self.queue.shape, dtype=np.bool_)
-        collected = np.zeros(self.queue.shape, dtype=np.int64)
-        failed, moved = np.ones((2, *chosen.shape), dtype=np.int64)
-        for uav in range(self.scenario.uavs):
-            at = (self._world, chosen[:, uav])
-            battery, cost = self.battery[at], energy[:, uav]
-            # A queue's capacity limits it, so that the number fits an integer.
-            affordable = np.minimum(np.floor(battery / cost + 1e-9), self.scenario.queue_capacity).astype(np.int64)
-            able = (affordable >= 1) & usable[:, uav] & ~served[at]
-            packets = np.where(able, np.minimum(np.minimum(self.queue[at], budget[:, uav]), affordable), 0)
-            self.queue[at] -= packets
-            spent = packets * np.where(able, cost, 0.0)
-            self.battery[at] = np.where(able, np.maximum(0.0, battery - spent), battery)
-            served[at] |= able
-            collected[at] += packets
-            failed[:, uav], moved[:, uav] = present[:, uav] & ~able, packets
-        return failed, moved, collected
-
-    def _observe(self) -> BatchObservation:
-        """Record the beacons in range."""
-        heard, row = self._heard, self._row_of[self._heard]
-        self._heard_queue.ravel()[heard] = self.queue.ravel()[row]
-        self._heard_battery.ravel()[heard] = self.battery.ravel()[row]
-        self._heard_gain.ravel()[heard] = self._gain
-        self._last_heard.ravel()[heard] = self.steps_flown
-        assert self._draw is not None
-        shape = self._last_heard.shape
+    def _observe(self, position: FloatArray, links: Links) -> BatchObservation:
+        """Record the beacons in range, and return all observations."""
+        assert self._truth is not None
+        heard = np.flatnonzero(links.distance_m <= self.scenario.radio_radius_m)
+        sensor = self._sensor_of.take(heard)
+        self._heard_queue.put(heard, self.sensors.queue.take(sensor))
+        self._heard_battery.put(heard, self.sensors.battery.take(sensor))
+        self._heard_gain.put(heard, links.gain_db.take(heard))
+        self._last_heard.put(heard, self.steps_flown)
         return BatchObservation(
-            step=np.full((*shape[:2], 1), self.steps_flown),
-            position=self._draw.truth.reported(self._position, self.steps_flown),
-            progress=self._progress[..., None],
-            sensor_position=np.broadcast_to(self._draw.positions[:, None], (*shape, 2)),
+            step=np.full((*position.shape[:2], 1), self.steps_flown),
+            position=self._truth.reported(position, self.steps_flown),
+            progress=self.fleet.progress_m[..., None],
+            sensor_position=self._surveyed,
             queue=self._heard_queue,
             battery=self._heard_battery,
             channel_gain=self._heard_gain,

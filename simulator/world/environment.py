@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
-from shared.world.channel import FloatArray, IntArray, Links
+from shared.world.channel import IntArray
 from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.trajectory import trajectories
 from simulator.world.actions import checked_actions
-from simulator.world.beacons import Beacons
+from simulator.world.batch import BatchObservation, BatchStep, Draw, VectorWorld, stacked
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Cost, Info, Observation, StepTally
 from simulator.world.observation_space import observation_space
-from simulator.world.sensors import Sensors, Streams
+from simulator.world.sensors import Sensors
 from simulator.world.truth import Truth
 
 
@@ -104,7 +104,9 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
 
     ## For reports
     ``scenario``; ``sensors`` (true queues and batteries); ``fleet`` (the UAVs' positions); ``truth`` (what the
-    model leaves out); ``tally``, one :class:`StepTally` a step flown.
+    model leaves out); ``tally``, one :class:`StepTally` a step flown. The world is a
+    :class:`~simulator.world.batch.VectorWorld` of one world, and its transfers, arrivals and overflows are those of
+    :mod:`shared.world.step_rule`.
 
     Args:
         arrivals: a trace, shape ``(at least T, J)``, instead of drawn arrivals.
@@ -127,20 +129,17 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         cost: Cost = "default",
         render_mode: str | None = None,
     ) -> None:
-        if cost not in ("default", "paper"):
-            raise ValueError(f"unknown cost {cost!r}: choose one of default, paper")
         self.scenario = scenario
         self.arrivals = arrivals
         self.gains = gains
-        self.cost = cost
         self.render_mode = render_mode
         self.possible_agents = [f"uav_{i}" for i in range(scenario.uavs)]
         self._index = {agent: uav for uav, agent in enumerate(self.possible_agents)}
         self.agents: list[str] = []
         self.tally: list[StepTally] = []
         self.sensors: Sensors
-        self.fleet: Fleet
         self.truth: Truth
+        self._worlds = VectorWorld(scenario, cost=cost)
         levels = [scenario.sensors, scenario.max_velocity + 1]
         self._action_spaces = {agent: spaces.MultiDiscrete(levels) for agent in self.possible_agents}
         self._observation_spaces = {
@@ -168,18 +167,14 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             self._missions = 0
         key = (self._missions,) if self._missions else ()
         self._missions += 1
-        streams = Streams.of(np.random.SeedSequence(self._entropy, spawn_key=key))
-        self.sensors = Sensors(self.scenario, streams, self.arrivals)
-        self.fleet = Fleet.draw(self.scenario, streams.angles)
-        self.truth = Truth.draw(self.scenario, streams, self.gains)
+        draw = Draw.one(
+            self.scenario, np.random.SeedSequence(self._entropy, spawn_key=key), self.arrivals, self.gains
+        )
+        observed = self._worlds.start(stacked([draw]))
+        self.sensors, self.truth = self._worlds.sensors.of(0), draw.truth
         self.tally = []
         self.agents = self.possible_agents[:]
-        self._beacons = Beacons(self.scenario.uavs, self.scenario.sensors)
-        position = self.fleet.positions
-        observations = self._observe(position, self._links(position, 0))
-        zeros = np.zeros(self.scenario.uavs, dtype=np.int64)
-        mask = _action_masks(self._beacons, self.scenario)
-        return observations, _infos(self.live, mask, zeros, zeros, zeros, zeros.astype(np.float64))
+        return self._own(observed), self._infos(observed, None)
 
     def step(
         self, actions: Mapping[str, ArrayLike]
@@ -188,28 +183,22 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         if not self.agents:
             raise ValueError("step after the mission's end: reset first" if self.tally else "step before reset")
         chosen = checked_actions(actions, self.live, self.scenario)
-        step = len(self.tally)
-        flown = self.truth.wind.flown_m(chosen[:, 1], self.fleet.progress_m, self.fleet.trajectories, step)
-        position = self.fleet.advance(flown)
-        links = self._links(position, step + 1)
-        failed, moved = self.sensors.serve(chosen[:, 0], self.live.values(), links)
-        lost = self.sensors.arrive(step)
-        collected = np.bincount(chosen[:, 0], weights=moved, minlength=self.scenario.sensors).astype(np.int64)
-        tally = StepTally(step, int(failed.sum()), int(np.count_nonzero(lost)), int(lost.sum()), collected)
-        self.tally.append(tally)
-
-        blamed = links.hold @ lost
-        cost = failed + blamed / self.scenario.queue_capacity
-        if self.cost == "paper":
-            cost = np.full(self.scenario.uavs, float(tally.events))
-        observations = self._observe(position, links)
-        infos = _infos(self.live, _action_masks(self._beacons, self.scenario), failed, moved, blamed, cost)
+        observed, outcome = self._worlds.fly(chosen[None, :, 0], chosen[None, :, 1])
+        self.tally.append(outcome.tally(0, len(self.tally)))
+        observations, infos = self._own(observed), self._infos(observed, outcome)
         rewards = {agent: -infos[agent]["cost"] for agent in self.agents}
-        over, present = len(self.tally) == self.scenario.steps, self.truth.faults.present(step + 1)
-        terminations = {agent: not over and not bool(present[uav]) for agent, uav in self.live.items()}
+        flown = len(self.tally)
+        over, present = flown == self.scenario.steps, self.truth.faults.present(flown).tolist()
+        terminations = {agent: not over and not present[uav] for agent, uav in self.live.items()}
         truncations = dict.fromkeys(self.agents, over)
         self.agents = [agent for agent, left in terminations.items() if not (over or left)]
         return observations, rewards, terminations, truncations, infos
+
+    @property
+    def fleet(self) -> Fleet:
+        """The fleet now."""
+        fleet = self._worlds.fleet
+        return Fleet(fleet.trajectories, fleet.start_m[0], fleet.progress_m[0])
 
     @property
     def live(self) -> dict[str, int]:
@@ -225,17 +214,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         Raises:
             ValueError: before the first ``reset``.
         """
-        if not hasattr(self, "sensors"):
-            raise ValueError("state before reset")
-        side, sensors = self.scenario.area_m, self.sensors
-        parts = (
-            [len(self.tally) / self.scenario.steps],
-            self.fleet.positions.ravel() / side,
-            sensors.positions.ravel() / side,
-            sensors.queue / self.scenario.queue_capacity,
-            sensors.battery / self.scenario.battery_j,
-        )
-        return np.concatenate(parts).astype(np.float32)
+        return np.asarray(self._worlds.state()[0])
 
     def render(self) -> NDArray[np.uint8]:
         """The map as an RGB image, shape ``(600, 600, 3)``: trajectories, UAVs, and sensors filled by their queues."""
@@ -247,57 +226,29 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
 
         return render_map(self)
 
-    def _links(self, position: FloatArray, instant: int) -> Links:
-        """The links of every UAV to every sensor, ``(I, J)``."""
-        offset = position[:, None, :] - self.sensors.positions
-        distance = np.hypot(offset[..., 0], offset[..., 1])
-        return self.truth.channel.links(distance, position, self.fleet.progress_m, instant)
-
-    def _observe(self, position: FloatArray, links: Links) -> dict[str, Observation]:
-        """Record the beacons in range, and return a copy of every live UAV's observation."""
-        step = len(self.tally)
-        self._beacons.hear(step, self.sensors, links, self.scenario.radio_radius_m)
-        reported = self.truth.reported(position, step)
+    def _own(self, observed: BatchObservation) -> dict[str, Observation]:
+        """A copy of every live UAV's observation."""
+        columns: Any = {key: values[0] for key, values in cast(dict[str, NDArray[Any]], observed).items()}
         return {
-            agent: Observation(
-                step=np.array([step]),
-                position=reported[uav].copy(),
-                progress=self.fleet.progress_m[uav : uav + 1].copy(),
-                sensor_position=self.sensors.positions.copy(),
-                queue=self._beacons.queue[uav].copy(),
-                battery=self._beacons.battery[uav].copy(),
-                channel_gain=self._beacons.gain_db[uav].copy(),
-                last_heard=self._beacons.step[uav].copy(),
-            )
+            agent: cast(Observation, {key: values[uav].copy() for key, values in columns.items()})
             for agent, uav in self.live.items()
         }
 
-
-def _infos(
-    live: Mapping[str, int],
-    mask: NDArray[np.int8],
-    failed: IntArray,
-    moved: IntArray,
-    blamed: IntArray,
-    cost: FloatArray,
-) -> dict[str, Info]:
-    """The info of every live agent from the numbers of all UAVs."""
-    return {
-        agent: Info(
-            action_mask=mask[uav].copy(),
-            failed=bool(failed[uav]),
-            collected=int(moved[uav]),
-            lost_packets=int(blamed[uav]),
-            cost=float(cost[uav]),
-        )
-        for agent, uav in live.items()
-    }
-
-
-def _action_masks(beacons: Beacons, scenario: Scenario) -> NDArray[np.int8]:
-    """The ``action_mask`` of every UAV, ``(I, J + V)``."""
-    selectable = beacons.step >= 0
-    selectable |= ~selectable.any(axis=1, keepdims=True)
-    mask = np.ones((scenario.uavs, scenario.sensors + scenario.max_velocity + 1), dtype=np.int8)
-    mask[:, : scenario.sensors] = selectable
-    return mask
+    def _infos(self, observed: BatchObservation, outcome: BatchStep | None) -> dict[str, Info]:
+        """The info of every live agent; without an outcome that of a reset."""
+        selectable = observed["last_heard"][0] >= 0
+        selectable |= ~selectable.any(axis=1, keepdims=True)
+        uavs, sensors = selectable.shape
+        mask = np.ones((uavs, sensors + self.scenario.max_velocity + 1), dtype=np.int8)
+        mask[:, :sensors] = selectable
+        failed, moved, blamed, cost = np.zeros((4, uavs)).tolist() if outcome is None else outcome.of_uavs(0)
+        return {
+            agent: Info(
+                action_mask=mask[uav].copy(),
+                failed=bool(failed[uav]),
+                collected=int(moved[uav]),
+                lost_packets=int(blamed[uav]),
+                cost=cost[uav],
+            )
+            for agent, uav in self.live.items()
+        }

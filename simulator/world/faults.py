@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -44,16 +43,6 @@ class Faults:
         departs_at[gone] = rng.integers(1, max(steps - 1, 1), len(gone), endpoint=True)
         drops_at = rng.integers(steps // 4 + 1, 3 * steps // 4 + 1, endpoint=True)
         return cls(scenario, dies_at, departs_at, np.asarray(drops_at))
-
-    @classmethod
-    def stack(cls, worlds: Sequence[Faults]) -> Self:
-        """The faults of B worlds of one scenario."""
-        return cls(
-            worlds[0].scenario,
-            np.stack([one.dies_at for one in worlds]),
-            np.stack([one.departs_at for one in worlds]),
-            np.stack([one.drops_at for one in worlds]),
-        )
 
     def present(self, instant: int) -> NDArray[np.bool_]:
         """Whether each UAV is still there at that instant, ``(I,)`` or ``(B, I)``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -13,30 +13,26 @@ from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory, trajectories
 
 
+@dataclass(frozen=True, eq=False)
 class Fleet:
-    """I UAVs, each on its trajectory.
+    """I UAVs, each on its trajectory; of B worlds both arrays have a first dimension B.
 
     Attributes:
         trajectories: one a UAV.
         start_m: shape ``(I,)``, arc length from each trajectory's beginning to the UAV's start.
         progress_m: shape ``(I,)``, ``start_m`` plus the distance flown.
-
-    Raises:
-        ValueError: the number of starts is not that of the trajectories.
     """
 
-    def __init__(self, paths: Sequence[Trajectory], start_m: ArrayLike) -> None:
-        self.trajectories = tuple(paths)
-        self.start_m: FloatArray = np.array(start_m, dtype=np.float64)
-        if self.start_m.shape != (len(self.trajectories),):
-            raise ValueError(f"{len(self.trajectories)} trajectories, start_m has shape {self.start_m.shape}")
-        self.progress_m = self.start_m
+    trajectories: tuple[Trajectory, ...]
+    start_m: FloatArray
+    progress_m: FloatArray
 
     @classmethod
     def draw(cls, scenario: Scenario, rng: np.random.Generator) -> Self:
         """A scenario's fleet, each start uniform along its trajectory."""
         paths = trajectories(scenario)
-        return cls(paths, rng.uniform(0.0, 1.0, len(paths)) * [path.length_m for path in paths])
+        start_m = rng.uniform(0.0, 1.0, len(paths)) * [path.length_m for path in paths]
+        return cls(paths, start_m, start_m)
 
     @property
     def positions(self) -> FloatArray:
@@ -47,18 +43,3 @@ class Fleet:
         """The UAVs' positions at arc lengths ``(..., I)`` along their trajectories, ``(..., I, 2)``, metres."""
         progress = np.asarray(progress_m, dtype=np.float64)
         return np.stack([path.at(progress[..., uav]) for uav, path in enumerate(self.trajectories)], axis=-2)
-
-    def advance(self, distance_m: ArrayLike) -> FloatArray:
-        """Advance each UAV by a distance, and return the new positions.
-
-        Args:
-            distance_m: arc lengths, shape ``(I,)`` or a scalar for all, metres, at least 0.
-
-        Raises:
-            ValueError: a distance is negative or not finite.
-        """
-        distance = np.asarray(distance_m, dtype=np.float64)
-        if not np.all(np.isfinite(distance) & (distance >= 0)):
-            raise ValueError(f"distance_m is {distance_m!r}, must be finite and at least 0")
-        self.progress_m = self.progress_m + distance
-        return self.positions

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from shared.world.channel import FloatArray, IntArray, Links
+from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
+from shared.world.step_rule import arrive
 
 
 class Streams(NamedTuple):
@@ -35,88 +36,64 @@ class Streams(NamedTuple):
         return cls(*(np.random.default_rng(child) for child in root.spawn(len(cls._fields))))
 
 
+@dataclass(frozen=True, eq=False)
 class Sensors:
-    """The J sensors of one world; the constructor makes all their random draws.
+    """The J sensors of one world; of B worlds every array has a first dimension B.
 
     Attributes:
         positions: shape ``(J, 2)``, metres.
         rates: shape ``(J,)``, mean arrival rates, packets a step.
+        initial_queue: shape ``(J,)``, packets.
         arrivals: shape ``(T, J)``, packets that arrive in each step: a trace's, else Poisson of ``rates``, or of the
             rates in and between bursts.
-        initial_queue: shape ``(J,)``, packets.
         queue: shape ``(J,)``, packets waiting now, 0..W.
         battery: shape ``(J,)``, joules left.
         lost: shape ``(J,)``, packets lost so far.
-
-    Raises:
-        ValueError: the trace does not cover the mission.
     """
 
-    def __init__(self, scenario: Scenario, streams: Streams, trace: IntArray | None = None) -> None:
-        self._scenario = scenario
+    positions: FloatArray
+    rates: FloatArray
+    initial_queue: IntArray
+    arrivals: IntArray
+    queue: IntArray
+    battery: FloatArray
+    lost: IntArray
+
+    @classmethod
+    def draw(cls, scenario: Scenario, streams: Streams, trace: IntArray | None = None) -> Self:
+        """One world's, before the first step.
+
+        Raises:
+            ValueError: the trace does not cover the mission.
+        """
         count, capacity = scenario.sensors, scenario.queue_capacity
-        self.positions = draw_positions(scenario, streams.layout)
-        self.rates: FloatArray = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)
+        positions = draw_positions(scenario, streams.layout)
+        rates = streams.rates.uniform(scenario.arrival_rate_min, scenario.arrival_rate_max, count)
         fewest = math.ceil(scenario.initial_queue_min * capacity - 1e-9)
-        self.initial_queue: IntArray = streams.queues.integers(fewest, capacity, count, endpoint=True)
+        queue = streams.queues.integers(fewest, capacity, count, endpoint=True)
         drawn = trace
         if drawn is None:
-            rates = self.rates if scenario.burst_factor == 1 else self.rates * draw_bursts(scenario, streams.bursts)
-            drawn = streams.arrivals.poisson(rates, (scenario.steps, count))
-        self.arrivals: IntArray = np.asarray(drawn[: scenario.steps], dtype=np.int64)
-        if self.arrivals.shape != (scenario.steps, count):
-            shape = self.arrivals.shape
+            bursts = 1.0 if scenario.burst_factor == 1 else draw_bursts(scenario, streams.bursts)
+            drawn = streams.arrivals.poisson(rates * bursts, (scenario.steps, count))
+        arrivals = np.asarray(drawn[: scenario.steps], dtype=np.int64)
+        if (shape := arrivals.shape) != (scenario.steps, count):
             raise ValueError(f"the trace has shape {shape}, the mission is {scenario.steps} steps of {count} sensors")
-        self.queue = self.initial_queue.copy()
-        self.battery: FloatArray = np.full(count, scenario.battery_j)
-        self.lost: IntArray = np.zeros(count, dtype=np.int64)
+        battery, lost = np.full(count, scenario.battery_j), np.zeros(count, dtype=np.int64)
+        return cls(positions, rates, queue, arrivals, queue.copy(), battery, lost)
 
-    def serve(self, chosen: IntArray, uavs: Iterable[int], links: Links) -> tuple[IntArray, IntArray]:
-        """Let UAVs collect, in this order, each from its sensor; returns f and the packets moved, each ``(I,)``.
+    def copy(self) -> Self:
+        """The same sensors, to be served independently of these."""
+        return replace(self, queue=self.queue.copy(), battery=self.battery.copy(), lost=self.lost.copy())
 
-        ``chosen`` has shape ``(I,)``, the links ``(I, J)``. Both numbers of a UAV that is not among ``uavs`` are 0.
-        """
-        reach = links[np.arange(len(chosen)), chosen]
-        usable, budget, rate = reach.hold.tolist(), reach.packets.tolist(), reach.rate_bps.tolist()
-        failed, moved = np.zeros((2, len(chosen)), dtype=np.int64)
-        served: set[int] = set()
-        for uav in uavs:
-            sensor, packets = int(chosen[uav]), None
-            if usable[uav] and sensor not in served:
-                packets = self.transmit(sensor, budget[uav], rate[uav])
-            if packets is not None:
-                served.add(sensor)
-            failed[uav] = packets is None
-            moved[uav] = packets or 0
-        return failed, moved
+    def arrive(self, step: int, capacity: int) -> IntArray:
+        """Let a step's packets arrive, and return those lost, ``(..., J)``."""
+        self.queue[...], lost = arrive(self.queue, self.arrivals[..., step, :], capacity)
+        self.lost[...] += lost
+        return np.asarray(lost)
 
-    def transmit(self, sensor: int, packets: int, rate_bps: float) -> int | None:
-        """Move up to ``packets`` out of a sensor's queue, and take the energy from its battery.
-
-        The energy is transmit power x airtime, with airtime ``moved x packet_bits / rate``. The remaining battery
-        limits the packets moved.
-
-        Returns:
-            The packets moved (0 from an empty queue), or ``None`` if the battery cannot pay for one packet, which at a
-            rate of 0 no battery can.
-        """
-        airtime_s = self._scenario.packet_bits / rate_bps if rate_bps > 0 else math.inf
-        energy = self._scenario.transmit_power_w * airtime_s
-        affordable = math.floor(float(self.battery[sensor]) / energy + 1e-9)
-        if affordable < 1:
-            return None
-        moved: int = min(int(self.queue[sensor]), packets, affordable)
-        self.queue[sensor] -= moved
-        self.battery[sensor] = max(0.0, float(self.battery[sensor]) - moved * energy)
-        return moved
-
-    def arrive(self, step: int) -> IntArray:
-        """Add a step's arrivals, clip the queues to W, and return the packets lost, shape ``(J,)``."""
-        filled: IntArray = self.queue + self.arrivals[step]
-        self.queue = np.minimum(filled, self._scenario.queue_capacity)
-        lost: IntArray = filled - self.queue
-        self.lost = self.lost + lost
-        return lost
+    def of(self, world: int) -> Self:
+        """The sensors of one of the worlds, in the same memory."""
+        return type(self)(*(getattr(self, field.name)[world] for field in fields(self)))
 
 
 def draw_positions(scenario: Scenario, rng: np.random.Generator) -> FloatArray:

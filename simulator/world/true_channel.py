@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from shared.world.channel import FloatArray, Links
+from shared.world.channel import FloatArray, Links, path_loss_db
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory, trajectories
 from simulator.world.faults import Faults
@@ -41,7 +40,7 @@ class TrueChannel:
 
     Attributes:
         scenario: of the world.
-        own_db: shape ``(J,)`` or ``(B, 1, J)``, each sensor's own excess loss.
+        own_db: shape ``(J,)`` or ``(B, J)``, each sensor's own excess loss.
         frequencies: shape ``(2, M)`` or ``(B, 2, M)``, radians a metre, of the shadowing along the way.
         mixture: shape ``(2 M, J)`` or ``(B, 2 M, J)``, dB, the weights of their cosines and sines for each sensor.
         fading: the normal numbers of small-scale fading.
@@ -79,19 +78,10 @@ class TrueChannel:
         fading = StepNoise.draw(streams.fading)
         return cls(scenario, own, pairs / scale, mixture, fading, faults, trajectories(scenario), trace)
 
-    @classmethod
-    def stack(cls, channels: Sequence[TrueChannel]) -> Self:
-        """The channels of B worlds of one scenario as one."""
-        return cls(
-            channels[0].scenario,
-            np.stack([one.own_db for one in channels])[:, None],
-            np.stack([one.frequencies for one in channels]),
-            np.stack([one.mixture for one in channels]),
-            StepNoise.stack([one.fading for one in channels]),
-            Faults.stack([one.faults for one in channels]),
-            channels[0].paths,
-            channels[0].trace,
-        )
+    @property
+    def mean_only(self) -> bool:
+        """Whether every link has the mean path loss."""
+        return mean_only(self.scenario, self.trace)
 
     @property
     def changes(self) -> bool:
@@ -100,7 +90,7 @@ class TrueChannel:
         return world.rician_k_db is not None or bool(world.dead_radios or world.link_share_drop)
 
     def links(self, distance_m: FloatArray, position: FloatArray, progress_m: FloatArray, instant: int) -> Links:
-        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``.
+        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``; past the radio radius the loss is infinite.
 
         Args:
             distance_m: horizontal, ``(..., I, J)``.
@@ -108,15 +98,19 @@ class TrueChannel:
             progress_m: of the UAVs, ``(..., I)``.
             instant: of the transmissions, and of the beacons that measure these links.
         """
-        return self.at(distance_m, self.excess_db(position, progress_m, instant), self.share(distance_m, instant))
+        # The path loss is the costliest number of a step. Of many links, indices are several times as fast as a mask.
+        near = np.flatnonzero(distance_m <= self.scenario.radio_radius_m)
+        excess = 0.0 if self.mean_only else self.excess_db(position, progress_m, instant).take(near)
+        loss = np.full(distance_m.shape, np.inf)
+        loss.put(near, self.at(distance_m.take(near), excess, 1.0).loss_db)
+        return Links(distance_m, loss, self.scenario, self.share(distance_m, instant))
 
-    def at(self, distance_m: FloatArray, excess_db: FloatArray, share: FloatArray | float) -> Links:
+    def at(self, distance_m: FloatArray, excess_db: FloatArray | float, share: FloatArray | float) -> Links:
         """The links at these distances, metres, with these excess losses, dB, and shares of the rate."""
-        links = Links.at(distance_m, self.scenario, excess_db)
-        loss = links.loss_db
-        if not mean_only(self.scenario, self.trace):
-            loss = np.clip(loss, *LOSS_BOUNDS_DB)
-        return replace(links, loss_db=loss, share=share)
+        loss = path_loss_db(distance_m, self.scenario)
+        if not self.mean_only:
+            loss = np.clip(loss + excess_db, *LOSS_BOUNDS_DB)
+        return Links(distance_m, loss, self.scenario, share)
 
     def excess_db(self, position: FloatArray, progress_m: FloatArray, instant: int) -> FloatArray:
         """The excess losses at an instant; shapes as of :meth:`links`."""
@@ -125,7 +119,7 @@ class TrueChannel:
     def place_db(self, position: FloatArray, progress_m: FloatArray) -> FloatArray:
         """The part of the excess losses that depends on the UAVs' places alone; shapes as of :meth:`links`."""
         count = self.scenario.sensors
-        excess = np.broadcast_to(self.own_db, (*position.shape[:-1], count))
+        excess = np.broadcast_to(self.own_db[..., None, :], (*position.shape[:-1], count))
         if self.scenario.route_shadowing_db:
             angle = position @ self.frequencies
             waves = np.concatenate((np.cos(angle), np.sin(angle)), axis=-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -14,7 +13,7 @@ from simulator.world.faults import Faults
 from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Streams
 from simulator.world.step_noise import StepNoise
-from simulator.world.true_channel import TrueChannel, mean_only
+from simulator.world.true_channel import TrueChannel
 from simulator.world.wind import Wind
 
 # The largest error of a reported position on each axis, in standard deviations.
@@ -37,21 +36,11 @@ class Truth:
         channel = TrueChannel.draw(scenario, streams, faults, gains)
         return cls(channel, Wind.draw(scenario, streams.gusts), faults, StepNoise.draw(streams.position_noise))
 
-    @classmethod
-    def stack(cls, truths: Sequence[Truth]) -> Self:
-        """The truth of B worlds of one scenario."""
-        return cls(
-            TrueChannel.stack([one.channel for one in truths]),
-            Wind.stack([one.wind for one in truths]),
-            Faults.stack([one.faults for one in truths]),
-            StepNoise.stack([one.position_noise for one in truths]),
-        )
-
     @property
     def differs(self) -> bool:
         """Whether links, wind or the fleet differ from what an edge plans with."""
         channel = self.channel
-        modelled = mean_only(channel.scenario, channel.trace) and not channel.changes
+        modelled = channel.mean_only and not channel.changes
         return not modelled or self.wind.blows or channel.scenario.departures > 0
 
     def reported(self, position: FloatArray, instant: int) -> FloatArray:

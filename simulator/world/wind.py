@@ -35,11 +35,6 @@ class Wind:
         """One world's."""
         return cls(scenario, StepNoise.draw(rng))
 
-    @classmethod
-    def stack(cls, winds: Sequence[Wind]) -> Self:
-        """The wind of B worlds of one scenario."""
-        return cls(winds[0].scenario, StepNoise.stack([one.gusts for one in winds]))
-
     @property
     def blows(self) -> bool:
         """Whether there is any wind."""

@@ -15,6 +15,7 @@ from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
 from simulator.policies.policy import Policy
 from simulator.policies.registry import POLICY_NAMES, policy_named
+from simulator.world.batch import VectorWorld
 from simulator.world.environment import PipelineWorld
 from simulator.world.fleet import Fleet
 from simulator.world.observation import Observation
@@ -25,7 +26,7 @@ from simulator.world.truth import Truth
 SCENARIO = SCENARIOS["paper"].model_copy(update={"radio_radius_m": 200.0})
 NAMES = (*POLICY_NAMES, "lab.marl.learned:madqn", "lab.marl.learned:mappo")
 DECISIONS, SEED = 4, 0
-HIDDEN = (PipelineWorld, Sensors, Streams, Fleet, Truth)
+HIDDEN = (PipelineWorld, VectorWorld, Sensors, Streams, Fleet, Truth)
 Actions = list[tuple[int, int]]
 
 pytestmark = pytest.mark.usefixtures("brief")
@@ -72,12 +73,12 @@ class Flight:
 
 def _change_what_is_hidden(sensors: Sensors, unheard: Any) -> None:
     never = unheard < 0
-    sensors.queue = np.where(never, 60 - sensors.queue // 2, sensors.queue)
-    sensors.battery = np.where(never, 1.0, sensors.battery)
-    sensors.rates = sensors.rates[::-1].copy()
+    sensors.queue[:] = np.where(never, 60 - sensors.queue // 2, sensors.queue)
+    sensors.battery[:] = np.where(never, 1.0, sensors.battery)
+    sensors.rates[:] = sensors.rates[::-1].copy()
     # The arrivals of a step are in the queue heard after it.
     later = np.arange(SCENARIO.steps)[:, None] >= np.maximum(unheard, 0)
-    sensors.arrivals = np.where(later, sensors.arrivals + 7, sensors.arrivals)
+    sensors.arrivals[:] = np.where(later, sensors.arrivals + 7, sensors.arrivals)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -105,7 +106,7 @@ def asked_again(policy: Policy, seen: list[list[Observation]]) -> list[Actions]:
         raise AssertionError("a policy draws a world")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Sensors, "__init__", forbidden)
+        patch.setattr(Sensors, "draw", forbidden)
         patch.setattr(Streams, "of", forbidden)
         policy.reset(SCENARIO, SEED)
         return [decide(policy, step) for step in seen]
@@ -141,7 +142,7 @@ def test_an_observation_is_a_copy_that_leads_nowhere() -> None:
     world = PipelineWorld()
     observations, _ = world.reset(seed=SEED)
     for _ in range(3):
-        parts = (world, world.sensors, world.fleet, world._beacons)
+        parts = (world._worlds, world.sensors, world.fleet)
         arrays = [value for part in parts for value in vars(part).values() if isinstance(value, np.ndarray)]
         assert len(arrays) > 8
         for observation in observations.values():

@@ -77,7 +77,7 @@ def test_the_worlds_compared_do_run_flat_collide_and_overflow() -> None:
     batch.reset(range(5))
     sensors, velocities = actions_of(FLAT, range(5))
     steps = [batch.step(*pair)[1] for pair in zip(sensors, velocities, strict=True)]
-    assert np.any(batch.battery < 0.02)
+    assert np.any(batch.sensors.battery < 0.02)
     assert any(np.any(step.failed) for step in steps)
     assert any(np.any(step.lost_packets) for step in steps)
     assert np.any(np.diff(np.sort(sensors, axis=2), axis=2) == 0)
@@ -92,7 +92,7 @@ def test_a_trace_replaces_the_arrivals() -> None:
     _, outcome = batch.step(idle, idle)
     world.step({agent: np.zeros(2, dtype=np.int64) for agent in world.agents})
     assert outcome.lost_packets.tolist() == [world.tally[0].lost_packets]
-    assert batch.queue[0].tolist() == world.sensors.queue.tolist()
+    assert batch.sensors.queue[0].tolist() == world.sensors.queue.tolist()
 
 
 def test_a_world_does_not_depend_on_its_neighbours() -> None:
@@ -126,5 +126,5 @@ def test_bad_use_is_refused_and_changes_nothing() -> None:
             batch.step(sensors, velocities)
     assert batch.steps_flown == 0
     batch.step(idle, idle)
-    with pytest.raises(ValueError, match="step after the missions' end: reset first"):
+    with pytest.raises(ValueError, match="step after the mission's end: reset first"):
         batch.step(idle, idle)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,18 +12,12 @@ from simulator.world.fleet import Fleet
 
 
 def two() -> Fleet:
-    return Fleet([Circle((0.0, 0.0), 10.0), Polyline([(0, 0), (100, 0)])], [0.0, 20.0])
+    start_m = np.array([0.0, 20.0])
+    return Fleet((Circle((0.0, 0.0), 10.0), Polyline([(0, 0), (100, 0)])), start_m, start_m)
 
 
 def test_uavs_start_where_they_are_put() -> None:
     np.testing.assert_allclose(two().positions, [(10.0, 0.0), (20.0, 0.0)], atol=1e-12)
-
-
-def test_uavs_advance_each_by_its_own_distance() -> None:
-    fleet = two()
-    got = fleet.advance([10.0 * np.pi / 2, 90.0])
-    np.testing.assert_allclose(got, [(0.0, 10.0), (90.0, 0.0)], atol=1e-12)
-    np.testing.assert_array_equal(got, fleet.positions)
 
 
 def test_looking_ahead_is_vectorised_and_moves_no_uav() -> None:
@@ -39,19 +32,9 @@ def test_looking_ahead_is_vectorised_and_moves_no_uav() -> None:
 def test_uavs_never_leave_their_circles(distances: list[int], seed: int) -> None:
     scenario = SCENARIOS["paper"]
     fleet = Fleet.draw(scenario, np.random.default_rng(seed))
-    for distance in distances:
-        before = fleet.positions
-        after = fleet.advance(float(distance))
-        np.testing.assert_allclose(np.hypot(*(after - scenario.lap_centres).T), 300.0)
-        np.testing.assert_allclose(np.hypot(*(after - before).T), 600.0 * np.sin(distance / 600.0), atol=1e-6)
-
-
-@pytest.mark.parametrize("distance", [-1.0, float("nan"), [1.0, float("inf")]])
-def test_a_distance_must_be_finite_and_forward(distance: float | list[float]) -> None:
-    with pytest.raises(ValueError, match="distance_m"):
-        two().advance(distance)
-
-
-def test_every_uav_needs_a_start() -> None:
-    with pytest.raises(ValueError, match="2 trajectories"):
-        Fleet(two().trajectories, [0.0])
+    flown = np.cumsum([0, *distances])[:, None] + fleet.start_m
+    places = fleet.at(flown)
+    np.testing.assert_allclose(np.hypot(*(places - scenario.lap_centres).transpose(2, 0, 1)), 300.0)
+    chords = np.hypot(*np.diff(places, axis=0).transpose(2, 0, 1))
+    expected = 600.0 * np.sin(np.array(distances, dtype=float) / 600.0)
+    np.testing.assert_allclose(chords, np.broadcast_to(expected[:, None], chords.shape), atol=1e-6)

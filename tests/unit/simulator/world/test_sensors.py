@@ -32,8 +32,8 @@ def test_bursts_and_calm_have_their_mean_lengths() -> None:
 
 def test_arrivals_follow_the_bursts_and_keep_each_sensors_mean() -> None:
     streams = [Streams.of(np.random.SeedSequence(2)) for _ in range(2)]
-    bursty = Sensors(BURSTY, streams[0])
-    steady = Sensors(BURSTY.model_copy(update={"burst_factor": 1.0}), streams[1])
+    bursty = Sensors.draw(BURSTY, streams[0])
+    steady = Sensors.draw(BURSTY.model_copy(update={"burst_factor": 1.0}), streams[1])
     np.testing.assert_array_equal(bursty.rates, steady.rates)
     assert bursty.arrivals.mean() == pytest.approx(steady.arrivals.mean(), rel=0.03)
     assert bursty.arrivals.var(axis=0).mean() > 2 * steady.arrivals.var(axis=0).mean()
