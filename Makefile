@@ -7,7 +7,6 @@ TORCH_INDEX ?=
 MINUTES ?= 10
 IMAGES ?= auto
 AICVDS_BUILD_NETWORK ?= default
-TORCH := $(shell grep '^torch==' constraints.txt)
 BIN := .venv/bin
 
 # mypy 2.4 may infer different types in different runs, by the order of its sets: PYTHONHASHSEED makes its result stable.
@@ -16,7 +15,7 @@ BIN := .venv/bin
 
 help:
 	@echo "make install   a virtual environment in .venv with everything, and the embedded model"
-	@echo "make demo      install, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
+	@echo "make demo      install what it needs, start the edge with its LLM, fly the paper's mission, write runs/demo/report.html"
 	@echo "make test      install, run the tests: 4 to 11 minutes on 2 cores"
 	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
@@ -30,17 +29,16 @@ help:
 
 install: .venv/installed
 
-.venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet $(TORCH) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX))
-	@# Commands that run from here would take the entry points of an earlier installation out of its egg-info.
-	rm -rf aic_vds.egg-info
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	$(BIN)/aicvds model fetch
-	$(COMPILE)
+.venv/installed: pyproject.toml constraints.txt install.py
+	$(PYTHON) install.py all $(TORCH_INDEX:%=--torch-index %)
+	@touch $@ .venv/demo
+
+# Less than a tenth of the packages: what serves, simulates and draws.
+.venv/demo: pyproject.toml constraints.txt install.py
+	$(PYTHON) install.py demo $(TORCH_INDEX:%=--torch-index %)
 	@touch $@
 
-demo: install
+demo: .venv/demo
 	$(BIN)/aicvds demo --out runs/demo
 
 # In advance, because a test that waits for the compiler may run into a limit of time; a second once it is done.

@@ -12,7 +12,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import softmax
 
 from service.deciding.attended_state import AttendedState
 from service.guidance.step_guidance import StepGuidance
@@ -65,7 +64,8 @@ class LearnedValues:
         """A sensor that attention did not keep scores as low as the lowest."""
         lowest = min((float(levels.min()) for levels in self.values.values()), default=0.0)
         scores = np.array([float(self.values[s][v]) if s in self.values else lowest for s, v in actions])
-        return np.asarray(softmax(scores / _VALUE_TEMPERATURE))
+        weights = np.exp((scores - scores.max()) / _VALUE_TEMPERATURE)
+        return np.asarray(weights / weights.sum())
 
 
 def _by_plan(state: AttendedState) -> Preference | None:

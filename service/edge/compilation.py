@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 
 from service.deciding import rollout_evaluator
@@ -53,7 +56,15 @@ def _heard(step: int) -> SensorColumns:
 
 
 def compile_all() -> None:
-    """Compile every function, or load it: installations do so in advance."""
-    load_for_event_loop()
-    annealing.warm_up()
-    rollout_evaluator.warm_up()
+    """Compile every function, or load it, on two cores: installations do so in advance.
+
+    Raises:
+        subprocess.CalledProcessError: the functions of the planner cannot be compiled.
+    """
+    # The planner's functions take as long as all others together.
+    command = [sys.executable, "-c", f"from {annealing.__name__} import warm_up; warm_up()"]
+    with subprocess.Popen(command) as planner:
+        load_for_event_loop()
+        rollout_evaluator.warm_up()
+    if planner.returncode:
+        raise subprocess.CalledProcessError(planner.returncode, command)

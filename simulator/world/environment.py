@@ -167,9 +167,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             self._missions = 0
         key = (self._missions,) if self._missions else ()
         self._missions += 1
-        draw = Draw.one(
-            self.scenario, np.random.SeedSequence(self._entropy, spawn_key=key), self.arrivals, self.gains
-        )
+        draw = Draw.one(self.scenario, np.random.SeedSequence(self._entropy, spawn_key=key), self.arrivals, self.gains)
         observed = self._worlds.start(stacked([draw]))
         self.sensors, self.truth = self._worlds.sensors.of(0), draw.truth
         self.tally = []
