@@ -82,9 +82,8 @@ def findings(host: str, port: int) -> Iterator[Finding]:
     except ValidationError as error:
         for fault in error.errors():
             name = "AICVDS_" + "_".join(str(part) for part in fault["loc"]).upper()
-            yield Finding(
-                "settings", f"{name.removesuffix('_')}: {problem_of(fault)}", "see docs/reference/settings.md"
-            )
+            found = f"{name.removesuffix('_')}: {problem_of(fault)}"
+            yield Finding("settings", found, "see docs/reference/settings.md")
         return
     yield Finding("settings", f"mode {settings.mode}, deadline {settings.deadline_ms} ms, top-k {settings.top_k}")
     yield store_of(settings)
