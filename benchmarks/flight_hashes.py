@@ -37,7 +37,7 @@ import httpx
 import tyro
 
 from shared.client.edge_client import EdgeClient
-from simulator.commands.options import chosen_site
+from simulator.commands.options import site_from_options
 from simulator.flying.flight import fly
 from simulator.flying.lossy_transport import LossyTransport
 from simulator.flying.pilots import EdgePilot, LocalPilot
@@ -133,7 +133,7 @@ def told(flight: Flight, name: str) -> dict[str, Any]:
 
 def flown(course: Course, seed: int, steps: int | None, url: str) -> Flight:
     """One flight, on board or over the edge."""
-    site = chosen_site(course.scenario, None, steps)
+    site = site_from_options(course.scenario, None, steps)
     if not course.uplink:
         return fly(site, LocalPilot(course.decides, site.scenario, seed), seed)
     return _over(url, course, site, seed)

@@ -26,7 +26,7 @@ from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
-from simulator.flying.pilots import Choice, LocalPilot
+from simulator.flying.pilots import LocalPilot, PilotChoice
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 from simulator.world.observation_report import decide_request
@@ -100,7 +100,7 @@ class Scribe(LocalPilot):
         self.asked: list[Asked] = []
         self.together: list[Together] = []
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The policy's choice."""
         choice = super().decide(uav, observation, taken)
         step = int(observation["step"][0])
@@ -145,7 +145,7 @@ class Scribe(LocalPilot):
             whole = Prompt(template.fleet_static, first.experiences, state, first.uncompressed)
             self.together.append(Together(view.step, whole, [list(o.labels) for o, _ in self._step.values()]))
 
-    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+    def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Keep the outcome for this UAV's next request."""
         self._owed[uav] = Outcome(decision_id=self._decided[uav], cost=cost, failed=failed)
 

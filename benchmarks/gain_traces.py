@@ -36,7 +36,7 @@ from shared.world.trajectory import trajectories
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot
 from simulator.flying.rollout import rollout
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.policy import Policy
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
@@ -102,7 +102,7 @@ class AtFullSpeed:
         return self._policy.decide(uav, observation, taken)[0], self._velocity
 
 
-class Laps(RecedingHorizon):
+class Laps(RecedingHorizonPolicy):
     """Laps at a steady velocity, while the belief learns; it notes the map's errors ahead on the second lap.
 
     Attributes:

@@ -33,7 +33,7 @@ from shared.belief.shadowing import Shadowing
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario, scenario_named
 from simulator.flying.rollout import rollout
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.policy import Policy
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
@@ -99,7 +99,7 @@ class OwnKnown(KindKnown):
         self.offset_db, self.deviation_db = 0.0, self._along_db
 
 
-class MapGiven(RecedingHorizon):
+class MapGiven(RecedingHorizonPolicy):
     """The planner on board with a given radio map.
 
     Args:
@@ -123,7 +123,7 @@ def schemes(world: PipelineWorld) -> dict[str, Policy]:
     share = (1.0 - FADING) / (own + along)
     kind = Shadowing(own * share, along * share, scenario.decorrelation_m)
     return {
-        "mpc": RecedingHorizon(),
+        "mpc": RecedingHorizonPolicy(),
         "known_kind": MapGiven(lambda: KindKnown(scenario.sensors, kind)),
         "known_own": MapGiven(lambda: OwnKnown(own_db, scenario)),
         "true_links": InformedPlanner(world),

@@ -31,7 +31,7 @@ from shared.wire.schemas import Mode
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.flight import fly
 from simulator.flying.local_edge import HOST, edge_process, usable_port
-from simulator.flying.pilots import Choice, EdgePilot
+from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.records.flight import Flight
 from simulator.sites.site import Site
 
@@ -54,9 +54,11 @@ class Missions:
     """Where to write the figures."""
 
 
-def flown(url: str, scenario: Scenario, seed: int, args: Missions, began: float, progress: Progress) -> list[Choice]:
+def flown(
+    url: str, scenario: Scenario, seed: int, args: Missions, began: float, progress: Progress
+) -> list[PilotChoice]:
     """All decisions of one mission, flown in real time from ``began`` (a time of the monotonic clock) on."""
-    choices: list[Choice] = []
+    choices: list[PilotChoice] = []
     task = progress.add_task(f"mission {seed}", total=scenario.steps)
 
     def wait(flight: Flight) -> None:
@@ -71,7 +73,7 @@ def flown(url: str, scenario: Scenario, seed: int, args: Missions, began: float,
     return choices
 
 
-def figures(choices: list[Choice]) -> dict[str, object]:
+def figures(choices: list[PilotChoice]) -> dict[str, object]:
     """Counts by source and reason, and round trips in seconds."""
     trips = np.array([choice.exchange.rtt_ms for choice in choices if choice.exchange]) / 1e3
     sources = Counter(f"{choice.source} ({choice.reason})" if choice.reason else choice.source for choice in choices)

@@ -32,7 +32,7 @@ from lab.experiments.intervals import interval, paired
 from lab.experiments.stand_ins import answering, drawn
 from shared.client.edge_client import EdgeClient
 from shared.wire.schemas import Mode
-from simulator.commands.options import chosen_site
+from simulator.commands.options import site_from_options
 from simulator.flying.flight import fly
 from simulator.flying.local_edge import HOST
 from simulator.flying.pilots import EdgePilot
@@ -64,7 +64,7 @@ class Planning:
 def flown(edge: tuple[int, int], scenario: str, mode: Mode, seed: int) -> dict[str, float]:
     """One mission's quantities, on the edge of this process and port; raises ``SystemExit`` where it left one out."""
     process, port = edge
-    site, name = chosen_site(scenario, None), f"{scenario}-{mode}-{seed}"
+    site, name = site_from_options(scenario, None), f"{scenario}-{mode}-{seed}"
     busy_s = processor_s(process)
     with EdgeClient(f"http://{HOST}:{port}", timeout_s=PATIENCE_S) as client:
         pilot = EdgePilot(client, name, site.scenario, seed)

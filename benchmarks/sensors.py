@@ -47,7 +47,7 @@ from shared.wire.schemas import DecideRequest, MissionSpec, Mode, Outcome, Uplin
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.local_edge import HOST, edge_process, usable_port
-from simulator.flying.pilots import Choice, EdgePilot
+from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 
@@ -103,7 +103,7 @@ class Pilot(EdgePilot):
         self.requests: list[DecideRequest] = []
         self.on_request = self.requests.append
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The edge's choice."""
         known, since = -1, time.monotonic()
         while (told := httpx.get(self._status, timeout=60).json())["feedback"] - self._untaught > told[

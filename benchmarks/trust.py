@@ -36,8 +36,8 @@ from shared.client.edge_client import EdgeClient
 from shared.wire.schemas import Mode
 from shared.world.scenario import Scenario, scenario_named
 from simulator.flying.flight import fly
-from simulator.flying.pilots import Choice, EdgePilot
-from simulator.policies.mpc import RecedingHorizon
+from simulator.flying.pilots import EdgePilot, PilotChoice
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 
@@ -81,12 +81,12 @@ class Pilot(EdgePilot):
 
     def __init__(self, client: EdgeClient, scenario: Scenario, seed: int, echo: Echo) -> None:
         super().__init__(client, f"echo-{seed}", scenario, seed)
-        self.planner = RecedingHorizon()
+        self.planner = RecedingHorizonPolicy()
         self.planner.reset(scenario, seed)
         self._echo = echo
         self.trust: list[float] = []
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The edge's choice."""
         self._echo.answer = self.planner.decide(uav, observation, taken)
         choice = super().decide(uav, observation, taken)

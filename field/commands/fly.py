@@ -18,8 +18,8 @@ from simulator.commands.options import (
     check_mission,
     check_seed,
     check_wait,
-    checked_edge,
-    chosen_site,
+    edge_from_option,
+    site_from_options,
 )
 from simulator.commands.running import command_main
 from simulator.errors import INTERRUPTED, UsageError
@@ -137,7 +137,7 @@ def fly(options: Fly, command: str, console: Console) -> int:
 def job_from_options(options: Fly) -> FieldJob:
     """The flight that the options describe; raises ``UsageError`` for the first that is unusable."""
     mission_id = check(options)
-    edge = checked_edge(options.edge)
+    edge = edge_from_option(options.edge)
     out = options.out or Path("runs") / f"{mission_id}-uav{options.uav}"
     refuse_old_result(out, options.overwrite, DECISIONS)
     from field.vehicles.mavlink_vehicle import require_mavsdk
@@ -189,7 +189,7 @@ def check(options: Fly) -> str:
 
 def checked_site(options: Fly) -> Site:
     """The world; raises ``UsageError`` if it is unusable or has no trajectory for one of the UAVs."""
-    site = chosen_site(None, options.world, options.steps)
+    site = site_from_options(None, options.world, options.steps)
     last = site.scenario.uavs - len(options.mavlink)
     trajectories = f"the world has {site.scenario.uavs} trajectories"
     if last < 0:

@@ -21,7 +21,7 @@ from field.vehicles.heard_beacons import LossCounters
 from field.vehicles.mission_clock import Clock, MissionClock
 from field.vehicles.radio import Collected, Radio, Spot
 from shared.wire.schemas import Mode
-from simulator.flying.pilots import Choice
+from simulator.flying.pilots import PilotChoice
 from simulator.records.decision import Decision
 from simulator.records.flight import Flight, exchange_fields
 from simulator.sites.site import Site
@@ -50,7 +50,7 @@ class _Leg:
     """A decision that is being flown."""
 
     uav: FieldUav
-    choice: Choice
+    choice: PilotChoice
     spot: Spot
 
 

@@ -12,7 +12,7 @@ from shared.wire.missions import MissionStatus
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
-from simulator.flying.pilots import FALLBACK, Choice, reason_on_board
+from simulator.flying.pilots import FALLBACK, PilotChoice, reason_on_board
 from simulator.policies.registry import policy_named
 from simulator.world.observation import Observation
 from simulator.world.observation_report import decide_request
@@ -83,18 +83,20 @@ class FieldPilot:
         self._joined, self.mode = True, there.mode
         return there
 
-    async def decide(self, observations: Mapping[int, Observation]) -> dict[int, Choice]:
+    async def decide(self, observations: Mapping[int, Observation]) -> dict[int, PilotChoice]:
         """The choices for UAVs from their observations: the edge's, or EOF's on board, in the order of the UAVs."""
         answers = await asyncio.gather(*(self._answer(uav, seen) for uav, seen in observations.items()))
-        choices = {uav: found for uav, found in zip(observations, answers, strict=True) if isinstance(found, Choice)}
+        choices = {
+            uav: found for uav, found in zip(observations, answers, strict=True) if isinstance(found, PilotChoice)
+        }
         for (uav, seen), found in zip(observations.items(), answers, strict=True):
-            if not isinstance(found, Choice):
+            if not isinstance(found, PilotChoice):
                 taken = frozenset(choice.sensor for choice in choices.values())
                 sensor, velocity = self._fallback.decide(uav, seen, taken)
-                choices[uav] = Choice(int(sensor), int(velocity), "onboard", found)
+                choices[uav] = PilotChoice(int(sensor), int(velocity), "onboard", found)
         return dict(sorted(choices.items()))
 
-    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+    def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Store the outcome for this UAV's next request."""
         if choice.exchange is not None:
             self._pending_outcomes[uav] = choice.exchange.outcome(cost, failed)
@@ -109,7 +111,7 @@ class FieldPilot:
         except (EdgeError, TimeoutError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
 
-    async def _answer(self, uav: int, observation: Observation) -> Choice | str:
+    async def _answer(self, uav: int, observation: Observation) -> PilotChoice | str:
         """The edge's choice, or the reason why there is none."""
         outcome = self._pending_outcomes.get(uav)
         request = decide_request(uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=outcome)
@@ -127,7 +129,7 @@ class FieldPilot:
             self.outcomes_sent += 1
             if not answer.stored:
                 self._unstored_outcomes.append(outcome)
-        return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
+        return PilotChoice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
     async def _ask(self, request: DecideRequest) -> Exchange:
         if not self._joined:

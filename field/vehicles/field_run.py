@@ -24,14 +24,14 @@ from shared.client.errors import EdgeError
 from shared.wire.schemas import Mode
 from simulator.records.decision import Decision
 from simulator.records.decision_log import DecisionLog
-from simulator.records.request_log import RequestLog, resolved
+from simulator.records.request_log import RequestLog, with_edge_defaults
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
 from simulator.sites.site import Site
 
 
 @dataclass(frozen=True)
 class FieldJob:
-    """A flight to conduct.
+    """A flight of real UAVs.
 
     ``mavlink`` has the connections of UAVs ``first_uav`` and the ones after it. ``seed`` is the simulated sensors';
     ``None`` for real ones.
@@ -112,7 +112,7 @@ async def join_mission(pilot: FieldPilot, job: FieldJob) -> None:
     """Make or find the mission at the edge; without an edge the UAVs begin on board."""
     try:
         status = await pilot.join()
-        pilot.spec = resolved(pilot.spec, status)
+        pilot.spec = with_edge_defaults(pilot.spec, status)
         print_line(f"mission {job.mission_id}, mode {status.mode}; watch it at {job.edge}/?mission={job.mission_id}")
     except EdgeError as error:
         print_line(f"{error}; the UAVs decide on board until it answers")

@@ -18,7 +18,7 @@ from lab.experiments.plan import QUICK_LLM_SEEDS, QUICK_SEEDS, Experiment, Setup
 from lab.experiments.result import Result
 from shared.kit.ray_connection import RayUnusable
 from shared.kit.validation_messages import suggestion
-from simulator.commands.options import check_between, checked_edge, chosen_site
+from simulator.commands.options import check_between, edge_from_option, site_from_options
 from simulator.commands.running import command_main
 from simulator.errors import UsageError
 
@@ -127,13 +127,13 @@ def setup_of(options: Options) -> Setup:
             raise UsageError(f"--model {model}: there is no such file")
     if options.llm not in ("embedded", "none") and not options.llm.startswith(("http://", "https://")):
         raise UsageError(f"--llm {options.llm}: choose embedded, none, or a URL such as http://127.0.0.1:8080/v1")
-    site = chosen_site(options.scenario, options.world, options.steps)
+    site = site_from_options(options.scenario, options.world, options.steps)
     sites = {site.scenario.name: site}
     if options.scenario is None:
         named = dict.fromkeys(name for each in EXPERIMENTS.values() for name in each.worlds)
-        sites |= {name: chosen_site(name, None, options.steps) for name in named if name not in sites}
+        sites |= {name: site_from_options(name, None, options.steps) for name in named if name not in sites}
     pace: Literal["full", "quick"] = "quick" if options.quick else "full"
-    edge = None if options.edge is None else checked_edge(options.edge)
+    edge = None if options.edge is None else edge_from_option(options.edge)
     llm, llm_seeds = Llm(options.llm, edge), min(llm_seeds, seeds)
     return Setup(sites, llm, options.model, seeds, llm_seeds, options.steps, pace, options.scheme)
 

@@ -15,7 +15,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from lab.marl.plan import MOST_EPISODES, STATE, Plan
 from shared.world.scenario import Scenario
-from simulator.commands.options import check_between, check_seed, chosen_scenario
+from simulator.commands.options import check_between, check_seed, scenario_from_options
 from simulator.commands.running import command_main
 from simulator.errors import INTERRUPTED, UsageError
 from simulator.records.run_folder import naming_out
@@ -81,7 +81,7 @@ def train(options: Train, command: str, console: Console) -> int:
     Raises:
         UsageError: the options are unusable, the folder has another training, or the extra ``marl`` is not installed.
     """
-    scenario = chosen_scenario(options.scenario)
+    scenario = scenario_from_options(options.scenario)
     check(options)
     out = options.out or Path("runs") / options.scheme
     if (out / STATE).exists() and not options.resume:
@@ -150,12 +150,14 @@ def _run(training: Training, options: Train, console: Console) -> None:
 
 
 def _conclude(training: Training, command: str, out: Path, console: Console) -> None:
-    from lab.marl.checkpoint import Checkpoint
+    from lab.marl.checkpoint import PolicyCheckpoint
     from lab.marl.curve import plot, write_csv
 
     plan = training.plan
     weights = {name: value.clone() for name, value in training.learner.network.state_dict().items()}
-    trained = Checkpoint(plan.scheme, plan.scenario, plan.episodes, plan.seed, command, version("aic-vds"), weights)
+    trained = PolicyCheckpoint(
+        plan.scheme, plan.scenario, plan.episodes, plan.seed, command, version("aic-vds"), weights
+    )
     trained.save(out / f"{plan.scheme}.pt")
     write_csv(training.points, out / f"{plan.scheme}.csv")
     plot(training.points, f"{plan.scheme.upper()} in scenario {plan.scenario.name}", out / plan.scheme)

@@ -18,7 +18,7 @@ from shared.client.errors import EdgeError
 from simulator.errors import UsageError
 from simulator.flying.flight import fly
 from simulator.flying.job import new_mission_id
-from simulator.flying.pilots import Choice, EdgePilot, LocalPilot, Pilot
+from simulator.flying.pilots import EdgePilot, LocalPilot, Pilot, PilotChoice
 from simulator.records.decision import Decision
 from simulator.records.flight import Flight
 from simulator.world.observation import Observation
@@ -35,7 +35,7 @@ class FullSpeed(LocalPilot):
         super().__init__(name, planned.site.scenario, planned.seed)
         self._velocity = site_max_velocity
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The policy's sensor at full speed."""
         return replace(super().decide(uav, observation, taken), velocity=self._velocity)
 
@@ -78,7 +78,7 @@ def fly_with_edge(edge: EdgeAt, planned: Planned) -> FlightRecord:
     mission_id = new_mission_id(scenario, planned.seed)
     lossy = scenario.uplink_drop > 0
 
-    def check(choice: Choice) -> None:
+    def check(choice: PilotChoice) -> None:
         if choice.source == "onboard" and not (lossy and choice.reason == "edge_unreachable"):
             edge.alive()
             raise EdgeError(

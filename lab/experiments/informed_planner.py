@@ -8,14 +8,14 @@ import numpy as np
 
 from shared.planning.receding import Draft
 from simulator.bound.true_problem import course, true_links
-from simulator.flying.pilots import Choice, LocalPilot
-from simulator.policies.mpc import RecedingHorizon
+from simulator.flying.pilots import LocalPilot, PilotChoice
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
 
 
-class InformedPlanner(RecedingHorizon):
+class InformedPlanner(RecedingHorizonPolicy):
     """The planner of ``mpc`` with the true links of every step of its horizon.
 
     They have shadowing, fading, dead radios, the links' share and the mean wind. Queues, arrivals and later gusts are
@@ -56,7 +56,7 @@ class InformedPilot(LocalPilot):
         self._actions: dict[str, tuple[int, int]] = {}
         super().__init__("informed", site.scenario, seed, InformedPlanner(self._twin))
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The plan's choice."""
         if int(observation["step"][0]) > len(self._twin.tally):
             self._twin.step(self._actions)

@@ -17,7 +17,7 @@ from shared.world.scenario import Scenario
 # The world and the planner take seconds to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:
     from lab.exploration.teachers import Action, Teacher, TeacherName
-    from simulator.flying.pilots import Choice
+    from simulator.flying.pilots import PilotChoice
     from simulator.world.observation import Observation
 
 # The longest deadline: a fallback of the edge teaches the LLM nothing.
@@ -184,7 +184,7 @@ class _EdgeFleet:
         self._client = EdgeClient(url, timeout_s=_TIMEOUT_S)
         self._mission_id = f"explore-{mission}-{secrets.token_hex(4)}"
         self._pilot = EdgePilot(self._client, self._mission_id, scenario, mission, deadline_ms=_DEADLINE_MS)
-        self._choices: dict[int, Choice] = {}
+        self._choices: dict[int, PilotChoice] = {}
 
     def __enter__(self) -> Self:
         self._client.put_mission(self._mission_id, self._pilot.spec)

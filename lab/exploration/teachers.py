@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.bound.true_problem import targets, true_problem, velocities_towards
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
 
@@ -48,7 +48,7 @@ class Teacher(Protocol):
         """Take the outcome of the UAV's action in that step."""
 
 
-class Planner(RecedingHorizon):
+class Planner(RecedingHorizonPolicy):
     """The receding-horizon planner with the fleet's belief; it has a reference action at every step."""
 
     deviations = 0.5

@@ -16,12 +16,12 @@ from shared.world.scenario import Scenario
 from simulator.errors import UsageError
 
 
-class Misfit(UsageError, ValueError):
+class CheckpointMismatch(UsageError, ValueError):
     """The weights are for scenarios of another size."""
 
 
 @dataclass(frozen=True, eq=False)
-class Checkpoint:
+class PolicyCheckpoint:
     """Weights of :func:`lab.marl.networks.two_heads` in float32, and their origin.
 
     Attributes:
@@ -45,7 +45,7 @@ class Checkpoint:
         write({**asdict(self), "scenario": self.scenario.model_dump_json()}, path)
 
     @classmethod
-    def load(cls, path: Path) -> Checkpoint:
+    def load(cls, path: Path) -> PolicyCheckpoint:
         """Read a checkpoint.
 
         Raises:
@@ -62,12 +62,12 @@ class Checkpoint:
         """The network for missions of a scenario.
 
         Raises:
-            Misfit: the network was trained for other numbers of sensors, UAVs or velocities.
+            CheckpointMismatch: the network was trained for other numbers of sensors, UAVs or velocities.
         """
         for name in ("sensors", "uavs", "max_velocity"):
             trained, requested = getattr(self.scenario, name), getattr(scenario, name)
             if trained != requested:
-                raise Misfit(
+                raise CheckpointMismatch(
                     f"{self.scheme} was trained for {name} {trained}, scenario {scenario.name} has {requested}: "
                     f"train one with `python -m lab train {self.scheme} --scenario {scenario.name}`"
                 )
@@ -76,10 +76,10 @@ class Checkpoint:
         return network.eval()
 
 
-def shipped(scheme: str) -> Checkpoint:
+def shipped(scheme: str) -> PolicyCheckpoint:
     """The checkpoint of a scheme that comes with the package."""
     with as_file(files("lab.marl").joinpath("checkpoints", f"{scheme}.pt")) as path:
-        return Checkpoint.load(path)
+        return PolicyCheckpoint.load(path)
 
 
 def write(content: dict[str, Any], path: Path) -> None:

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
-from lab.marl.network_inputs import stacked, width
+from lab.marl.network_inputs import fleet_input, width
 from shared.world.scenario import Scenario
 from simulator.world.batch import BatchObservation, VectorWorld
 from simulator.world.observation import Cost
@@ -24,7 +24,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
 
     | key | shape, type | meaning |
     |---|---|---|
-    | ``agents, observation`` | ``(B, I, F)`` float32 | each UAV's, by :func:`lab.marl.network_inputs.view` |
+    | ``agents, observation`` | ``(B, I, F)`` float32 | each UAV's, by :func:`lab.marl.network_inputs.actor_input` |
     | ``agents, action_mask`` | ``(B, I, J + V)`` bool | the slots and velocities allowed |
     | ``agents, action`` | ``(B, I, 2)`` int64 | slot of the sensor in the UAV's own order, velocity in m/s |
     | ``agents, reward`` | ``(B, I, 1)`` float32 | minus the world's cost |
@@ -78,7 +78,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
             self.next_seed = seed
 
     def _tensors(self, observation: BatchObservation, lost: NDArray[Any]) -> TensorDict:
-        views = stacked(self._world.scenario, observation)
+        views = fleet_input(self._world.scenario, observation)
         self._order = views.order
         over = torch.full((*self.batch_size, 1), self._world.steps_flown == self._world.scenario.steps)
         agents = {"observation": torch.from_numpy(views.features), "action_mask": torch.from_numpy(views.mask)}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from torch import nn
 
-from lab.marl.network_inputs import of_uav, view, without
+from lab.marl.network_inputs import actor_input, mask_without, uav_slice
 from lab.marl.networks import greedy
 from shared.world.channel import IntArray
 from shared.world.scenario import Scenario
@@ -27,8 +27,8 @@ def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -
         taken = np.zeros((len(seeds), scenario.sensors), dtype=np.bool_)
         actions = np.zeros((len(seeds), scenario.uavs, 2), dtype=np.int64)
         for uav in range(scenario.uavs):
-            own = view(scenario, uav, of_uav(observation, uav))
-            slot, velocity = greedy(network, scenario.sensors, own.features, without(own, taken)).T
+            own = actor_input(scenario, uav, uav_slice(observation, uav))
+            slot, velocity = greedy(network, scenario.sensors, own.features, mask_without(own, taken)).T
             actions[:, uav] = np.stack((own.order[rows, slot], velocity), axis=-1)
             taken[rows, actions[:, uav, 0]] = True
         observation, outcome = world.step(actions[..., 0], actions[..., 1])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Learned:
     """The greedy policy of a network trained by `python -m lab train`; it draws no random number.
 
-    Its input is :func:`lab.marl.network_inputs.view` of the UAV's observation. It chooses among the free
+    Its input is :func:`lab.marl.network_inputs.actor_input` of the UAV's observation. It chooses among the free
     sensors heard at least once, or among all free sensors if there is none.
 
     Args:
@@ -30,9 +30,9 @@ class Learned:
     """
 
     def __init__(self, scheme: str, checkpoint: Path | None = None) -> None:
-        from lab.marl.checkpoint import Checkpoint, shipped
+        from lab.marl.checkpoint import PolicyCheckpoint, shipped
 
-        self._checkpoint = shipped(scheme) if checkpoint is None else Checkpoint.load(checkpoint)
+        self._checkpoint = shipped(scheme) if checkpoint is None else PolicyCheckpoint.load(checkpoint)
         self._network: nn.Module
 
     def reset(self, scenario: Scenario, seed: int) -> None:
@@ -42,11 +42,11 @@ class Learned:
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
         """Sensor and velocity."""
-        from lab.marl.network_inputs import taken_by, view, without
+        from lab.marl.network_inputs import actor_input, mask_without, taken_mask
         from lab.marl.networks import greedy
 
-        own = view(self._scenario, uav, observation)
-        mask = without(own, taken_by(taken, self._scenario.sensors))
+        own = actor_input(self._scenario, uav, observation)
+        mask = mask_without(own, taken_mask(taken, self._scenario.sensors))
         slot, velocity = greedy(self._network, self._scenario.sensors, own.features, mask).tolist()
         return int(own.order[slot]), velocity
 

@@ -27,7 +27,7 @@ _OLD_STEPS = 20
 _AGE_UNIT_STEPS = 10.0
 
 
-class View(NamedTuple):
+class ActorInput(NamedTuple):
     """An actor's input from one UAV's observation; leading dimensions are those of the observation.
 
     Attributes:
@@ -47,8 +47,8 @@ def width(scenario: Scenario) -> int:
     return 3 + scenario.uavs + scenario.max_velocity + 1 + columns * scenario.sensors
 
 
-def view(scenario: Scenario, uav: int, observation: Mapping[str, Any]) -> View:
-    """Features, mask and slot order from a UAV's ``Observation`` alone.
+def actor_input(scenario: Scenario, uav: int, observation: Mapping[str, Any]) -> ActorInput:
+    """Features, mask and slot order from a UAV's ``Observation``.
 
     Features of the UAV: the share of the mission flown, the cosine and sine of the phase of its lap, a one-hot of its
     index, and for each velocity the largest expected yield of one sensor after a step. Features of each sensor: whether
@@ -95,22 +95,22 @@ def view(scenario: Scenario, uav: int, observation: Mapping[str, Any]) -> View:
     features = np.concatenate(parts, axis=-1).astype(np.float32)
     selectable = np.take_along_axis(heard | ~heard.any(axis=-1, keepdims=True), order, axis=-1)
     velocities = np.ones((*order.shape[:-1], scenario.max_velocity + 1), dtype=np.bool_)
-    return View(features, np.concatenate((selectable, velocities), axis=-1), order)
+    return ActorInput(features, np.concatenate((selectable, velocities), axis=-1), order)
 
 
-def stacked(scenario: Scenario, observation: Mapping[str, Any]) -> View:
+def fleet_input(scenario: Scenario, observation: Mapping[str, Any]) -> ActorInput:
     """The views of a whole fleet, from arrays ``(B, I, ...)`` to arrays ``(B, I, ...)``."""
     fleet = range(scenario.uavs)
-    views = [view(scenario, uav, of_uav(observation, uav)) for uav in fleet]
-    return View(*(np.stack(parts, axis=1) for parts in zip(*views, strict=True)))
+    views = [actor_input(scenario, uav, uav_slice(observation, uav)) for uav in fleet]
+    return ActorInput(*(np.stack(parts, axis=1) for parts in zip(*views, strict=True)))
 
 
-def of_uav(observation: Mapping[str, Any], uav: int) -> dict[str, Any]:
+def uav_slice(observation: Mapping[str, Any], uav: int) -> dict[str, Any]:
     """One UAV's part of arrays ``(B, I, ...)``: arrays ``(B, ...)``."""
     return {key: value[:, uav] for key, value in observation.items()}
 
 
-def without(own: View, taken: BoolArray) -> BoolArray:
+def mask_without(own: ActorInput, taken: BoolArray) -> BoolArray:
     """The mask without the sensors taken by other UAVs; if no slot remains, all free sensors; without those, all.
 
     Args:
@@ -124,7 +124,7 @@ def without(own: View, taken: BoolArray) -> BoolArray:
     return np.concatenate((slots, own.mask[..., count:]), axis=-1)
 
 
-def taken_by(taken: Collection[int], sensors: int) -> BoolArray:
+def taken_mask(taken: Collection[int], sensors: int) -> BoolArray:
     """The mask of the sensors in the collection, ``(J,)``."""
     return np.isin(np.arange(sensors), list(taken))
 

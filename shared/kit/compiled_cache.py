@@ -15,7 +15,7 @@ _RULES = Path(__file__).parents[1] / "world"
 class BesideModule(InTreeCacheLocator):
     """The folder ``__pycache__`` beside a module, also one that is read-only but has the function, as in an image.
 
-    A function is compiled anew after a change of any module of its folder or of ``shared/world``, which have its callees.
+    A function is compiled anew after a change in its folder or in ``shared/world``, which have its callees.
     """
 
     def get_source_stamp(self) -> bytes:

@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import arg
 
 from simulator.bound.clairvoyant_bound import clairvoyant, confirmed
-from simulator.commands.options import check_between, check_seed, chosen_site
+from simulator.commands.options import check_between, check_seed, site_from_options
 from simulator.commands.running import command_main
 from simulator.records.record import Record
 from simulator.records.run_folder import naming_out
@@ -78,7 +78,7 @@ def main(argv: list[str]) -> int:
 
 
 def _run(options: BoundOptions, console: Console) -> int:
-    site = chosen_site(options.scenario, options.world, options.steps)
+    site = site_from_options(options.scenario, options.world, options.steps)
     scenario = site.scenario
     check_seed(options.seed)
     check_between("--time-limit-s", options.time_limit_s, 0.1, 86_400)

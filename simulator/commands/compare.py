@@ -51,9 +51,9 @@ def compare(options: Compare, console: Console) -> int:
     """
     if len(options.runs) < 2:
         raise UsageError("name two or more missions' folders, such as runs/eof runs/wqcs")
-    from simulator.reporting.comparison import caution, names, read_run, render_comparison, rows
+    from simulator.reporting.comparison import caution, names, read_result, render_comparison, rows
 
-    runs = [read_run(folder) for folder in options.runs]
+    runs = [read_result(folder) for folder in options.runs]
     table = Table("")
     for name in names(runs):
         # A name's end may be all in which two runs differ.

@@ -11,11 +11,11 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, arg
 
-from simulator.commands.options import check_between, check_seed, check_wait, chosen_site
+from simulator.commands.options import check_between, check_seed, check_wait, site_from_options
 from simulator.commands.running import command_main
 from simulator.flying.job import BOUND_S, Job, new_mission_id
 from simulator.flying.local_edge import HOST, check_alive, edge_process, usable_port
-from simulator.flying.run import conduct
+from simulator.flying.run import run_mission
 from simulator.records.run_folder import REPORT, fresh_folder, refuse_old_result
 
 EDGE_LOG = "edge.log"
@@ -64,7 +64,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         UsageError: the options are unusable, or the folder cannot be written.
         EdgeError: the edge died at start, or never became ready.
     """
-    site = chosen_site(options.scenario, options.world)
+    site = site_from_options(options.scenario, options.world)
     check_seed(options.seed)
     check_wait(options.wait_s)
     check_between("--port", options.port, 0, 65_535)
@@ -90,7 +90,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         console.print(
             f"Started an edge on port {port}; its log is {log}", markup=False, highlight=False, soft_wrap=True
         )
-        code = conduct(job, console, alive=lambda: check_alive(process, log))
+        code = run_mission(job, console, alive=lambda: check_alive(process, log))
     if code == 0:
         console.print(_next_steps(options.out), markup=False, highlight=False, soft_wrap=True)
     return code

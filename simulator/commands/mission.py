@@ -14,7 +14,7 @@ from tyro.conf import arg
 
 from shared.client.edge_client import API_KEY
 from shared.wire.schemas import DecideRequest, MissionSpec, Mode
-from simulator.commands.options import check_mission, check_note, check_seed, checked_edge, chosen_site
+from simulator.commands.options import check_mission, check_note, check_seed, edge_from_option, site_from_options
 from simulator.commands.running import command_main
 from simulator.flying.job import new_mission_id
 
@@ -64,11 +64,11 @@ def create(options: Create, console: Console) -> int:
         UsageError: the options or the world's files are unusable.
         EdgeError: the edge cannot be reached, or refuses.
     """
-    edge = checked_edge(options.edge)
+    edge = edge_from_option(options.edge)
     check_seed(options.seed)
     check_mission(options.mission)
     check_note(options.note)
-    site = chosen_site(options.scenario, options.world, options.steps)
+    site = site_from_options(options.scenario, options.world, options.steps)
     from shared.client.edge_client import EdgeClient
     from simulator.world.observation_report import decide_request
 
@@ -84,13 +84,13 @@ def create(options: Create, console: Console) -> int:
     print(f"# Mission {mission_id}: {world.sensors} sensors, {fleet}, {world.steps} steps, mode {made.mode}.")
     print(f"# Watch it at {edge}/?mission={mission_id}")
     print("# Ask for a decision:")
-    print(curl(f"{edge}/decide", pasted(request), key is not None))
+    print(curl(f"{edge}/decide", readable_json(request), key is not None))
     print("# Report its outcome, with the decision_id of the answer. The cost is 1 if the transmission failed, and for")
     print("# every sensor the packets that it lost in the step, divided by its queue's capacity:")
     print(curl(f"{edge}/feedback", '{"decision_id": "…", "cost": 0.2}', key is not None))
     if options.note is not None:
         guidance = f"{edge}/missions/{mission_id}/guidance"
-        print("# What the LLM understood of the note, in a few seconds, and your word on it:")
+        print("# How the LLM compiled the note, after a few seconds, and your confirmation:")
         print(f"curl {shlex.quote(guidance)}")
         print(curl(guidance, '{"answer": "confirm"}', key is not None))
     return 0
@@ -102,7 +102,7 @@ def curl(url: str, body: str, with_key: bool) -> str:
     return f"curl -X POST {shlex.quote(url)} -H 'Content-Type: application/json'{key} -d {shlex.quote(body)}"
 
 
-def pasted(request: DecideRequest) -> str:
+def readable_json(request: DecideRequest) -> str:
     """The request's JSON, a line for each column, with numbers that people can read."""
     body: dict[str, Any] = json.loads(request.model_dump_json(exclude_none=True, exclude={"sensors"}))
     columns = {name: _rounded(column) for name, column in request.sensors.model_dump().items()}

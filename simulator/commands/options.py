@@ -59,7 +59,7 @@ def _check_as(kind: Any, option: str, value: str, remedy: str) -> None:
         raise UsageError(f"{option} {value[:32]!r}: {remedy}") from None
 
 
-def checked_edge(edge: str | None) -> str:
+def edge_from_option(edge: str | None) -> str:
     """The URL in ``--edge``; raises ``UsageError`` for a missing or invalid one."""
     if edge is None:
         raise UsageError("--edge is missing: give the edge's address, such as --edge http://127.0.0.1:8000")
@@ -69,7 +69,7 @@ def checked_edge(edge: str | None) -> str:
         raise UsageError(f"--edge: {error}") from None
 
 
-def chosen_site(scenario: str | None, world: Path | None, steps: int | None = None) -> Site:
+def site_from_options(scenario: str | None, world: Path | None, steps: int | None = None) -> Site:
     """The site that a command's options name; by default the scenario ``paper``.
 
     Warnings about a world, such as a sensor out of every UAV's reach, go to stderr.
@@ -84,7 +84,7 @@ def chosen_site(scenario: str | None, world: Path | None, steps: int | None = No
             invalid.
     """
     if world is None:
-        return Site(chosen_scenario(scenario or "paper", steps))
+        return Site(scenario_from_options(scenario or "paper", steps))
     if scenario is not None:
         raise UsageError(f"--scenario {scenario[:32]} and --world {world} contradict each other; give one of the two")
     if steps is not None and not 1 <= steps <= 10_000:
@@ -95,7 +95,7 @@ def chosen_site(scenario: str | None, world: Path | None, steps: int | None = No
     return site_from_folder(world, steps, on_warning=lambda text: print(f"warning: {text}", file=sys.stderr))
 
 
-def chosen_scenario(name: str, steps: int | None = None) -> Scenario:
+def scenario_from_options(name: str, steps: int | None = None) -> Scenario:
     """The preset of that name, with ``steps`` overridden if given; raises ``UsageError``."""
     try:
         scenario = scenario_named(name)

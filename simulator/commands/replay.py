@@ -20,7 +20,7 @@ from shared.client.calls import Exchange
 from shared.client.edge_client import API_KEY, EdgeClient
 from shared.client.errors import EdgeError
 from shared.wire.schemas import DecideRequest, Features, FeedbackRequest, Init, MissionSpec, Mode, Outcome, Selection
-from simulator.commands.options import check_deadline, check_wait, checked_edge
+from simulator.commands.options import check_deadline, check_wait, edge_from_option
 from simulator.commands.running import command_main
 from simulator.errors import INTERRUPTED, UsageError
 from simulator.flying.edge_session import DEFAULT_TIMEOUT_S, NETWORK_SLACK_S, await_edge
@@ -62,7 +62,7 @@ class Replay:
     ages in its prompts, follow its own decisions and not the flight.
 
     Written to --out: replay.json (agreement by source; tokens, latency and cost of both missions) and replayed.jsonl
-    (each decision beside the logged one). Exit code: 0 complete, 1 no edge, or the edge was lost (the decisions so far
+    (each decision with the logged one). Exit code: 0 complete, 1 no edge, or the edge was lost (the decisions so far
     are written), 2 bad use, 130 interrupted (written too). The key of an edge is read from AICVDS_API_KEY.
     """
 
@@ -115,14 +115,14 @@ def main(argv: list[str]) -> int:
 
 
 @dataclass(frozen=True)
-class Logged:
+class LoggedMission:
     """A logged mission: its spec, and each request with the decision flown."""
 
     spec: MissionSpec
     decisions: list[tuple[DecideRequest, Decision]]
 
 
-def logged_mission(run: Path) -> Logged:
+def read_logged_mission(run: Path) -> LoggedMission:
     """The mission in a folder of ``aicvds simulate``; raises ``UsageError`` if it cannot be replayed."""
     if not run.is_dir():
         raise UsageError(f"{run} is no folder; name one that `aicvds simulate --edge URL` wrote")
@@ -143,7 +143,7 @@ def logged_mission(run: Path) -> Logged:
     decisions = [(request, flown[key]) for request, key in pairs if key in flown]
     if not decisions:
         raise UsageError(f"{run} has no decision to replay")
-    return Logged(spec, decisions)
+    return LoggedMission(spec, decisions)
 
 
 def replay(options: Replay, command: str, console: Console) -> int:
@@ -154,9 +154,9 @@ def replay(options: Replay, command: str, console: Console) -> int:
         EdgeError: no edge is ready, or the edge refuses the changed mission.
     """
     check(options)
-    edge = checked_edge(options.edge)
-    logged = logged_mission(options.run)
-    spec = changed_spec(logged.spec, options)
+    edge = edge_from_option(options.edge)
+    logged = read_logged_mission(options.run)
+    spec = apply_options(logged.spec, options)
     assert not isinstance(spec.scenario, str), "an edge resolves the scenario's name"
     mission_id = f"{new_mission_id(spec.scenario, spec.seed)}-replay"
     out = options.out or Path("runs") / mission_id
@@ -179,7 +179,7 @@ def replay(options: Replay, command: str, console: Console) -> int:
 
 
 def summarise(
-    logged: Logged, spec: MissionSpec, compared: list[Compared], prices: Prices | None, **facts: str
+    logged: LoggedMission, spec: MissionSpec, compared: list[Compared], prices: Prices | None, **facts: str
 ) -> ReplaySummary:
     """The summary of a replay with ``spec``."""
     return ReplaySummary(
@@ -198,13 +198,13 @@ def summarise(
 
 
 class Replayer:
-    """Sends logged requests to an edge; ``compared`` has the decisions so far beside the logged ones."""
+    """Sends logged requests to an edge; ``compared`` pairs the decisions so far with the logged ones."""
 
     def __init__(self, client: EdgeClient, mission_id: str, deadline_ms: int | None) -> None:
         self._client = client
         self._mission_id = mission_id
         self._deadline_ms = deadline_ms
-        self._pending: dict[int, Outcome] = {}
+        self._pending_outcomes: dict[int, Outcome] = {}
         self.compared: list[Compared] = []
 
     def replay(self, request: DecideRequest, flown: Decision) -> Compared:
@@ -213,26 +213,29 @@ class Replayer:
         Raises:
             EdgeError: the edge gives no usable answer.
         """
-        changes: dict[str, Any] = {"mission_id": self._mission_id, "outcome": self._pending.pop(request.uav_id, None)}
+        changes: dict[str, Any] = {
+            "mission_id": self._mission_id,
+            "outcome": self._pending_outcomes.pop(request.uav_id, None),
+        }
         if self._deadline_ms is not None:
             changes["deadline_ms"] = self._deadline_ms
         exchange = self._client.decide(request.model_copy(update=changes))
         compared = Compared(logged=flown, replayed=_decision(flown, exchange))
         if compared.same:
-            self._pending[request.uav_id] = exchange.outcome(flown.cost, flown.failed)
+            self._pending_outcomes[request.uav_id] = exchange.outcome(flown.cost, flown.failed)
             compared = compared.model_copy(update={"fed_back": True})
         self.compared.append(compared)
         return compared
 
     def finish(self) -> None:
         """Send the outcomes that no later request carried."""
-        for uav in sorted(self._pending):
-            outcome = self._pending[uav]
+        for uav in sorted(self._pending_outcomes):
+            outcome = self._pending_outcomes[uav]
             self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
-        self._pending.clear()
+        self._pending_outcomes.clear()
 
 
-def _replay_all(replayer: Replayer, logged: Logged, out: Path, console: Console) -> int:
+def _replay_all(replayer: Replayer, logged: LoggedMission, out: Path, console: Console) -> int:
     """Replay the requests in the order flown, and write each decision at once; returns the exit code so far."""
     with naming_out(out):
         log = (out / REPLAYED).open("w", encoding="utf-8")
@@ -288,7 +291,7 @@ def prices(options: Replay) -> Prices | None:
     return Prices(options.price_input, cached, output)
 
 
-def changed_spec(spec: MissionSpec, options: Replay) -> MissionSpec:
+def apply_options(spec: MissionSpec, options: Replay) -> MissionSpec:
     """The logged spec with the options' changes; raises ``UsageError`` for a value out of bounds."""
     fields = {name: getattr(options, name) for name in _OF_SPEC if getattr(options, name) is not None}
     prompt = {name: getattr(options, name) for name in _OF_PROMPT if getattr(options, name) is not None}

@@ -19,13 +19,13 @@ from simulator.commands.options import (
     check_note,
     check_seed,
     check_wait,
-    checked_edge,
-    chosen_site,
+    edge_from_option,
+    site_from_options,
 )
 from simulator.commands.running import command_main
 from simulator.errors import INTERRUPTED, UsageError
 from simulator.flying.job import BOUND_S, Job, new_mission_id
-from simulator.flying.run import conduct
+from simulator.flying.run import run_mission
 from simulator.records.run_folder import refuse_old_result
 
 
@@ -128,9 +128,9 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
         UsageError: the options are unusable, or the folder cannot be written.
         EdgeError: no edge is ready.
     """
-    site = chosen_site(options.scenario, options.world, options.steps)
+    site = site_from_options(options.scenario, options.world, options.steps)
     check(options)
-    from simulator.flying.flight_metrics import FlightMetrics, served
+    from simulator.flying.flight_metrics import FlightMetrics, serve_metrics
 
     mission_id = options.mission or new_mission_id(site.scenario, options.seed)
     job = Job(
@@ -153,8 +153,8 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     )
     refuse_old_result(job.out, options.overwrite)
     metrics = FlightMetrics(site.scenario.steps)
-    with served(metrics, options.metrics_host, options.metrics_port) as server:
-        code = conduct(job, console, metrics=metrics)
+    with serve_metrics(metrics, options.metrics_host, options.metrics_port) as server:
+        code = run_mission(job, console, metrics=metrics)
         # All results are written: Ctrl-C only ends this wait.
         if server is not None and code != INTERRUPTED:
             with console.status("Waiting until Prometheus has the last numbers"), suppress(KeyboardInterrupt):
@@ -175,7 +175,7 @@ def check(options: Simulate) -> None:
     check_between("--reconnect-s", options.reconnect_s, 0, 3600)
     check_between("--metrics-port", options.metrics_port, 0, 65_535)
     if options.policy == "edge":
-        checked_edge(options.edge)
+        edge_from_option(options.edge)
         check_mission(options.mission)
         check_note(options.note)
         return

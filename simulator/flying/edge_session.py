@@ -1,4 +1,4 @@
-"""The edge of a flight: waited for, and given the mission that is flown."""
+"""The edge of a flight: its clients, the wait for it, and the mission made there."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from simulator.flying.lossy_transport import LossyTransport
 # Without a requested deadline the edge's default applies, which may be as long as the paper's step.
 DEFAULT_TIMEOUT_S = 10.0
 NETWORK_SLACK_S = 1.0
-# The timeout of a readiness probe during an outage, short beside the wait for the edge.
+# The timeout of a readiness probe during an outage, short compared with the wait for the edge.
 PROBE_TIMEOUT_S = 2.0
 
 
-def begun_mission(ground: EdgeClient, job: Job, spec: MissionSpec) -> MissionStatus:
+def create_or_check_mission(ground: EdgeClient, job: Job, spec: MissionSpec) -> MissionStatus:
     """The mission at the edge: made now, or, where the job names one that is there, that one.
 
     Raises:
@@ -68,14 +68,14 @@ def radio_link(scenario: Scenario, seed: int) -> LossyTransport | None:
     return LossyTransport(inner, drop=scenario.uplink_drop, jitter_ms=scenario.uplink_jitter_ms, seed=seed)
 
 
-def client_of(job: Job, edge: str, transport: httpx.BaseTransport | None = None) -> EdgeClient:
+def job_client(job: Job, edge: str, transport: httpx.BaseTransport | None = None) -> EdgeClient:
     """A client of the edge with the job's deadline and uplink; without ``transport`` its link is lossless."""
     timeout_s = DEFAULT_TIMEOUT_S if job.deadline_ms is None else job.deadline_ms / 1000 + NETWORK_SLACK_S
     key = os.environ.get(API_KEY) or None
     return EdgeClient(edge, timeout_s=timeout_s, api_key=key, seed=job.seed, transport=transport, uplink=job.uplink)
 
 
-def probe_of(edge: str) -> EdgeClient:
+def probe_client(edge: str) -> EdgeClient:
     """A client that asks once and waits briefly, for the edge's state during an outage."""
     return EdgeClient(edge, timeout_s=PROBE_TIMEOUT_S, attempts=1, api_key=os.environ.get(API_KEY) or None)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from pydantic_core import PydanticSerializationError
 
-from simulator.flying.pilots import Choice, Pilot
+from simulator.flying.pilots import Pilot, PilotChoice
 from simulator.records.decision import Decision
 from simulator.records.decision_log import DecisionLog
 from simulator.records.flight import Flight, exchange_fields
@@ -24,7 +24,7 @@ def fly(
     pilot: Pilot,
     seed: int,
     log: DecisionLog | None = None,
-    on_decision: Callable[[Choice], None] | None = None,
+    on_decision: Callable[[PilotChoice], None] | None = None,
     on_step: Callable[[Flight], None] | None = None,
     on_decided: Callable[[int, Sensors], None] | None = None,
 ) -> Flight:
@@ -48,7 +48,7 @@ def fly(
         flight.sensor_xy = np.array(observations["uav_0"]["sensor_position"], dtype=float)
         flight.track.append(_instant(world, observations, {}))
         for step in range(scenario.steps):
-            choices: dict[int, Choice] = {}
+            choices: dict[int, PilotChoice] = {}
             for agent, uav in world.live.items():
                 taken = frozenset(choice.sensor for choice in choices.values())
                 choices[uav] = pilot.decide(uav, observations[agent], taken)
@@ -90,7 +90,7 @@ def _instant(world: PipelineWorld, observations: Mapping[str, Observation], left
 def _record(
     flight: Flight,
     observations: Mapping[str, Observation],
-    choices: Mapping[int, Choice],
+    choices: Mapping[int, PilotChoice],
     infos: Mapping[str, Info],
     log: DecisionLog | None,
 ) -> None:

@@ -16,7 +16,7 @@ from prometheus_client.process_collector import ProcessCollector
 from simulator.errors import UsageError
 
 if TYPE_CHECKING:
-    from simulator.flying.pilots import Choice
+    from simulator.flying.pilots import PilotChoice
     from simulator.records.flight import Flight
 
 LONGEST_LAST_SCRAPE_S = 20.0
@@ -47,13 +47,13 @@ class FlightMetrics:
         self._flown = Gauge("aicvds_flight_steps_flown", "Steps that the whole fleet has flown", registry=r)
         Gauge("aicvds_flight_steps", "Steps that the mission has", registry=r).set(steps)
 
-    def decided(self, choice: Choice) -> None:
+    def count_decision(self, choice: PilotChoice) -> None:
         """Count one decision."""
         self._decisions.labels(choice.source, choice.reason or "none").inc()
         if choice.exchange is not None:
             self._round_trip.observe(choice.exchange.rtt_ms / 1e3)
 
-    def stepped(self, flight: Flight) -> None:
+    def count_step(self, flight: Flight) -> None:
         """Count one step of the whole fleet."""
         tally = flight.tally[-1]
         self._lost.inc(tally.lost_packets)
@@ -135,7 +135,7 @@ class MetricsServer:
 
 
 @contextmanager
-def served(metrics: FlightMetrics, host: str, port: int) -> Iterator[MetricsServer | None]:
+def serve_metrics(metrics: FlightMetrics, host: str, port: int) -> Iterator[MetricsServer | None]:
     """Within the context, serve the metrics to Prometheus; port 0 serves none.
 
     Raises:

@@ -1,4 +1,4 @@
-"""One mission to conduct."""
+"""The settings of one simulated mission."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def new_mission_id(scenario: Scenario, seed: int) -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """One mission to conduct.
+    """The settings of one simulated mission.
 
     ``policy`` is ``edge`` or a local policy's name, and then ``edge`` is ``None``. A ``named`` mission may exist at the
     edge before the flight. ``note`` is the operator's. Before take-off the mission waits,

@@ -12,7 +12,7 @@ class LossyTransport(httpx.BaseTransport):
     """Delays every request by up to ``jitter_ms`` and loses a share ``drop`` of the requests.
 
     A lost request never reaches the edge: after its delay it raises ``httpx.ConnectTimeout``, which the client retries
-    like a real loss. The draws depend on ``seed`` alone, two a request, so a repeated mission has the same losses.
+    like a real loss. The draws depend only on ``seed``, two a request, so a repeated mission has the same losses.
 
     Raises:
         ValueError: ``drop`` is no probability below 1, or ``jitter_ms`` is negative.

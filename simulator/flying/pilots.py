@@ -12,7 +12,7 @@ from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused, EdgeUnreachable
 from shared.wire.schemas import DecideRequest, FeedbackRequest, MissionSpec, Mode, Outcome
 from shared.world.scenario import Scenario
-from simulator.policies.policy import Learner, Policy
+from simulator.policies.policy import LearningPolicy, Policy
 from simulator.policies.registry import policy_named
 from simulator.records.decision import DecidedBy
 from simulator.world.observation import Observation
@@ -22,7 +22,7 @@ FALLBACK = "eof"
 
 
 @dataclass(frozen=True)
-class Choice:
+class PilotChoice:
     """A decision: sensor, velocity in m/s, source, the reason of a fallback, and the exchange with an edge, if any."""
 
     sensor: int
@@ -35,10 +35,10 @@ class Choice:
 class Pilot(Protocol):
     """Decides for the fleet."""
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The choice for one UAV from its observation and the sensors that earlier UAVs of this step took."""
 
-    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+    def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Use the outcome of that choice."""
 
     def land(self) -> None:
@@ -54,15 +54,15 @@ class LocalPilot:
         self._policy.reset(scenario, seed)
         self._steps: dict[int, int] = {}
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The policy's choice."""
         self._steps[uav] = int(observation["step"][0])
         sensor, velocity = self._policy.decide(uav, observation, taken)
-        return Choice(int(sensor), int(velocity), "onboard", self._reason)
+        return PilotChoice(int(sensor), int(velocity), "onboard", self._reason)
 
-    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
-        """Tell the policy, if it learns."""
-        if isinstance(self._policy, Learner):
+    def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
+        """Pass the outcome to the policy, if it learns."""
+        if isinstance(self._policy, LearningPolicy):
             self._policy.learn(uav, self._steps[uav], failed)
 
     def land(self) -> None:
@@ -101,9 +101,9 @@ class EdgePilot:
         self.spec = MissionSpec(scenario=scenario, seed=seed, mode=mode, note=note)
         self._deadline_ms = deadline_ms
         self._max_velocity = scenario.max_velocity
-        self._pending: dict[int, Outcome] = {}
+        self._pending_outcomes: dict[int, Outcome] = {}
         # Outcomes sent to an edge that could not write them to disk; they are sent again at the end.
-        self._undurable: list[Outcome] = []
+        self._unstored_outcomes: list[Outcome] = []
         self._lost = False
         self._fallback: Policy = policy_named(FALLBACK)
         self._fallback.reset(scenario, seed)
@@ -111,14 +111,14 @@ class EdgePilot:
         self.answered = 0
         self.last_error: str | None = None
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         """The edge's choice, or EOF's with source ``onboard`` and the reason."""
         step = int(observation["step"][0])
         if step != self._step and self._lost and self._wait_left_s > 0:
             self._await_edge()
         self._step = step
         request = decide_request(
-            uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._pending.get(uav)
+            uav, observation, self._mission_id, deadline_ms=self._deadline_ms, outcome=self._pending_outcomes.get(uav)
         )
         self.on_request(request)
         try:
@@ -126,13 +126,13 @@ class EdgePilot:
         except EdgeError as error:
             self.last_error = str(error)
             sensor, velocity = self._fallback.decide(uav, observation, taken)
-            return Choice(int(sensor), int(velocity), "onboard", reason_on_board(error))
-        self._pending.pop(uav, None)
+            return PilotChoice(int(sensor), int(velocity), "onboard", reason_on_board(error))
+        self._pending_outcomes.pop(uav, None)
         if request.outcome is not None and not exchange.response.stored:
-            self._undurable.append(request.outcome)
+            self._unstored_outcomes.append(request.outcome)
         self.answered += 1
         answer = exchange.response
-        return Choice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
+        return PilotChoice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
     def _await_edge(self) -> None:
         # Without an edge a step takes microseconds: the mission would end before a restarted edge is up.
@@ -165,14 +165,14 @@ class EdgePilot:
             )
         return exchange
 
-    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+    def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         """Store the outcome for this UAV's next request."""
         if choice.exchange is not None:
-            self._pending[uav] = choice.exchange.outcome(cost, failed)
+            self._pending_outcomes[uav] = choice.exchange.outcome(cost, failed)
 
     def land(self) -> None:
         """Send the outcomes that no later request carried, until the edge is unreachable."""
-        for outcome in (*self._undurable, *self._pending.values()):
+        for outcome in (*self._unstored_outcomes, *self._pending_outcomes.values()):
             try:
                 self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
             except EdgeUnreachable as error:
@@ -180,8 +180,8 @@ class EdgePilot:
                 break
             except EdgeError as error:
                 self.last_error = str(error)
-        self._pending.clear()
-        self._undurable.clear()
+        self._pending_outcomes.clear()
+        self._unstored_outcomes.clear()
 
 
 def reason_on_board(error: EdgeError) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from simulator.policies.policy import Learner, Policy
+from simulator.policies.policy import LearningPolicy, Policy
 from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld
@@ -43,7 +43,7 @@ def rollout(
             actions[agent] = policy.decide(uav, observations[agent], taken)
             taken |= {actions[agent][0]}
         observations, _, _, _, infos = world.step(actions)
-        if isinstance(policy, Learner):
+        if isinstance(policy, LearningPolicy):
             for agent, uav in live.items():
                 policy.learn(uav, step, infos[agent]["failed"])
         if on_step is not None:

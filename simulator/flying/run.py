@@ -15,12 +15,12 @@ from shared.client.edge_client import EdgeClient
 from shared.client.errors import EdgeError
 from shared.wire.schemas import LLM_MODES
 from simulator.errors import INTERRUPTED
-from simulator.flying.edge_session import await_edge, begun_mission, client_of, probe_of, radio_link
+from simulator.flying.edge_session import await_edge, create_or_check_mission, job_client, probe_client, radio_link
 from simulator.flying.job import Job
 from simulator.records.decision_log import DecisionLog
 from simulator.records.flight import Flight
-from simulator.records.operator import Operator, recounted
-from simulator.records.request_log import RequestLog, resolved
+from simulator.records.operator import OperatorRecord, recount_deadlines
+from simulator.records.request_log import RequestLog, with_edge_defaults
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
 from simulator.records.summary import BySource, Summary, sources_text, summarise
 from simulator.reporting.results import write_results
@@ -28,11 +28,11 @@ from simulator.reporting.results import write_results
 # The world and matplotlib take a second to import; `--help` and usage errors do without them.
 if TYPE_CHECKING:
     from simulator.flying.flight_metrics import FlightMetrics
-    from simulator.flying.pilots import Choice, Pilot
+    from simulator.flying.pilots import Pilot, PilotChoice
     from simulator.records.flight import Flight
 
 
-def conduct(
+def run_mission(
     job: Job, console: Console, alive: Callable[[], None] = lambda: None, metrics: FlightMetrics | None = None
 ) -> int:
     """Wait for the edge, fly, compare, write and print; returns the exit code.
@@ -49,31 +49,35 @@ def conduct(
     if job.edge is None:
         fresh_folder(job.out)
         flight = _fly(job, LocalPilot(job.policy, job.site.scenario, job.seed), console, _ProgressText(metrics))
-        return _conclude(job, flight, None, None, {}, console)
+        return _write_results(job, flight, None, None, {}, console)
     lossy = radio_link(job.site.scenario, job.seed)
-    with client_of(job, job.edge) as ground, client_of(job, job.edge, lossy) as radio, probe_of(job.edge) as probe:
+    with (
+        job_client(job, job.edge) as ground,
+        job_client(job, job.edge, lossy) as radio,
+        probe_client(job.edge) as probe,
+    ):
         model = await_edge(ground, job.wait_s, console, alive, job.wait_out)
         progress = _ProgressText(metrics)
         pilot = EdgePilot(
             radio, job.mission_id, job.site.scenario, job.seed, mode=job.mode, note=job.note,
             deadline_ms=job.deadline_ms,
-            probe=probe, reconnect_s=job.reconnect_s, on_wait=progress.waiting,
+            probe=probe, reconnect_s=job.reconnect_s, on_wait=progress.on_wait,
         )  # fmt: skip
-        created = begun_mission(ground, job, pilot.spec)
+        created = create_or_check_mission(ground, job, pilot.spec)
         watched = f"{job.edge}/?mission={job.mission_id}"
         console.print(f"Mission {job.mission_id}; watch it at {watched}", markup=False, highlight=False, soft_wrap=True)
         if job.note is not None:
             console.print("The edge obeys the note once you confirm it on that page.", highlight=False, soft_wrap=True)
         fresh_folder(job.out)
         with naming_out(job.out):
-            requests = RequestLog(job.out / REQUESTS, resolved(pilot.spec, created))
+            requests = RequestLog(job.out / REQUESTS, with_edge_defaults(pilot.spec, created))
         with requests:
             pilot.on_request = requests.append
             flight = _fly(job, pilot, console, progress)
         operator = _operator(probe, job.mission_id, flight)
-        again = _reference(job, ground, console) if created.mode in LLM_MODES and not flight.interrupted else None
+        again = _fly_reference(job, ground, console) if created.mode in LLM_MODES and not flight.interrupted else None
     extra = {"operator": operator, "without_llm": again}
-    code = _conclude(job, flight, created.mode, model, extra, console)
+    code = _write_results(job, flight, created.mode, model, extra, console)
     if pilot.last_error is not None:
         unanswered = len(flight.decisions) - pilot.answered
         print(
@@ -98,22 +102,22 @@ class _ProgressText:
         """Display the text by calling ``update``."""
         self._update = update
 
-    def waiting(self, cause: str) -> None:
+    def on_wait(self, cause: str) -> None:
         """Show that the fleet waits for a lost edge."""
         self._update(f"waiting for the edge: {escape(cause)}")
 
-    def decided(self, choice: Choice) -> None:
+    def on_decision(self, choice: PilotChoice) -> None:
         """Count and show a decision."""
         if self._metrics is not None:
-            self._metrics.decided(choice)
+            self._metrics.count_decision(choice)
         self._sources[choice.source] += 1
         trip = f", {choice.exchange.rtt_ms:.0f} ms" if choice.exchange else ""
         self._update(f"{self._lost} lost; {choice.source} decides{trip}")
 
-    def stepped(self, flight: Flight) -> None:
+    def on_step(self, flight: Flight) -> None:
         """Count and show a step of the whole fleet."""
         if self._metrics is not None:
-            self._metrics.stepped(flight)
+            self._metrics.count_step(flight)
         self._lost += flight.tally[-1].lost_packets
         self._update(f"{self._lost} lost; {sources_text(BySource(**self._sources))}")
 
@@ -140,15 +144,15 @@ def _fly(job: Job, pilot: Pilot, console: Console, text: _ProgressText) -> Fligh
 
         def stepped(flight: Flight) -> None:
             progress.advance(task)
-            text.stepped(flight)
+            text.on_step(flight)
 
-        flight = fly(job.site, pilot, job.seed, log, text.decided, stepped)
+        flight = fly(job.site, pilot, job.seed, log, text.on_decision, stepped)
     if flight.interrupted:
         console.print(f"interrupted after {flight.steps_flown} steps; writing their results", highlight=False)
     return flight
 
 
-def _reference(job: Job, edge: EdgeClient, console: Console) -> int | None:
+def _fly_reference(job: Job, edge: EdgeClient, console: Console) -> int | None:
     """The packets that the same edge loses in the same world in the job's reference mode; ``None`` if it fails."""
     from simulator.flying.flight import fly
     from simulator.flying.pilots import EdgePilot
@@ -173,20 +177,20 @@ def _reference(job: Job, edge: EdgeClient, console: Console) -> int | None:
     return sum(tally.lost_packets for tally in flight.tally)
 
 
-def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> Operator | None:
+def _operator(probe: EdgeClient, mission_id: str, flight: Flight) -> OperatorRecord | None:
     """The operator's part in the flight; ``None`` if there was none, or the edge that knows it is gone."""
     try:
-        told, status = probe.guidance(mission_id), probe.mission(mission_id)
+        guidance, status = probe.guidance(mission_id), probe.mission(mission_id)
     except EdgeError:
         return None
     orders = status.deadlines or []
-    if told.note is None and told.obeyed_in_words is None and not orders:
+    if guidance.note is None and guidance.obeyed_in_words is None and not orders:
         return None
-    deadlines = recounted(orders, flight.decisions, flight.steps_flown)
-    return Operator(note=told.note, orders=told.obeyed_in_words, deadlines=deadlines)
+    deadlines = recount_deadlines(orders, flight.decisions, flight.steps_flown)
+    return OperatorRecord(note=guidance.note, orders=guidance.obeyed_in_words, deadlines=deadlines)
 
 
-def _bounded(job: Job, flight: Flight, summary: Summary, console: Console) -> Summary:
+def _with_bound(job: Job, flight: Flight, summary: Summary, console: Console) -> Summary:
     """The summary with the bound on the losses, unless none is wanted."""
     if not job.bound_s:
         return summary
@@ -198,7 +202,7 @@ def _bounded(job: Job, flight: Flight, summary: Summary, console: Console) -> Su
     return summary.model_copy(update=known)
 
 
-def _conclude(
+def _write_results(
     job: Job, flight: Flight, mode: str | None, model: str | None, extra: Mapping[str, Any], console: Console
 ) -> int:
     """Summarise, with these further fields of the summary, write and print; returns the exit code."""
@@ -218,6 +222,6 @@ def _conclude(
         command=job.command,
     )
     flown = summarise(facts, flight.decisions, tallies).model_copy(update=extra)
-    summary = _bounded(job, flight, flown, console)
+    summary = _with_bound(job, flight, flown, console)
     write_results(job.out, summary, flight, tallies, console)
     return INTERRUPTED if flight.interrupted else 0

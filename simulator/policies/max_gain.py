@@ -10,7 +10,7 @@ from simulator.world.observation import Observation
 class MaximumGain:
     """Collect from the sensor in reach with the highest channel gain.
 
-    The gain depends on the distance alone, so this is the sensor closest to the UAV, whatever its queue and its visits.
+    The gain depends only on the distance, so this is the sensor closest to the UAV, whatever its queue and its visits.
     With no free sensor in radio range, the choice is the one heard longest ago. The velocity is 7 m/s throughout.
     """
 

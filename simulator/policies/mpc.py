@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from shared.belief.fleet_belief import FleetBelief
-from shared.planning.receding import Draft
-from shared.planning.receding import RecedingHorizon as Planner
+from shared.planning.receding import Draft, RecedingHorizon
 from shared.world.actions import Action
 from shared.world.scenario import Scenario
-from simulator.policies.reach import longest_silent
+from simulator.policies.reach import longest_unheard
 from simulator.world.observation import Observation
 
 
-class RecedingHorizon:
+class RecedingHorizonPolicy:
     """The planner of :mod:`shared.planning.receding`; every decision of a UAV plans for the whole fleet again.
 
     Each decision adds the UAV's observation to the fleet's belief, and its action is fixed in the later plans.
@@ -23,7 +22,7 @@ class RecedingHorizon:
         """Start a mission; the seed is not used."""
         self._scenario = scenario
         self.belief = self.new_belief(scenario)
-        self._planner = Planner(scenario, self.belief)
+        self._planner = RecedingHorizon(scenario, self.belief)
 
     def new_belief(self, scenario: Scenario) -> FleetBelief:
         """The belief that a mission starts with."""
@@ -49,9 +48,9 @@ class RecedingHorizon:
         )
         fresh = observation["last_heard"] == step
         self.belief.measure(uav, ids[fresh], observation["channel_gain"][fresh])
-        action = self._planned(uav, taken)
+        action = self._plan_action(uav, taken)
         if action is None:
-            action = Action(longest_silent(observation, taken), self._scenario.max_velocity)
+            action = Action(longest_unheard(observation, taken), self._scenario.max_velocity)
         self.belief.tell(uav, step, *action)
         return action
 
@@ -59,7 +58,7 @@ class RecedingHorizon:
         """Take the outcome of a UAV's decision of a step."""
         self.belief.settle(uav, step, failed)
 
-    def _planned(self, uav: int, taken: frozenset[int]) -> Action | None:
+    def _plan_action(self, uav: int, taken: frozenset[int]) -> Action | None:
         """The plan's action; none off the trajectory, where no plan exists."""
         draft = self.draft(uav, taken)
         if draft is not None:

@@ -1,4 +1,4 @@
-"""Receding-horizon planning without learning: what the planner's model alone is worth."""
+"""Receding-horizon planning without learning: the planner with its initial model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from shared.belief.gain_measurements import NOTHING_MEASURED, Measured
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 
 
 class _MeanArrivals(Arrivals):
@@ -17,18 +17,18 @@ class _MeanArrivals(Arrivals):
         """Every sensor's rate stays the scenario's mean."""
 
 
-class _StillAir(Drift):
+class _NoDrift(Drift):
     def learn(self, path: Trajectory, start_m: float, still_m: float, end_m: float) -> None:
         """A UAV is expected to fly its velocity times the step."""
 
 
-class _Formula(FleetBelief):
+class _FormulaBelief(FleetBelief):
     """The beacons' queues and the UAVs' positions; links, rates and ways are the formulas'."""
 
     def __init__(self, scenario: Scenario) -> None:
         super().__init__(scenario)
         self.arrivals = _MeanArrivals(scenario)
-        self.drift = _StillAir()
+        self.drift = _NoDrift()
 
     def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:
         """A link has the mean path loss, whatever gain was measured."""
@@ -38,9 +38,9 @@ class _Formula(FleetBelief):
         """A transfer is what was planned, until a beacon says otherwise."""
 
 
-class FormulaPlanner(RecedingHorizon):
+class FormulaPlanner(RecedingHorizonPolicy):
     """The planner of ``mpc`` with the model that it starts with: its channel, drift and arrivals never learn."""
 
     def new_belief(self, scenario: Scenario) -> FleetBelief:
         """A belief that takes no measurement and no outcome."""
-        return _Formula(scenario)
+        return _FormulaBelief(scenario)

@@ -9,7 +9,7 @@ from simulator.world.observation import Observation
 
 
 class Policy(Protocol):
-    """Decides for a fleet, one UAV at a time, from that UAV's observation alone."""
+    """Decides for a fleet, one UAV at a time, only from that UAV's observation."""
 
     def reset(self, scenario: Scenario, seed: int) -> None:
         """Start a mission. Called before the first ``decide``."""
@@ -27,7 +27,7 @@ class Policy(Protocol):
 
 
 @runtime_checkable
-class Learner(Protocol):
+class LearningPolicy(Protocol):
     """A policy that learns from the outcomes of its decisions."""
 
     def learn(self, uav: int, step: int, failed: bool) -> None:

@@ -27,7 +27,7 @@ def in_reach(observation: Observation, taken: frozenset[int]) -> NDArray[np.bool
     return np.asarray(heard_now & free_sensors(len(observation["queue"]), taken))
 
 
-def longest_silent(observation: Observation, taken: frozenset[int]) -> int:
+def longest_unheard(observation: Observation, taken: frozenset[int]) -> int:
     """The free sensor heard longest ago, never heard ones first; of equals the nearest."""
     free = np.flatnonzero(free_sensors(len(observation["queue"]), taken))
     distance = np.hypot(*(observation["sensor_position"][free] - observation["position"]).T)
@@ -42,5 +42,5 @@ def best_in_reach(score: NDArray[np.float64], observation: Observation, taken: f
     """
     reachable = in_reach(observation, taken)
     if not reachable.any():
-        return longest_silent(observation, taken)
+        return longest_unheard(observation, taken)
     return int(np.argmax(np.where(reachable, score, -np.inf)))

@@ -10,7 +10,7 @@ from importlib import import_module
 from simulator.errors import UsageError
 from simulator.policies.eof import EarliestOverflowFirst
 from simulator.policies.max_gain import MaximumGain
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.mpc_formula import FormulaPlanner
 from simulator.policies.nearest import NearestNeighbour
 from simulator.policies.policy import Policy
@@ -25,7 +25,7 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "wqcs": WeightedQueueChannel,
     "max_gain": MaximumGain,
     "nearest": NearestNeighbour,
-    "mpc": RecedingHorizon,
+    "mpc": RecedingHorizonPolicy,
     "mpc_formula": FormulaPlanner,
 }
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)

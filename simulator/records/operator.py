@@ -1,4 +1,4 @@
-"""The operator's part of a flight: the note, the orders, and how they were kept."""
+"""The operator's part of a flight: the note, the orders, and the visit deadlines met and missed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from simulator.records.decision import Decision
 from simulator.records.record import Record
 
 
-class Operator(Record):
+class OperatorRecord(Record):
     """The operator's newest note, the orders in force at the end in words, and every visit order's deadlines."""
 
     note: str | None
@@ -28,7 +28,9 @@ class Operator(Record):
         return sum(one.missed for one in self.deadlines)
 
 
-def recounted(orders: Iterable[VisitDeadline], decisions: Sequence[Decision], steps: int) -> list[VisitDeadline]:
+def recount_deadlines(
+    orders: Iterable[VisitDeadline], decisions: Sequence[Decision], steps: int
+) -> list[VisitDeadline]:
     """The orders with the deadlines that these decisions met and missed; an edge does not know those taken on board.
 
     Args:

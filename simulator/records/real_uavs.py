@@ -1,4 +1,4 @@
-"""The part of a flight's summary that only real UAVs have: each one's sums, and what did not go as decided."""
+"""The part of a flight's summary that only real UAVs have: sums by UAV, and decisions not carried out."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from simulator.records.statistics import percentile
 
 
 class UavSums(Record):
-    """One UAV's decisions and what came of them.
+    """One UAV's decisions and their outcomes.
 
-    ``lost_packets`` are those of the sensors that it heard: a packet counts for each UAV that heard of it. ``rtt_ms``
-    is the median round trip, ``null`` without an answer of the edge.
+    ``lost_packets`` are those of the sensors that it heard: a packet counts for each UAV that heard its sensor's
+    beacon. ``rtt_ms`` is the median round trip, ``null`` without an answer of the edge.
     """
 
     uav_id: int
@@ -28,8 +28,9 @@ class RealUavs(Record):
     """What a flight of real UAVs adds to a summary.
 
     ``late`` decisions came after the end of their waypoint's step. ``undecided`` counts the waypoints at which a UAV
-    was told nothing, by the reason. ``not_carried_out`` has the texts of the commands that a vehicle did not carry out.
-    ``simulated_lost`` are the packets that all sensors have lost, heard of or not; ``null`` where they are real.
+    got no command, by the reason. ``not_carried_out`` has the texts of the commands that a vehicle did not carry out.
+    ``simulated_lost`` are the packets that all simulated sensors have lost, reported by beacons or not; ``null`` with
+    real sensors.
     """
 
     uavs: list[UavSums]

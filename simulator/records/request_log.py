@@ -43,7 +43,7 @@ class RequestLog:
         self._file.flush()
 
 
-def resolved(spec: MissionSpec, status: MissionStatus) -> MissionSpec:
+def with_edge_defaults(spec: MissionSpec, status: MissionStatus) -> MissionSpec:
     """The spec with the defaults of the edge that made the mission, independent of another edge's defaults."""
     return spec.model_copy(update={"mode": status.mode, "top_k": status.top_k, "prompt": status.prompt})
 

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from shared.wire.schemas import Tokens, Uplink
 from simulator.records.decision import Decision, queried_llm
-from simulator.records.operator import Operator
+from simulator.records.operator import OperatorRecord
 from simulator.records.real_uavs import RealUavs
 from simulator.records.record import Record
 from simulator.records.statistics import jain_index, mean, percentile, visits_per_sensor
@@ -112,8 +112,8 @@ class Summary(FlightFacts):
     that a UAV fetched for its decision. ``trust`` is the mean weight of each adviser over the decisions of source
     ``guided``. ``without_llm`` is the packets that the same edge lost in the same world in mode ``policy``, ``null``
     where that was not flown. ``bound`` is ``null`` where ``bound_missing`` says why. ``operator`` is ``null`` without
-    a note and orders. ``real_uavs`` is left out of a simulated mission; with it, losses are those that beacons told
-    of, and ``uavs`` are those of one command.
+    a note and orders. ``real_uavs`` is left out of a simulated mission; with it, losses are those that beacons
+    reported, and ``uavs`` are those of one command.
     """
 
     decisions: int
@@ -133,7 +133,7 @@ class Summary(FlightFacts):
     without_llm: int | None = None
     bound: LossBound | None = None
     bound_missing: str | None = None
-    operator: Operator | None = None
+    operator: OperatorRecord | None = None
     real_uavs: RealUavs | None = Field(None, exclude_if=lambda value: value is None)
 
 

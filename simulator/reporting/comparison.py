@@ -26,7 +26,7 @@ TITLES = {
 
 
 @dataclass(frozen=True)
-class Run:
+class MissionResult:
     """One mission's folder, and its summary."""
 
     folder: Path
@@ -43,7 +43,7 @@ class Run:
         return next(iter(self.summary.lost_packets.values()), 0)
 
 
-def read_run(folder: Path) -> Run:
+def read_result(folder: Path) -> MissionResult:
     """The mission in a folder that `aicvds simulate`, `demo` or `replay` wrote.
 
     Raises:
@@ -51,7 +51,7 @@ def read_run(folder: Path) -> Run:
     """
     file = folder / SUMMARY
     try:
-        return Run(folder, Summary.model_validate_json(file.read_bytes()))
+        return MissionResult(folder, Summary.model_validate_json(file.read_bytes()))
     except OSError as error:
         raise UsageError(f"{file}: {error.strerror}; name the --out folder of a mission") from None
     except ValueError:
@@ -59,7 +59,7 @@ def read_run(folder: Path) -> Run:
 
 
 # fmt: off
-ROWS: dict[str, Callable[[Run], str]] = {
+ROWS: dict[str, Callable[[MissionResult], str]] = {
     "world": lambda run: world_text(run.summary),
     "steps flown": lambda run: f"{run.summary.steps_flown} of {run.summary.steps}",
     "policy, mode": lambda run: run.summary.policy + (f", {run.summary.mode}" if run.summary.mode else ""),
@@ -80,23 +80,23 @@ ROWS: dict[str, Callable[[Run], str]] = {
 # fmt: on
 
 
-def rows(runs: Sequence[Run]) -> dict[str, list[str]]:
+def rows(runs: Sequence[MissionResult]) -> dict[str, list[str]]:
     """The table: each row's name with a cell for each run; rows without any number are left out."""
     table = {name: [cell(run) for run in runs] for name, cell in ROWS.items()}
     return {name: cells for name, cells in table.items() if set(cells) != {"–"}}
 
 
-def caution(runs: Sequence[Run]) -> str:
+def caution(runs: Sequence[MissionResult]) -> str:
     """What the losses of these runs can be compared for."""
     worlds = {(run.summary.scenario, run.summary.seed, run.summary.steps_flown) for run in runs}
     if any(run.summary.real_uavs is not None for run in runs):
-        return "Real UAVs know only the losses that beacons told them of, so these losses cannot be compared."
+        return "Real UAVs know only the losses that beacons reported, so these losses cannot be compared."
     if len(worlds) > 1:
         return "These missions flew different worlds or numbers of steps, so their losses cannot be compared."
     return "One world is an example, not a result: docs/results/ compares over many."
 
 
-def render_comparison(runs: Sequence[Run]) -> str:
+def render_comparison(runs: Sequence[MissionResult]) -> str:
     """The page as HTML, which needs no other file."""
     pages = Environment(loader=PackageLoader("simulator.reporting", "."), autoescape=True, undefined=StrictUndefined)
     pages.trim_blocks = pages.lstrip_blocks = True
@@ -109,13 +109,13 @@ def render_comparison(runs: Sequence[Run]) -> str:
     )
 
 
-def names(runs: Sequence[Run]) -> list[str]:
+def names(runs: Sequence[MissionResult]) -> list[str]:
     """A name for each run: its folder's, or the whole path where two folders have the same."""
     short = [run.name for run in runs]
     return [str(run.folder) if short.count(run.name) > 1 else run.name for run in runs]
 
 
-def _figure(run: Run, name: str) -> str | None:
+def _figure(run: MissionResult, name: str) -> str | None:
     """The figure as a data URL; None where the run has none."""
     file = run.folder / FIGURES / f"{name}.svg"
     if not file.is_file():

@@ -65,7 +65,7 @@ class PaperFigure:
 
 
 @contextmanager
-def drawn(name: str, height_in: float, panels: tuple[int, int], out: list[PaperFigure]) -> Iterator[list[Axes]]:
+def paper_figure(name: str, height_in: float, panels: tuple[int, int], out: list[PaperFigure]) -> Iterator[list[Axes]]:
     """Yield a new figure's panels, and after the context append the figure to ``out``; one panel fills one column."""
     # A constant salt makes the IDs, and so the whole text, the same on every run.
     with matplotlib.style.context(["default", {**RC, "svg.hashsalt": name}]):

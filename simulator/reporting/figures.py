@@ -22,7 +22,7 @@ from shared.world.trajectory import trajectories
 from simulator.records.decision import Decision
 from simulator.records.statistics import visits_per_sensor
 from simulator.records.summary import Tally
-from simulator.reporting.figure_style import PaperFigure, drawn
+from simulator.reporting.figure_style import PaperFigure, paper_figure
 
 INK = "#222222"
 BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#767676"
@@ -100,7 +100,7 @@ def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[D
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
     scale = Normalize(min(trips), max(trips)) if trips else Normalize(0.0, 1.0)
     out: list[PaperFigure] = []
-    with drawn("latency-map", 2.1 * rows + 0.4, (rows, columns), out) as panels:
+    with paper_figure("latency-map", 2.1 * rows + 0.4, (rows, columns), out) as panels:
         for extra in panels[shown:]:
             extra.set_visible(False)
         for uav in range(shown):
@@ -164,12 +164,12 @@ def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Dec
     return [tail, tip, label]
 
 
-def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, drawn: list[np.ndarray]) -> None:
+def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, paper_figure: list[np.ndarray]) -> None:
     few = len(sensor_xy) <= 20
     axes.scatter(
         sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=27 if few else 6, color=INK, edgecolors="white", zorder=5
     )
-    occupied = [*drawn, *sensor_xy]
+    occupied = [*paper_figure, *sensor_xy]
     reach = LABEL_OFFSET * scenario.area_m
     angles = np.arange(8) * np.pi / 4 + np.pi / 4
     for j, at in enumerate(sensor_xy if few else ()):
@@ -203,7 +203,7 @@ def latency_per_step(decisions: Sequence[Decision]) -> PaperFigure:
         if d.rtt_ms is not None:
             trips[d.source][d.step].append(d.rtt_ms)
     out: list[PaperFigure] = []
-    with drawn("latency-steps", 2.2, (1, 1), out) as (axes,):
+    with paper_figure("latency-steps", 2.2, (1, 1), out) as (axes,):
         for source in (name for name in SOURCES if name in trips):
             by_step, colour = trips[source], SOURCES[source]
             steps = sorted(by_step)
@@ -230,7 +230,7 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Pap
         ("loss events", lambda t: t.failures + t.overflows),
     )
     out: list[PaperFigure] = []
-    with drawn("losses", 4.8, (2, 2), out) as panels:
+    with paper_figure("losses", 4.8, (2, 2), out) as panels:
         for row, (title, measure) in enumerate(measures):
             for name, tally in tallies.items():
                 colour, dash, marker = POLICIES.get(name, OTHER_POLICY)
@@ -262,7 +262,7 @@ def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
             by_step[d.step].append(d.tokens)
     steps = sorted(by_step)
     out: list[PaperFigure] = []
-    with drawn("tokens", 2.7, (1, 2), out) as panels:
+    with paper_figure("tokens", 2.7, (1, 2), out) as panels:
         for axes, sent, full, title in (
             (panels[0], "prompt", "uncompressed", "whole prompt"),
             (panels[1], "state", "state_uncompressed", "state block"),
@@ -289,7 +289,7 @@ def visits(decisions: Sequence[Decision], sensors: int) -> PaperFigure:
     served = np.array(visits_per_sensor(decisions, sensors))
     tried = np.bincount([d.sensor_id for d in decisions], minlength=sensors)[:sensors]
     out: list[PaperFigure] = []
-    with drawn("visits", 2.2, (1, 1), out) as (axes,):
+    with paper_figure("visits", 2.2, (1, 1), out) as (axes,):
         at = np.arange(sensors)
         axes.bar(at, served, color=BLUE, label="served")
         missed = np.flatnonzero(tried > served)
@@ -317,7 +317,7 @@ def deciders(decisions: Sequence[Decision]) -> PaperFigure:
     """The sources of the decisions of each step, as stacked bars."""
     steps = sorted({d.step for d in decisions})
     out: list[PaperFigure] = []
-    with drawn("deciders", 2.0, (1, 1), out) as (axes,):
+    with paper_figure("deciders", 2.0, (1, 1), out) as (axes,):
         below = np.zeros(len(steps))
         for source, colour in SOURCES.items():
             counts = np.array([sum(d.step == s and d.source == source for d in decisions) for s in steps], dtype=float)

@@ -113,7 +113,7 @@ def write_report(
     sensor_xy: np.ndarray,
     track: Track,
 ) -> None:
-    """Write the page, and its figures for print into the folder ``figures/`` beside it.
+    """Write the page, and its figures for print into the folder ``figures/`` next to it.
 
     The first arguments are those of ``drawings``; ``track`` is what the playback shows.
 

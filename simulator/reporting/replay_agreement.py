@@ -43,7 +43,7 @@ class Compared(Record):
         return self.model_dump_json(exclude={"replayed": {"failed", "collected", "lost_packets", "cost"}})
 
 
-class Agreement(Record):
+class ReplayAgreement(Record):
     """Percentages of ``decisions`` that agree; in velocity within 1 m/s, ``both_pct`` in sensor and velocity."""
 
     decisions: int
@@ -88,8 +88,8 @@ class ReplaySummary(Record):
     decisions: int
     unasked: int
     outcomes_fed_back: int
-    agreement: Agreement
-    by_source: dict[str, Agreement]
+    agreement: ReplayAgreement
+    by_source: dict[str, ReplayAgreement]
     logged: Side
     replayed: Side
 
@@ -117,15 +117,17 @@ class Prices:
         return (fresh + cached * self.cached + completion * self.completion) / 1e6
 
 
-def agreement(compared: Sequence[Compared]) -> Agreement:
+def agreement(compared: Sequence[Compared]) -> ReplayAgreement:
     """The agreement over all pairs."""
     sensor = [c.logged.sensor_id == c.replayed.sensor_id for c in compared]
     velocity = [abs(c.logged.velocity - c.replayed.velocity) <= CLOSE_MPS for c in compared]
     both = [s and v for s, v in zip(sensor, velocity, strict=True)]
-    return Agreement(decisions=len(compared), sensor_pct=_pct(sensor), velocity_pct=_pct(velocity), both_pct=_pct(both))
+    return ReplayAgreement(
+        decisions=len(compared), sensor_pct=_pct(sensor), velocity_pct=_pct(velocity), both_pct=_pct(both)
+    )
 
 
-def by_source(compared: Sequence[Compared]) -> dict[str, Agreement]:
+def by_source(compared: Sequence[Compared]) -> dict[str, ReplayAgreement]:
     """The agreement by source of the replayed decision."""
     sources = Counter(c.replayed.source for c in compared)
     return {name: agreement([c for c in compared if c.replayed.source == name]) for name, _ in sources.most_common()}

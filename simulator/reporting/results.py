@@ -1,4 +1,4 @@
-"""The results of a flight beside its log: the summary, the report, and the outcome on the terminal."""
+"""The results of a flight in the folder of its log: the summary, the report, and the outcome on the terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from simulator.reporting.terminal_table import show
 def write_results(
     out: Path, summary: Summary, flight: Flight, tallies: Mapping[str, Sequence[Tally]], console: Console
 ) -> None:
-    """Write a flight's summary and report beside its log, and print its outcome and the files' names.
+    """Write a flight's summary and report into the folder of its log, and print the outcome and the file names.
 
     Without matplotlib, as where only real UAVs are flown, there is no report.
 

@@ -20,7 +20,7 @@ from simulator.reporting.wording import (
 
 
 def show(summary: Summary, console: Console) -> None:
-    """Print the outcome beside those of EOF and WQCS, and the sources of the decisions."""
+    """Print the outcome with those of EOF and WQCS, and the sources of the decisions."""
     whole = summary.steps_flown == summary.steps and not summary.interrupted
     steps = f"{summary.steps} steps" if whole else f"{summary.steps_flown} of {summary.steps} steps"
     table = Table(title=f"Scenario {world_text(summary)}, {steps}")
@@ -61,7 +61,7 @@ def show(summary: Summary, console: Console) -> None:
 
 
 def _show_real_uavs(summary: Summary, real: RealUavs, console: Console) -> None:
-    """Print each UAV's sums, what was late, and what did not go as decided."""
+    """Print each UAV's sums, what was late, and the commands not carried out."""
     table = Table(title="UAVs")
     table.add_column("UAV")
     for column in ("decisions", "collected", "failed", "lost in range", "round trip, ms"):

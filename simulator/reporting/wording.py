@@ -38,7 +38,7 @@ def policy_labels(summary: Summary) -> dict[str, str]:
 
 
 def llm_notice(summary: Summary) -> str | None:
-    """The LLM's part in a mission whose mode uses it; ``None`` where nothing is to be said of it."""
+    """The LLM's part in a mission whose mode uses it; ``None`` where the LLM has no part."""
     if summary.policy != "edge" or not summary.decisions:
         return None
     if summary.mode == "guided":
@@ -117,10 +117,10 @@ def bound_text(summary: Summary) -> str | None:
             None if summary.bound_missing is None else f"The least possible loss is unknown: {summary.bound_missing}."
         )
     lost, least, best = next(iter(summary.lost_packets.values())), summary.bound.lower_bound, summary.bound.best_flight
-    said = f"Nobody can lose fewer than {_packets(least)} in this world; this mission lost {lost:,}."
+    text = f"Nobody can lose fewer than {_packets(least)} in this world; this mission lost {lost:,}."
     if best > least:
-        said += f" A search that knows all arrivals found a flight that loses {best:,}."
-    return said
+        text += f" A search that knows all arrivals found a flight that loses {best:,}."
+    return text
 
 
 def orders_text(summary: Summary) -> str | None:

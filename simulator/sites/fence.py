@@ -25,7 +25,7 @@ class Fence:
 
     Attributes:
         role: ``fence``: not to be left; ``no_fly``: not to be entered.
-        points: the corners of a polygon, closed (the last is the first), or the centre of a circle alone.
+        points: the corners of a polygon, closed (the last is the first), or only the centre of a circle.
         radius: of a circle, else 0.
     """
 

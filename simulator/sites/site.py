@@ -1,4 +1,4 @@
-"""A site: a scenario, and what was recorded of it rather than drawn: arrivals, excess losses of the links."""
+"""A site: a scenario, and its recorded arrivals and excess losses of the links."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Site:
     Attributes:
         arrivals: shape ``(at least T, J)``, packets that arrive in each step at each sensor; ``None`` for Poisson
             arrivals.
-        gains: excess losses along the UAVs' ways, beside the scenario's.
+        gains: excess losses along the UAVs' paths, added to the scenario's.
         frame: the place of the scenario's plane on the globe; ``None`` for a site that has none.
         sensor_names: the sensors' IDs on the globe, ``()`` for a site that has none.
         fences: areas that no UAV may leave or enter, metres in the scenario's plane.

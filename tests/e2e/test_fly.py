@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from field.vehicles.field_uav import LEAST_SPEED_M_S
-from simulator.commands.replay import logged_mission
+from simulator.commands.replay import read_logged_mission
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
 from simulator.records.real_uavs import sums_by_uav
@@ -90,7 +90,7 @@ def test_every_waypoint_is_decided_though_the_edge_is_gone_for_twenty_seconds(tm
     # The outage begins within step 14 and lasts four steps, and the edge starts again in some more.
     assert all(d.source == "onboard" for d in decisions if 15 <= d.step < 18), told
     assert {d.source for d in decisions if d.step >= 25} >= {"policy"}, "the edge decides again"
-    assert len(logged_mission(tmp_path / "out").decisions) == STEPS * UAVS
+    assert len(read_logged_mission(tmp_path / "out").decisions) == STEPS * UAVS
     check_wire(peers, decisions)
     check_report(tmp_path / "out", decisions, told)
 

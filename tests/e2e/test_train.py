@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.marl.checkpoint import Checkpoint
+from lab.marl.checkpoint import PolicyCheckpoint
 from lab.marl.curve import read_csv
 from tests.e2e.processes import run, run_here
 from tests.support.waiting import until
@@ -32,7 +32,7 @@ sys.exit(train.main(sys.argv[1:]))
 
 
 def weights_of(folder: Path) -> list[list[float]]:
-    return [value.flatten().tolist() for value in Checkpoint.load(folder / "mappo.pt").weights.values()]
+    return [value.flatten().tolist() for value in PolicyCheckpoint.load(folder / "mappo.pt").weights.values()]
 
 
 @pytest.mark.long

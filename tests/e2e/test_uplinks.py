@@ -17,7 +17,7 @@ from shared.wire.schemas import FeedbackRequest, Uplink
 from shared.world.scenario import SCENARIOS
 from simulator.flying.flight import fly
 from simulator.flying.lossy_transport import LossyTransport
-from simulator.flying.pilots import Choice, EdgePilot
+from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.records.flight import Flight
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
@@ -36,7 +36,7 @@ class Patient(EdgePilot):
         super().__init__(client, mission_id, SCENARIO, 0, mode="value")
         self._edge, self._name = client, mission_id
 
-    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> Choice:
+    def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
         until(self._learned, lambda: self._edge.mission(self._name))
         return super().decide(uav, observation, taken)
 
@@ -44,7 +44,7 @@ class Patient(EdgePilot):
         told = self._edge.mission(self._name)
         return told.learner_updates == told.feedback
 
-    def learn(self, uav: int, choice: Choice, cost: float, failed: bool) -> None:
+    def learn(self, uav: int, choice: PilotChoice, cost: float, failed: bool) -> None:
         assert choice.exchange is not None, self.last_error
         outcome = choice.exchange.outcome(cost, failed)
         self._edge.feedback(FeedbackRequest(mission_id=self._name, **outcome.model_dump()))

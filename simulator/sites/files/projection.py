@@ -42,7 +42,7 @@ def _plane(longitude: float, latitude: float) -> Proj:
     return Proj(proj="aeqd", ellps="WGS84", units="m", lon_0=longitude, lat_0=latitude)
 
 
-def middle_of(degrees: ArrayLike) -> tuple[float, float]:
+def centre_of(degrees: ArrayLike) -> tuple[float, float]:
     """The longitude and latitude of the mean of points ``(N, 2)`` as directions from the Earth's centre, degrees."""
     longitude, latitude = np.asarray(degrees, dtype=np.float64).T
     east, north = np.radians(longitude), np.radians(latitude)
@@ -69,10 +69,10 @@ def to_metres(degrees: ArrayLike) -> FloatArray:
         with another version of the projection's library.
     """
     longitude, latitude = np.asarray(degrees, dtype=np.float64).T
-    return np.round(np.stack(_plane(*middle_of(degrees))(longitude, latitude), axis=-1), 3)
+    return np.round(np.stack(_plane(*centre_of(degrees))(longitude, latitude), axis=-1), 3)
 
 
-def in_square(points: FloatArray) -> tuple[FloatArray, float]:
+def fit_square(points: FloatArray) -> tuple[FloatArray, float]:
     """Move points, ``(N, 2)`` metres, to the middle of the smallest square of whole metres with a corner at 0, 0.
 
     Returns:

@@ -46,7 +46,7 @@ def _ring(rings: list[list[list[float]]]) -> list[list[list[float]]]:
     return rings
 
 
-class _Member(BaseModel):
+class _GeoJson(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
 
@@ -54,17 +54,17 @@ class _Member(BaseModel):
 Position = Annotated[list[float], Field(min_length=2, max_length=3), AfterValidator(_on_earth)]
 
 
-class _Point(_Member):
+class _Point(_GeoJson):
     type: Literal["Point"]
     coordinates: Position
 
 
-class _LineString(_Member):
+class _LineString(_GeoJson):
     type: Literal["LineString"]
     coordinates: list[Position] = Field(min_length=2, max_length=MAX_WAYPOINTS)
 
 
-class _Polygon(_Member):
+class _Polygon(_GeoJson):
     type: Literal["Polygon"]
     coordinates: Annotated[list[Annotated[list[Position], Field(max_length=MAX_WAYPOINTS)]], AfterValidator(_ring)]
 
@@ -72,21 +72,21 @@ class _Polygon(_Member):
 _Name = Annotated[str, Field(min_length=1, max_length=64)] | int | None
 
 
-class _Properties(_Member):
+class _Properties(_GeoJson):
     role: Literal["sensor", "trajectory", "pipeline", "fence", "no_fly"]
     id: _Name = None
     name: _Name = None
     radius_m: float | None = Field(None, gt=0, le=MAX_RADIUS_M)
 
 
-class _Feature(_Member):
+class _Feature(_GeoJson):
     type: Literal["Feature"]
     properties: _Properties
     geometry: _Point | _LineString | _Polygon = Field(discriminator="type")
     id: _Name | float = None
 
     @property
-    def called(self) -> str | None:
+    def identifier(self) -> str | None:
         names = (self.properties.id, self.properties.name, self.id)
         return next((str(name).strip() for name in names if name is not None), None)
 
@@ -150,7 +150,7 @@ def _features(path: Path) -> Iterator[tuple[str, _Feature]]:
         try:
             yield label, _Feature.model_validate(raw)
         except ValidationError as error:
-            raise UsageError(f"{path}, {label}: {_complaint(error.errors(include_url=False)[0])}") from None
+            raise UsageError(f"{path}, {label}: {_error_text(error.errors(include_url=False)[0])}") from None
 
 
 def _collection(path: Path) -> list[Any]:
@@ -184,7 +184,7 @@ def _id_of(raw: object) -> str:
     return "" if name is None else f" ({quoted(name)})"
 
 
-def _complaint(error: ErrorDetails) -> str:
+def _error_text(error: ErrorDetails) -> str:
     """A validation error as a message in the terms of GeoJSON."""
     where = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in error["loc"]).lstrip(".")
     for geometry in ("Point", "LineString", "Polygon"):
@@ -213,13 +213,13 @@ def _add(survey: Survey, label: str, feature: _Feature) -> None:
     if role == "sensor":
         if geometry != "Point":
             raise ValueError(f"a sensor is a Point, not a {geometry}")
-        if not feature.called:
+        if not feature.identifier:
             raise ValueError('the sensor has no ID; add to its properties "id", such as "kp-01"')
-        if feature.called in survey.sensors:
-            raise ValueError(f"sensor {quoted(feature.called)} comes twice; give each sensor an ID of its own")
+        if feature.identifier in survey.sensors:
+            raise ValueError(f"sensor {quoted(feature.identifier)} comes twice; give each sensor an ID of its own")
         if len(survey.sensors) == MAX_SENSORS:
             raise ValueError(f"a world has at most {MAX_SENSORS:,} sensors")
-        survey.sensors[feature.called] = feature.line[0]
+        survey.sensors[feature.identifier] = feature.line[0]
     elif role == "trajectory":
         if geometry == "Point":
             raise ValueError("a trajectory is a LineString (there and back) or a Polygon (laps), not a Point")

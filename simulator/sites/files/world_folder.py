@@ -38,7 +38,7 @@ from simulator.errors import UsageError
 from simulator.sites.fence import Fence
 from simulator.sites.files.gains import read_gains
 from simulator.sites.files.overrides import read_overrides
-from simulator.sites.files.projection import Frame, in_square, middle_of, to_metres
+from simulator.sites.files.projection import Frame, centre_of, fit_square, to_metres
 from simulator.sites.files.reading import quoted
 from simulator.sites.files.survey import Survey, check_complete, read_survey
 from simulator.sites.files.trace import read_trace
@@ -70,7 +70,7 @@ def site_from_folder(
     survey = read_survey(folder / FEATURES)
     check_complete(folder / FEATURES, survey)
     overrides = read_overrides(folder / OVERRIDES)
-    placed, frame = _placed(survey, folder / FEATURES)
+    placed, frame = _scenario_geometry(survey, folder / FEATURES)
     derived = placed | ({} if steps is None else {"steps": steps})
     if "name" not in overrides.values:
         derived["name"] = _fit_name(folder.resolve().name)
@@ -85,7 +85,7 @@ def site_from_folder(
         tuple(names),
         _fences(survey, folder / FEATURES, frame, scenario),
     )
-    far = [name for name, near in zip(survey.sensors, _in_reach(scenario), strict=True) if not near]
+    far = [name for name, near in zip(survey.sensors, _reachable(scenario), strict=True) if not near]
     if far:
         named = ", ".join(quoted(name) for name in far[:FAR_NAMED]) + (" and others" if len(far) > FAR_NAMED else "")
         on_warning(
@@ -95,7 +95,7 @@ def site_from_folder(
     return site
 
 
-def _placed(survey: Survey, path: Path) -> tuple[dict[str, object], Frame]:
+def _scenario_geometry(survey: Survey, path: Path) -> tuple[dict[str, object], Frame]:
     """The fields of a scenario that follow from the features, and the place of its plane on the globe."""
     lines = [list(survey.sensors.values()), *survey.trajectories.values(), survey.pipeline]
     degrees = [point for line in lines for point in line]
@@ -108,9 +108,9 @@ def _placed(survey: Survey, path: Path) -> tuple[dict[str, object], Frame]:
             f"mistyped coordinate"
         )
     projected = metres[0]
-    metres, side = in_square(metres)
+    metres, side = fit_square(metres)
     x, y = (metres[0] - projected).tolist()
-    frame = Frame(*middle_of(degrees), (x, y))
+    frame = Frame(*centre_of(degrees), (x, y))
     ends = np.cumsum([len(line) for line in lines])[:-1]
     sites, *routes, pipeline = (_points(part) for part in np.split(metres, ends))
     for label, route in zip(survey.trajectories, routes, strict=True):
@@ -141,7 +141,7 @@ def _fences(survey: Survey, path: Path, frame: Frame, scenario: Scenario) -> tup
     return tuple(fences)
 
 
-def _in_reach(scenario: Scenario) -> Iterator[bool]:
+def _reachable(scenario: Scenario) -> Iterator[bool]:
     """For each sensor, whether some trajectory comes into its radio range."""
     paths = [(path, *path.bounds) for path in trajectories(scenario)]
     for sensor in scenario.sites:

@@ -43,7 +43,7 @@ def import_plans(plans: Sequence[Path], folder: Path, overwrite: bool) -> Import
             other fences than the plans, and ``overwrite`` is false.
     """
     read = [read_plan(path) for path in plans]
-    fences = _one_fence(plans, read)
+    fences = _merge_fences(plans, read)
     path = folder / FEATURES
     kept: list[dict[str, Any]] = []
     replaced = 0
@@ -61,8 +61,8 @@ def import_plans(plans: Sequence[Path], folder: Path, overwrite: bool) -> Import
         features = json.loads(path.read_text(encoding="utf-8-sig"))["features"]
         roles = ("sensor", "pipeline") if fences else ("sensor", "pipeline", "fence", "no_fly")
         kept = [feature for feature in features if feature["properties"]["role"] in roles]
-    flown = [_flown(plan, of.stem) for plan, of in zip(read, plans, strict=True)]
-    _write(path, {"type": "FeatureCollection", "features": [*kept, *flown, *map(_fenced, fences)]})
+    flown = [_trajectory_feature(plan, of.stem) for plan, of in zip(read, plans, strict=True)]
+    _write(path, {"type": "FeatureCollection", "features": [*kept, *flown, *map(_fence_feature, fences)]})
     sensors = sum(feature["properties"]["role"] == "sensor" for feature in kept)
     drawn = len(fences) + sum(feature["properties"]["role"] in ("fence", "no_fly") for feature in kept)
     altitudes = frozenset(height for plan in read for height in plan.path.altitudes_m if height is not None)
@@ -89,7 +89,7 @@ def export_plans(folder: Path, out: Path, overwrite: bool) -> list[Path]:
     return paths
 
 
-def _one_fence(paths: Sequence[Path], plans: Sequence[FlightPlan]) -> list[Fence]:
+def _merge_fences(paths: Sequence[Path], plans: Sequence[FlightPlan]) -> list[Fence]:
     """The plans' fences, each once; raises ``UsageError`` for two areas not to be left."""
     fences: list[Fence] = []
     for path, plan in zip(paths, plans, strict=True):
@@ -105,11 +105,11 @@ def _one_fence(paths: Sequence[Path], plans: Sequence[FlightPlan]) -> list[Fence
     return fences
 
 
-def _flown(plan: FlightPlan, name: str) -> dict[str, Any]:
+def _trajectory_feature(plan: FlightPlan, name: str) -> dict[str, Any]:
     return _feature("trajectory", "LineString", [list(point) for point in plan.path.trajectory], name=name)
 
 
-def _fenced(fence: Fence) -> dict[str, Any]:
+def _fence_feature(fence: Fence) -> dict[str, Any]:
     if fence.radius:
         return _feature(fence.role, "Point", list(fence.points[0]), radius_m=fence.radius)
     return _feature(fence.role, "Polygon", [[list(point) for point in fence.points]])
@@ -127,6 +127,8 @@ def _write(path: Path, document: dict[str, Any]) -> None:
     """Write the file so that it is there as a whole or as it was; each feature is one line."""
     path.parent.mkdir(parents=True, exist_ok=True)
     features = ",\n".join(f"    {json.dumps(feature, ensure_ascii=False)}" for feature in document["features"])
-    beside = path.with_suffix(".new")
-    beside.write_text(f'{{\n  "type": "FeatureCollection",\n  "features": [\n{features}\n  ]\n}}\n', encoding="utf-8")
-    os.replace(beside, path)
+    temporary = path.with_suffix(".new")
+    temporary.write_text(
+        f'{{\n  "type": "FeatureCollection",\n  "features": [\n{features}\n  ]\n}}\n', encoding="utf-8"
+    )
+    os.replace(temporary, path)

@@ -25,7 +25,7 @@ MAX_ITEMS = 10_000
 _RELATIVE = {3, 6}
 
 
-class _Member(BaseModel):
+class _PlanPart(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
 
@@ -35,7 +35,7 @@ _Longitude = Annotated[float, Field(ge=-180, le=180)]
 _Place = Annotated[tuple[_Latitude, _Longitude], Field(strict=False)]
 
 
-class _SimpleItem(_Member):
+class _SimpleItem(_PlanPart):
     type: Literal["SimpleItem"]
     command: int
     frame: int = 3
@@ -43,51 +43,51 @@ class _SimpleItem(_Member):
     params: list[float | None] = Field(min_length=7, max_length=7)
 
 
-class _Transect(_Member):
+class _Transect(_PlanPart):
     Items: list[_SimpleItem] = Field(max_length=MAX_ITEMS)
 
 
-class _ComplexItem(_Member):
+class _ComplexItem(_PlanPart):
     type: Literal["ComplexItem"]
     complexItemType: str = ""
     TransectStyleComplexItem: _Transect | None = None
 
 
-class _Mission(_Member):
+class _Mission(_PlanPart):
     items: list[Annotated[_SimpleItem | _ComplexItem, Field(discriminator="type")]] = Field(max_length=MAX_ITEMS)
 
 
-class _FenceMember(_Member):
+class _FencePart(_PlanPart):
     # A key that is not known may be an area.
     model_config = ConfigDict(extra="forbid")
 
 
-class _Polygon(_FenceMember):
+class _FencePolygon(_FencePart):
     version: int = 1
     inclusion: bool
     polygon: list[_Place] = Field(min_length=3, max_length=1000)
 
 
-class _Circle(_FenceMember):
+class _Circle(_FencePart):
     center: _Place
     radius: float = Field(gt=0, le=1e6)
 
 
-class _FenceCircle(_FenceMember):
+class _FenceCircle(_FencePart):
     version: int = 1
     inclusion: bool
     circle: _Circle
 
 
-class _GeoFence(_FenceMember):
+class _GeoFence(_FencePart):
     version: Literal[2] = 2
     # Where a UAV goes that has left the fence.
     breachReturn: Any = None
     circles: list[_FenceCircle] = Field([], max_length=100)
-    polygons: list[_Polygon] = Field([], max_length=100)
+    polygons: list[_FencePolygon] = Field([], max_length=100)
 
 
-class _Plan(_Member):
+class _Plan(_PlanPart):
     fileType: Literal["Plan"]
     mission: _Mission
     geoFence: _GeoFence = _GeoFence()
@@ -112,7 +112,7 @@ def read_plan(path: Path) -> FlightPlan:
     try:
         plan = _Plan.model_validate_json(text)
     except ValidationError as error:
-        raise UsageError(f"{path}: {_complaint(error)}") from None
+        raise UsageError(f"{path}: {_error_text(error)}") from None
     except RecursionError:
         raise UsageError(f"{path} is no plan: it is nested too deep") from None
     try:
@@ -135,8 +135,8 @@ def plan_text(trajectory: Sequence[Point], fences: Sequence[Fence], altitude_m: 
     document = {
         "fileType": "Plan",
         "geoFence": {
-            "circles": [_circle(fence) for fence in fences if fence.radius],
-            "polygons": [_polygon(fence) for fence in fences if not fence.radius],
+            "circles": [_circle_json(fence) for fence in fences if fence.radius],
+            "polygons": [_polygon_json(fence) for fence in fences if not fence.radius],
             "version": 2,
         },
         "groundStation": "QGroundControl",
@@ -145,7 +145,7 @@ def plan_text(trajectory: Sequence[Point], fences: Sequence[Fence], altitude_m: 
             "firmwareType": 12,
             "globalPlanAltitudeMode": 1,
             "hoverSpeed": speed_m_s,
-            "items": [_written(item) for item in items_of(trajectory, altitude_m)],
+            "items": [_item_json(item) for item in items_of(trajectory, altitude_m)],
             "plannedHomePosition": [*_latitude_first((longitude, latitude)), 0],
             "vehicleType": 2,
             "version": 2,
@@ -193,7 +193,7 @@ def _fences(drawn: _GeoFence) -> Iterator[Fence]:
         yield Fence("fence" if circle.inclusion else "no_fly", ((longitude, latitude),), circle.circle.radius)
 
 
-def _written(item: MissionItem) -> dict[str, Any]:
+def _item_json(item: MissionItem) -> dict[str, Any]:
     latitude, longitude = (0, 0) if item.position is None else _latitude_first(item.position)
     first, second = item.parameters
     return {
@@ -209,12 +209,12 @@ def _written(item: MissionItem) -> dict[str, Any]:
     }
 
 
-def _circle(fence: Fence) -> dict[str, Any]:
+def _circle_json(fence: Fence) -> dict[str, Any]:
     area = {"center": _latitude_first(fence.points[0]), "radius": fence.radius}
     return {"circle": area, "inclusion": fence.role == "fence", "version": 1}
 
 
-def _polygon(fence: Fence) -> dict[str, Any]:
+def _polygon_json(fence: Fence) -> dict[str, Any]:
     corners = [_latitude_first(point) for point in fence.points[:-1]]
     return {"inclusion": fence.role == "fence", "polygon": corners, "version": 1}
 
@@ -224,7 +224,7 @@ def _latitude_first(point: Point) -> list[float]:
     return [round(point[1], 7), round(point[0], 7)]
 
 
-def _complaint(error: ValidationError) -> str:
+def _error_text(error: ValidationError) -> str:
     """A validation error as a message with the field's name."""
     first = error.errors(include_url=False)[0]
     where = "".join(f"[{at}]" if isinstance(at, int) else f".{at}" for at in first["loc"]).lstrip(".")

@@ -16,7 +16,7 @@ from playwright.sync_api import expect
 from service.api.app import create_app
 from service.config.settings import Settings
 from simulator.commands import simulate
-from simulator.flying.pilots import Choice, EdgePilot
+from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.world.observation import Observation
 from tests.e2e.page.conftest import Open, violations
 from tests.support.running import serving
@@ -116,7 +116,7 @@ def test_orders_that_change_in_flight_are_counted_while_they_are_in_force(
     out, decide = tmp_path / "run", EdgePilot.decide
     own = {"sensors": [{"sensor_id": 3, "visit_every": EVERY}, {"sensor_id": 5, "visit_every": 2}]}
 
-    def deciding(pilot: EdgePilot, uav: int, seen: Observation, taken: frozenset[int]) -> Choice:
+    def deciding(pilot: EdgePilot, uav: int, seen: Observation, taken: frozenset[int]) -> PilotChoice:
         at = (int(seen["step"][0]), uav)
         if at == (4, 0):
             proposed(edge, "watch")

@@ -18,7 +18,7 @@ from shared.world.actions import Action
 from shared.world.scenario import scenario_named
 from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.site import Site
 from simulator.world.sensors import Sensors
@@ -62,7 +62,7 @@ def test_half_of_the_sensors_report_every_third_step(edge: Edge, monkeypatch: py
     assert 0 < status["readings"] <= len(sent)
 
 
-class Hearing(RecedingHorizon):
+class Hearing(RecedingHorizonPolicy):
     """Keeps the fleet's belief of what it hears, and flies the same way whatever that is."""
 
     def _planned(self, uav: int, taken: frozenset[int]) -> Action:

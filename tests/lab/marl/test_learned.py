@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lab.marl.checkpoint import Checkpoint, shipped
+from lab.marl.checkpoint import PolicyCheckpoint, shipped
 from lab.marl.evaluate import lost_packets
 from lab.marl.learned import Learned
 from lab.marl.networks import two_heads
@@ -26,7 +26,7 @@ SCHEMES = ["madqn", "mappo"]
 def saved(path: Path, scenario: Scenario = SMALL) -> Path:
     torch.manual_seed(0)
     weights = two_heads(scenario).state_dict()
-    Checkpoint("madqn", scenario, 10, 0, "python -m lab train madqn", "0", weights).save(path)
+    PolicyCheckpoint("madqn", scenario, 10, 0, "python -m lab train madqn", "0", weights).save(path)
     return path
 
 

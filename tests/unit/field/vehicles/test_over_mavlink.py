@@ -20,7 +20,7 @@ from field.vehicles.simulated_radio import SimulatedRadio
 from field.vehicles.take_off import wait_for_missions
 from field.vehicles.uploaded_path import check_uploaded
 from shared.client.edge_client import EdgeClient
-from simulator.commands.replay import logged_mission
+from simulator.commands.replay import read_logged_mission
 from simulator.records.decision import Decision
 from simulator.records.decision_log import read_decisions
 from simulator.records.summary import Summary
@@ -127,7 +127,7 @@ def test_a_vehicle_of_mavsdk_flies_as_the_edge_decides(
     }  # fmt: skip
     assert max(gap_m(d, peer.airframe.trace) for d in decisions) < 1
     assert sum(d.collected for d in decisions) > 0
-    logged = logged_mission(tmp_path)
+    logged = read_logged_mission(tmp_path)
     assert len(logged.decisions) == 8 and logged.spec.mode == "policy"
     with EdgeClient(url, timeout_s=PATIENCE_S) as operator:
         status = operator.mission("m")
@@ -277,7 +277,7 @@ def test_sigterm_leaves_the_vehicle_on_its_mission(
         process.terminate()
         assert process.wait(60) == 130
         assert peer.airframe.mode == "mission"
-    logged = logged_mission(tmp_path).decisions
+    logged = read_logged_mission(tmp_path).decisions
     assert len(logged) >= 3
     summary = Summary.model_validate_json((tmp_path / "summary.json").read_bytes())
     assert summary.interrupted and summary.steps_flown == summary.decisions == len(logged) < summary.steps

@@ -12,7 +12,7 @@ import pytest
 
 from service.mission import planner
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request
 
@@ -41,7 +41,7 @@ def flown_by_edge(client: httpx.Client, scenario: Scenario, seed: int) -> list[l
 
 
 def flown_by_planner(scenario: Scenario, seed: int) -> list[list[tuple[int, int]]]:
-    world, policy = PipelineWorld(scenario), RecedingHorizon()
+    world, policy = PipelineWorld(scenario), RecedingHorizonPolicy()
     observations, _ = world.reset(seed=seed)
     policy.reset(scenario, seed)
     flown = []

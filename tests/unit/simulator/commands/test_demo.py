@@ -18,7 +18,7 @@ from shared.wire.schemas import Mode
 from shared.world.scenario import Scenario
 from simulator.commands import demo
 from simulator.flying.job import Job
-from simulator.flying.run import conduct
+from simulator.flying.run import run_mission
 from simulator.records.summary import Summary
 from simulator.sites.site import Site
 from tests.support.edge_stub import EdgeStub, stub_edge
@@ -59,7 +59,7 @@ def flown_beside(stub: EdgeStub, out: Path, mode: Mode) -> Summary:
     """A mission in this mode at the stub, with the reference mode of the demo."""
     site = Site(Scenario(steps=3))
     job = Job(site, 1, "paper-1-x", out, "aicvds demo", edge=stub.url, mode=mode, bound_s=0.0, reference="policy")
-    assert conduct(job, Console()) == 0
+    assert run_mission(job, Console()) == 0
     return summary_in(out)
 
 

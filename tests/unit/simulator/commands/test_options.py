@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from simulator.commands.options import check_between, check_deadline, check_seed, check_wait, checked_edge
+from simulator.commands.options import check_between, check_deadline, check_seed, check_wait, edge_from_option
 from simulator.errors import UsageError
 
 
@@ -19,8 +19,8 @@ from simulator.errors import UsageError
         (lambda: check_wait(float("nan")), "--wait-s nan is not between 0 and 86400"),
         (lambda: check_deadline(9), "--deadline-ms 9 is not between 10 and 60000"),
         (lambda: check_between("--time-limit-s", 0.0, 0.1, 86_400), "--time-limit-s 0 is not between 0.1 and 86400"),
-        (lambda: checked_edge(None), "--edge is missing: give the edge's address"),
-        (lambda: checked_edge("ftp://edge"), "--edge: "),
+        (lambda: edge_from_option(None), "--edge is missing: give the edge's address"),
+        (lambda: edge_from_option("ftp://edge"), "--edge: "),
     ],
 )
 def test_the_error_for_a_value_out_of_bounds_has_the_bounds(check: Callable[[], object], message: str) -> None:
@@ -35,4 +35,4 @@ def test_values_on_their_bounds_are_taken() -> None:
     check_wait(86_400)
     check_deadline(None)
     check_deadline(10)
-    assert checked_edge("http://127.0.0.1:8000").startswith("http://127.0.0.1:8000")
+    assert edge_from_option("http://127.0.0.1:8000").startswith("http://127.0.0.1:8000")

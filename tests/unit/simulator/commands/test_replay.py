@@ -15,7 +15,7 @@ import pytest
 
 from shared.wire.schemas import DecideRequest, MissionSpec
 from simulator.commands import replay, simulate
-from simulator.commands.replay import logged_mission
+from simulator.commands.replay import read_logged_mission
 from simulator.records.decision_log import read_decisions
 from simulator.records.request_log import read_requests
 from simulator.reporting.replay_agreement import ReplaySummary
@@ -155,7 +155,9 @@ def test_a_request_without_a_flown_decision_is_not_replayed(run: Path) -> None:
     (run / "decisions.jsonl").write_text("".join(text[:6]) + text[6][:40])
     requests = (run / "requests.jsonl").read_text()
     (run / "requests.jsonl").write_text(requests[:-200])
-    assert [(r.step, d.uav_id) for r, d in logged_mission(run).decisions] == [(s, u) for s in (0, 1) for u in range(3)]
+    assert [(r.step, d.uav_id) for r, d in read_logged_mission(run).decisions] == [
+        (s, u) for s in (0, 1) for u in range(3)
+    ]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from pydantic_core import PydanticSerializationError
 from shared.client.edge_client import EdgeClient
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.flight import fly
-from simulator.flying.pilots import Choice, EdgePilot, LocalPilot
+from simulator.flying.pilots import EdgePilot, LocalPilot, PilotChoice
 from simulator.flying.rollout import BASELINES, baselines, rollout
 from simulator.policies.registry import policy_named
 from simulator.records.decision_log import DecisionLog, read_decisions
@@ -79,7 +79,7 @@ def between_two_instructions() -> None:
 def test_an_interrupt_keeps_the_whole_steps(
     stub: EdgeStub, client: EdgeClient, tmp_path: Path, interrupted: Callable[[], None]
 ) -> None:
-    def interrupt(choice: Choice) -> None:
+    def interrupt(choice: PilotChoice) -> None:
         if stub.request_count == 8:
             interrupted()
 
@@ -92,7 +92,7 @@ def test_an_interrupt_keeps_the_whole_steps(
 
 
 def test_a_model_that_cannot_be_written_is_no_interrupt(client: EdgeClient) -> None:
-    def fail(choice: Choice) -> None:
+    def fail(choice: PilotChoice) -> None:
         Interrupted(cause=ValueError).model_dump_json()
 
     with pytest.raises(PydanticSerializationError, match="ValueError"):

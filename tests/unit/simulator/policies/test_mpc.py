@@ -9,7 +9,7 @@ import pytest
 
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.registry import policy_named
 from simulator.world.environment import PipelineWorld
 
@@ -27,7 +27,9 @@ def short() -> list[tuple[int, list[int]]]:
 
 
 def flown(scenario: Scenario, seed: int) -> list[tuple[int, list[int]]]:
-    return [(t.lost_packets, t.collected.tolist()) for t in rollout(PipelineWorld(scenario), RecedingHorizon(), seed)]
+    return [
+        (t.lost_packets, t.collected.tolist()) for t in rollout(PipelineWorld(scenario), RecedingHorizonPolicy(), seed)
+    ]
 
 
 def test_the_same_seed_is_the_same_mission_to_the_bit(short: list[tuple[int, list[int]]]) -> None:
@@ -35,7 +37,7 @@ def test_the_same_seed_is_the_same_mission_to_the_bit(short: list[tuple[int, lis
 
 
 def test_a_policy_that_flew_before_flies_as_a_new_one(short: list[tuple[int, list[int]]]) -> None:
-    policy = RecedingHorizon()
+    policy = RecedingHorizonPolicy()
     rollout(PipelineWorld(SHORT), policy, 101)
     assert [(t.lost_packets, t.collected.tolist()) for t in rollout(PipelineWorld(SHORT), policy, 100)] == short
 
@@ -50,7 +52,7 @@ def test_unobserved_differences_do_not_change_its_decisions() -> None:
     """In two worlds with unobserved differences, the decisions are the same until a UAV observes one."""
     decisions = []
     for hidden in (0, 20):
-        world, policy = PipelineWorld(SHORT), RecedingHorizon()
+        world, policy = PipelineWorld(SHORT), RecedingHorizonPolicy()
         observations, _ = world.reset(seed=102)
         policy.reset(SHORT, 102)
         world.sensors.queue[:] = np.minimum(world.sensors.queue + hidden, 60)
@@ -64,7 +66,7 @@ def test_unobserved_differences_do_not_change_its_decisions() -> None:
 
 
 def test_it_keeps_no_sensor_that_another_has_taken() -> None:
-    world, policy = PipelineWorld(SHORT), RecedingHorizon()
+    world, policy = PipelineWorld(SHORT), RecedingHorizonPolicy()
     observations, _ = world.reset(seed=100)
     policy.reset(SHORT, 100)
     first, _ = policy.decide(1, observations["uav_1"], NONE)

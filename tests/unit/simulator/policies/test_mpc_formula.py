@@ -7,14 +7,14 @@ import pytest
 
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
-from simulator.policies.mpc import RecedingHorizon
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.mpc_formula import FormulaPlanner
 from simulator.world.environment import PipelineWorld
 
 pytestmark = pytest.mark.usefixtures("brief")
 
 
-def flown(scenario: Scenario, policy: RecedingHorizon) -> RecedingHorizon:
+def flown(scenario: Scenario, policy: RecedingHorizonPolicy) -> RecedingHorizonPolicy:
     rollout(PipelineWorld(scenario.model_copy(update={"steps": 6})), policy, 3)
     return policy
 
@@ -27,8 +27,8 @@ def test_nothing_that_it_sees_changes_its_model(scenario: str) -> None:
 
 
 def test_the_planner_that_learns_learns_from_the_same_missions() -> None:
-    assert not flown(SCENARIOS["shadowed"], RecedingHorizon()).belief.channel.by_formula
-    windy = flown(SCENARIOS["windy"], RecedingHorizon()).belief
+    assert not flown(SCENARIOS["shadowed"], RecedingHorizonPolicy()).belief.channel.by_formula
+    windy = flown(SCENARIOS["windy"], RecedingHorizonPolicy()).belief
     assert not windy.drift.none and (windy.arrivals.rate != SCENARIOS["windy"].mean_arrival_rate).any()
 
 
@@ -42,6 +42,6 @@ def test_where_nothing_can_be_learned_it_flies_as_mpc() -> None:
     certain = SCENARIOS["paper"].model_copy(update={"arrival_rate_min": 6.0, "arrival_rate_max": 6.0, "steps": 1})
     lost = [
         [tally.collected.tolist() for tally in rollout(PipelineWorld(certain), policy, 3)]
-        for policy in (RecedingHorizon(), FormulaPlanner())
+        for policy in (RecedingHorizonPolicy(), FormulaPlanner())
     ]
     assert lost[0] == lost[1]

@@ -12,10 +12,10 @@ from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
 from simulator.flying.pilots import LocalPilot
 from simulator.records.flight import Flight
-from simulator.records.operator import Operator
+from simulator.records.operator import OperatorRecord
 from simulator.records.real_uavs import RealUavs, sums_by_uav
 from simulator.records.summary import BySource, LossBound, Summary, summarise
-from simulator.reporting.comparison import Run, caution
+from simulator.reporting.comparison import MissionResult, caution
 from simulator.reporting.terminal_table import show
 from simulator.reporting.wording import (
     bound_text,
@@ -69,7 +69,9 @@ def test_real_uavs_claim_only_what_they_heard(flight: Flight, tmp_path: Path) ->
     summary = Summary.model_validate_json(simulated.model_copy(update=changes).model_dump_json())
     assert summary.real_uavs == real and world_text(summary) == "paper, real sensors"
     assert verdict(summary) == "The UAVs heard that sensors lost 1 packet in this flight."
-    assert "these losses cannot be compared" in caution([Run(tmp_path, simulated), Run(tmp_path, summary)])
+    assert "these losses cannot be compared" in caution(
+        [MissionResult(tmp_path, simulated), MissionResult(tmp_path, summary)]
+    )
     console = Console(width=120, file=StringIO())
     show(summary, console)
     assert isinstance(console.file, StringIO)
@@ -97,7 +99,7 @@ def test_the_operators_orders_are_named_beside_the_losses(flight: Flight) -> Non
     summary = summary_of(flight, None)
     assert orders_text(summary) is None
     note = "Visit sensor 3."
-    unconfirmed, obeyed = (Operator(note=note, orders=orders, deadlines=[]) for orders in (None, note))
+    unconfirmed, obeyed = (OperatorRecord(note=note, orders=orders, deadlines=[]) for orders in (None, note))
     said = orders_text(summary.model_copy(update={"operator": unconfirmed}))
     assert said is not None and said.startswith("No order of the operator was in force at the end")
     said = orders_text(summary.model_copy(update={"operator": obeyed}))

@@ -12,7 +12,7 @@ from pyproj import Geod
 
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
-from simulator.commands.options import chosen_site
+from simulator.commands.options import site_from_options
 from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
@@ -160,7 +160,7 @@ def test_a_sensor_out_of_reach_is_a_warning(tmp_path: Path, capsys: pytest.Captu
     warnings: list[str] = []
     site_from_folder(write(tmp_path, *GOOD, far), on_warning=warnings.append)
     assert len(warnings) == 1 and "1 of 3 sensors can be reached from no trajectory ('far')" in warnings[0]
-    chosen_site(None, tmp_path)
+    site_from_options(None, tmp_path)
     assert capsys.readouterr().err == f"warning: {warnings[0]}\n"
 
 
@@ -184,19 +184,19 @@ def test_sensors_in_reach_are_within_the_radio_radius(tmp_path: Path, metres: fl
 
 
 def test_with_neither_a_scenario_nor_a_world_the_paper() -> None:
-    assert chosen_site(None, None).scenario == Scenario()
-    assert chosen_site("stress", None, 4).scenario.steps == 4
+    assert site_from_options(None, None).scenario == Scenario()
+    assert site_from_options("stress", None, 4).scenario.steps == 4
 
 
 def test_a_scenario_and_a_world_contradict_each_other(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--scenario paper and --world .* contradict"):
-        chosen_site("paper", write(tmp_path, *GOOD))
+        site_from_options("paper", write(tmp_path, *GOOD))
 
 
 @pytest.mark.parametrize("steps", [0, 10_001])
 def test_steps_out_of_bounds(tmp_path: Path, steps: int) -> None:
     with pytest.raises(UsageError, match=f"--steps {steps} is not between 1 and 10000"):
-        chosen_site(None, write(tmp_path, *GOOD), steps)
+        site_from_options(None, write(tmp_path, *GOOD), steps)
 
 
 # ---- the worked example
