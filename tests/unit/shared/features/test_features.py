@@ -41,7 +41,7 @@ def test_the_horizon_multiplies_the_rate() -> None:
 def test_urgency_is_half_fill_and_half_overflow() -> None:
     queue, rate = np.array([0.0, 30.0, 60.0]), np.array([2.0, 8.0, 8.0])
     expected = 0.5 * queue / 60 + 0.5 * stats.poisson.sf(60 - queue, 3 * rate)
-    np.testing.assert_allclose(urgency(queue, rate, PAPER), expected)
+    np.testing.assert_allclose(urgency(queue, rate, PAPER), expected, rtol=0, atol=1e-13)
 
 
 @given(
