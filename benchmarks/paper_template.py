@@ -14,7 +14,7 @@ from service.prompting.experiences import Experiences
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt
 from service.prompting.rows import UNKNOWN, Cells
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import State
 from shared.world.actions import Action
 from shared.world.scenario import Scenario

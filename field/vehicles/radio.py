@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 from shared.world.scenario import Point
-from simulator.errors import UsageError
-from simulator.sites.site import Site
-
-SIMULATED = "simulated"
 
 
 @dataclass(frozen=True)
@@ -60,27 +54,3 @@ class Radio(Protocol):
     async def collect(self, spot: Spot, sensor: int) -> Collected:
         """Fetch a sensor's waiting packets, as many as the link carries in one step; called at the step's end."""
         ...
-
-
-def radio_named(name: str, site: Site, seed: int) -> Radio:
-    """The radio of the option ``--radio``: ``simulated``, or ``MODULE:NAME``, a callable that takes the site.
-
-    Raises:
-        UsageError: there is no such module or callable.
-    """
-    from field.vehicles.simulated_radio import SimulatedRadio
-
-    if name == SIMULATED:
-        return SimulatedRadio(site, seed)
-    module, _, attribute = name.partition(":")
-    if not attribute:
-        raise UsageError(f"--radio {name}: write simulated, or MODULE:NAME of your own, such as my_radio:Radio")
-    # A console script does not have the working directory on its path.
-    sys.path.insert(0, "")
-    try:
-        make: Callable[[Site], Radio] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"--radio {name}: {error}; it is looked for in the working directory and PYTHONPATH") from None
-    finally:
-        sys.path.remove("")
-    return make(site)

@@ -12,7 +12,7 @@ from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.softmax_means import softmax_means
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import ExpectedLinks
 from shared.belief.records import Records, take_report

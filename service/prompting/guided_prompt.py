@@ -9,7 +9,7 @@ from service.prompting.candidates import CandidateSet, Letters, Viewpoint
 from service.prompting.paper_prompt import Template
 from service.prompting.prompt import Prompt, note_block
 from service.prompting.rows import Cells, cells, row
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import Reach, State
 from shared.world.actions import Action
 from shared.world.scenario import Scenario

@@ -17,7 +17,7 @@ from service.prompting.rows import (
     meanings,
     row,
 )
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from shared.features.augmented_state import State
 from shared.wire.schemas import Features
 from shared.world.actions import Action

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 
 
 @dataclass(frozen=True, slots=True)

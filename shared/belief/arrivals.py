@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from shared.belief.expected_queues import GOES_ON, bursts_to_come
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 
@@ -16,8 +17,6 @@ _ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
 # The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least dispersion that
 # is no chance.
 _POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
-# The probability that a burst lasts into the next step, and its powers until they are 0.
-GOES_ON = 0.7
 _POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
 _ARRAYS = ("arrived", "watched", "recent", "recent_at")
 
@@ -76,8 +75,6 @@ class Arrivals:
 
     def burst(self, step: int, ids: IntArray | None = None) -> FloatArray:
         """Packets above the rate that are still to come of the bursts seen, from this step on, ``(J,)`` or ``(n,)``."""
-        from shared.belief.expected_queues import bursts_to_come
-
         which = np.arange(len(self.rate)) if ids is None else np.array(ids)
         packets = np.empty(len(which))
         bursts_to_come(*self.burst_arrays, self.in_bursts, which, step, packets)

@@ -6,9 +6,11 @@ Arrays ``(J,)`` are by sensor, those of :class:`~shared.belief.fleet_belief.Flee
 
 from __future__ import annotations
 
-from shared.belief.arrivals import GOES_ON
 from shared.kit.compiled import compiled, inlined
 from shared.world.channel import FloatArray, IntArray
+
+# The probability that a burst lasts into the next step, and its powers until they are 0.
+GOES_ON = 0.7
 
 
 @inlined

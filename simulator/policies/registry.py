@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
-from importlib import import_module
 
+from shared.kit.own_code import imported
 from simulator.errors import UsageError
 from simulator.policies.eof import EarliestOverflowFirst
 from simulator.policies.max_gain import MaximumGain
@@ -48,13 +46,10 @@ def policy_named(name: str) -> Policy:
 
 
 def _imported(name: str) -> Policy:
-    """The policy that a class without arguments makes; modules of the current folder are found too."""
-    module, _, attribute = name.partition(":")
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.insert(0, here)
+    """The policy that a class without arguments makes."""
     try:
-        made = getattr(import_module(module), attribute)()
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        made = imported(name)()
+    except (TypeError, ValueError) as error:
         raise UsageError(f"policy {name}: {error}") from None
     for method in ("reset", "decide"):
         if not callable(getattr(made, method, None)):

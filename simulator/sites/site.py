@@ -11,7 +11,7 @@ from shared.world.scenario import Scenario
 if TYPE_CHECKING:
     from shared.world.channel import IntArray
     from simulator.sites.fence import Fence
-    from simulator.sites.files.projection import Frame
+    from simulator.sites.projection import Frame
     from simulator.world.environment import PipelineWorld
     from simulator.world.gain_trace import GainTrace
     from simulator.world.observation import Cost

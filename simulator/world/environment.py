@@ -222,7 +222,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             raise ValueError("render before reset")
         from simulator.world.rendering import render_map
 
-        return render_map(self)
+        return render_map(self.scenario, len(self.tally), self.sensors, self.fleet)
 
     def _own(self, observed: BatchObservation) -> dict[str, Observation]:
         """A copy of every live UAV's observation."""

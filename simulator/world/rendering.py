@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from simulator.world.environment import PipelineWorld
+from shared.world.scenario import Scenario
+from simulator.world.fleet import Fleet
+from simulator.world.sensors import Sensors
 
 
-def render_map(world: PipelineWorld) -> NDArray[np.uint8]:
+def render_map(scenario: Scenario, step: int, sensors: Sensors, fleet: Fleet) -> NDArray[np.uint8]:
     """The map as RGB, shape ``(600, 600, 3)``: trajectories, UAVs, and sensors filled by their queues."""
-    scenario, sensors, fleet = world.scenario, world.sensors, world.fleet
     # Without pyplot, no reference to the figure outlives this function.
     figure = Figure(figsize=(6, 6), dpi=100)
     canvas = FigureCanvasAgg(figure)
-    axes = figure.add_subplot(xlabel="x, m", ylabel="y, m", title=f"{scenario.name}, step {len(world.tally)}")
+    axes = figure.add_subplot(xlabel="x, m", ylabel="y, m", title=f"{scenario.name}, step {step}")
     low, high = [np.zeros(2)], [np.full(2, scenario.area_m)]
     for uav, (path, position) in enumerate(zip(fleet.trajectories, fleet.positions, strict=True)):
         colour = f"C{uav % 10}"

@@ -90,7 +90,7 @@ class TrueChannel:
         return world.rician_k_db is not None or bool(world.dead_radios or world.link_share_drop)
 
     def links(self, distance_m: FloatArray, position: FloatArray, progress_m: FloatArray, instant: int) -> Links:
-        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``; past the radio radius the loss is infinite.
+        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``; out of range the loss is infinite.
 
         Args:
             distance_m: horizontal, ``(..., I, J)``.

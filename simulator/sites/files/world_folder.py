@@ -38,10 +38,10 @@ from simulator.errors import UsageError
 from simulator.sites.fence import Fence
 from simulator.sites.files.gains import read_gains
 from simulator.sites.files.overrides import read_overrides
-from simulator.sites.files.projection import Frame, centre_of, fit_square, to_metres
 from simulator.sites.files.reading import quoted
 from simulator.sites.files.survey import Survey, check_complete, read_survey
 from simulator.sites.files.trace import read_trace
+from simulator.sites.projection import Frame, centre_of, fit_square, to_metres
 from simulator.sites.site import Site
 
 __all__ = ["ARRIVALS", "FEATURES", "GAINS", "OVERRIDES", "site_from_folder"]

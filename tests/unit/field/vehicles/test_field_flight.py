@@ -13,7 +13,8 @@ from field.errors import VehicleError
 from field.vehicles.field_flight import FieldFlight, RealFlight
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import FieldUav
-from field.vehicles.radio import Beacon, Collected, Radio, Spot, radio_named
+from field.vehicles.named_radio import radio_named
+from field.vehicles.radio import Beacon, Collected, Radio, Spot
 from field.vehicles.simulated_radio import SimulatedRadio
 from shared.client.edge_client import AsyncEdgeClient, EdgeClient
 from shared.wire.schemas import DecideRequest

@@ -9,8 +9,8 @@ import numpy as np
 
 from shared.world.scenario import scenario_named
 from shared.world.trajectory import trajectories
-from simulator.sites.files.projection import Frame
 from simulator.sites.files.world_folder import site_from_folder
+from simulator.sites.projection import Frame
 from simulator.world.fleet import Fleet
 from simulator.world.sensors import Streams, draw_positions
 from tests.unit.field.vehicles.airframe import Item

@@ -21,7 +21,7 @@ from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.prompt import Prompt
 from service.prompting.rows import row
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from shared.world.actions import Action
 from tests.support.running import serving
 from tests.support.waiting import Clock, Gate, until

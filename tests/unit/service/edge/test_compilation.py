@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from service.edge.compilation import load_for_event_loop
 from service.prompting import row_kinds
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from shared.belief import beacon_updates, expected_queues, link_expectations, record_updates
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.records import take_report

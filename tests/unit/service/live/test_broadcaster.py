@@ -25,7 +25,7 @@ from service.live.recent_decisions import RecentDecisions
 from service.mission.events import Settled
 from service.prompting.prompt import Prompt
 from service.prompting.rows import row
-from service.prompting.token_accounting import UnprunedState
+from service.prompting.unpruned_state import UnprunedState
 from service.storage.rows import decode, encode, pack
 from shared.wire.schemas import DecideResponse, Outcome, Tokens
 from tests.e2e.processes import serving_edge

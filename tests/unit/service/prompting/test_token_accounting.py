@@ -7,8 +7,9 @@ import pytest
 
 from service.config.settings import Settings
 from service.prompting.rows import row
-from service.prompting.token_accounting import TokenCounter, UnprunedState, price_usd
+from service.prompting.token_accounting import TokenCounter, price_usd
 from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_vocabulary
+from service.prompting.unpruned_state import UnprunedState
 from shared.wire.schemas import Features, MissionSpec
 from shared.world.scenario import Scenario
 from tests.unit.service.making import attended, mission, uav

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from shared.belief.arrivals import GOES_ON
+from shared.belief.expected_queues import GOES_ON
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import ExpectedLinks
 from shared.belief.records import Records, take_report

@@ -16,8 +16,8 @@ from simulator.commands.options import site_from_options
 from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
-from simulator.sites.files.projection import to_metres
 from simulator.sites.files.world_folder import site_from_folder
+from simulator.sites.projection import to_metres
 from simulator.sites.site import Site
 from simulator.world.batch import VectorWorld
 from tests.unit.simulator.sites.files.made_folder import (
