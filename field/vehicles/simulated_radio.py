@@ -19,9 +19,6 @@ class SimulatedRadio:
 
     A sensor serves one UAV a step. Packets arrive between two steps. What the model leaves out
     (:class:`shared.world.unmodelled.Unmodelled`) is not simulated, except bursts.
-
-    Attributes:
-        lost: packets that all sensors have lost so far.
     """
 
     def __init__(self, site: Site, seed: int) -> None:

@@ -105,7 +105,7 @@ class Planned:
 
     @property
     def plans(self) -> bool:
-        """Whether a planner flies it, for seconds and, where OR-Tools searches, in a process of its own."""
+        """Whether a planner flies it, which takes seconds, and a process of its own."""
         decides = self.scheme.decides
         return isinstance(decides, Clairvoyant | Informed) or (
             isinstance(decides, Local) and decides.policy in PLANNERS

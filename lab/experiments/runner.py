@@ -121,8 +121,7 @@ class Run:
                     yield planned, fly_with_edge(edge, planned)
 
     def _fly_locally(self, flights: Sequence[Planned]) -> Iterator[tuple[Planned, FlightRecord | None]]:
-        # Planners need a separate process: OR-Tools installs a SIGINT handler for its search and does not restore the
-        # old one.
+        # A planner searches for seconds in compiled code, which Ctrl-C does not interrupt: its process is ended.
         pooled = [planned for planned in flights if self.workers > 1 or self.ray or planned.plans]
         for planned in (planned for planned in flights if planned not in pooled):
             yield planned, self._record_of(planned, lambda planned=planned: fly_locally(planned))  # type: ignore[misc]

@@ -99,7 +99,6 @@ class Clairvoyant:
 
     def _planned(self) -> NDArray[np.int64]:
         """The best flight ``(H, I, 2)`` found from the world's current state to its end, in wind for one step."""
-        from shared.planning.greedy import look_ahead
         from simulator.bound.solver import Budget, plan
 
         world = self._world
@@ -107,7 +106,7 @@ class Clairvoyant:
         problem = true_problem(world, _WINDY_STEPS if blows else None)
         # The search of simulator.bound.clairvoyant_bound ends by the clock; rollouts must repeat to the bit.
         budget = Budget(work=_WINDY_WORK if blows else _CLAIRVOYANT_WORK)
-        actions = plan(problem, budget, "cautious", look_ahead(problem)).actions
+        actions = plan(problem, budget, "cautious").actions
         if not blows:
             return actions
         # In wind no step but the first one is flown as planned.

@@ -13,8 +13,8 @@ from torchrl.envs import EnvBase
 
 from lab.marl.network_inputs import fleet_input, width
 from shared.world.scenario import Scenario
-from simulator.world.batch import BatchObservation, VectorWorld
-from simulator.world.observation import Cost
+from simulator.world.batch import VectorWorld
+from simulator.world.observation import Cost, Observation
 
 
 class PipelineEnv(EnvBase):  # type: ignore[misc]
@@ -77,7 +77,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
         if seed is not None:
             self.next_seed = seed
 
-    def _tensors(self, observation: BatchObservation, lost: NDArray[Any]) -> TensorDict:
+    def _tensors(self, observation: Observation, lost: NDArray[Any]) -> TensorDict:
         views = fleet_input(self._world.scenario, observation)
         self._order = views.order
         over = torch.full((*self.batch_size, 1), self._world.steps_flown == self._world.scenario.steps)

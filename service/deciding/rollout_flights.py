@@ -1,4 +1,7 @@
-"""Flights of the rollout evaluator's candidates through sampled futures, compiled by numba."""
+"""Flights of the rollout evaluator's candidates through sampled futures, compiled by numba.
+
+A step follows :mod:`shared.world.step_rule` with batteries that last; a property test compares the two.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,11 @@ from numpy.typing import NDArray
 
 from service.deciding.rollout_state import RolloutState
 from service.deciding.sampled_futures import SampledFutures
-from shared.features.augmented_state import VELOCITY_BONUS, urgency
 from shared.kit.compiled import compiled, inlined
 from shared.planning.annealing_arrays import listed
 from shared.planning.orders import LATE_PACKETS
 from shared.world.channel import FloatArray
+from shared.world.urgency import VELOCITY_BONUS, urgency
 
 
 class FlownWorld(NamedTuple):

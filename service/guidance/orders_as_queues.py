@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.features.augmented_state import Reach, State, overflow_probability, urgency_of
+from shared.features.augmented_state import Reach, State
 from shared.planning.orders import Guidance
 from shared.world.scenario import Scenario
+from shared.world.urgency import overflow_probability, urgency_of
 
 
 def as_queues(

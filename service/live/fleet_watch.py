@@ -10,11 +10,11 @@ import numpy as np
 
 from service.mission.mission import Mission
 from shared.belief.fleet_belief import FleetBelief
-from shared.features.augmented_state import overflow_probability
 from shared.kit.bounded import BoundedDict
 from shared.wire.schemas import UavState
 from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
+from shared.world.urgency import overflow_probability
 
 # Missions that are watched, and the steps that are remembered of each.
 _MOST_MISSIONS = 1000

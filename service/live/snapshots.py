@@ -10,9 +10,9 @@ from pydantic_core import to_json
 from service.live.fleet_watch import Watched
 from service.live.recent_decisions import RecentDecision
 from service.mission.mission import Mission
-from shared.features.augmented_state import urgency
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
+from shared.world.urgency import urgency
 
 # Steps until a queue is full, of a sensor that gets hardly any packets.
 _NEVER = 10_000

@@ -15,7 +15,7 @@ from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
 
-# A plan for a larger world is slow to set up; the learned values decide there.
+# For a larger world a plan takes too long to set up. There the LLM-free policy, look-ahead, stands in for the plan.
 MAX_SENSORS = 1000
 MAX_UAVS = 20
 

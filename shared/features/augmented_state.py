@@ -7,54 +7,22 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from shared.belief.drift import Drift
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import LIKELY, ExpectedLinks, LearnedChannel
-from shared.features.poisson_tail import above_poisson
 from shared.wire.schemas import Features, UavState
 from shared.wire.sensor_arrays import arrays_of
 from shared.world.channel import FloatArray, best_gain_db, channel_gain_db
 from shared.world.scenario import Point, Scenario
 from shared.world.trajectory import progress_of, trajectories
+from shared.world.urgency import overflow_probability, urgency_of, with_bonus
 
 # The number of features of a sensor in each preset.
 FEATURES: dict[Features, int] = {"paper": 5, "reach": 12}
-# The worth of a metre a second in urgent packets: while a UAV dwells at few packets, sensors further on overflow.
-# On 30 worlds of scenario `paper`, 0.5 to 4 lost 54 to 61 packets, differences within their noise.
-VELOCITY_BONUS = 0.5
 # The number of the velocity scorer's inputs for each velocity level.
 LEVEL_FEATURES = 4
-
-
-def overflow_probability(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:
-    """``Pof_j = P(Poisson(rate_j x horizon) > W - q_j)``, in 0..1, shape ``(J,)``.
-
-    Args:
-        queue: packets waiting, shape ``(J,)``; clipped to 0..W.
-        rate: arrival rate in packets a step, shape ``(J,)``, at least 0.
-    """
-    capacity = scenario.queue_capacity
-    # For a few numbers np.clip takes several times as long.
-    room = np.floor(capacity - np.minimum(np.maximum(np.asarray(queue, dtype=np.float64), 0), capacity))
-    mean = np.asarray(rate, dtype=np.float64) * scenario.overflow_horizon_steps
-    # Copies, because numba would compile the function again for arrays that are read-only.
-    rooms, means = np.array(np.broadcast_arrays(room, mean))
-    above = np.empty(rooms.shape)
-    above_poisson(rooms.ravel(), means.ravel(), above.ravel())
-    return above
-
-
-def urgency(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:
-    """``U_j = 0.5 q_j / W + 0.5 Pof_j``, in 0..1, shape ``(J,)``; arguments as :func:`overflow_probability`."""
-    return urgency_of(queue, overflow_probability(queue, rate, scenario), scenario)
-
-
-def urgency_of(queue: ArrayLike, overflow: FloatArray, scenario: Scenario) -> FloatArray:
-    """As :func:`urgency`, from known probabilities ``Pof_j``, shape ``(J,)``."""
-    fill = np.asarray(queue, dtype=np.float64) / scenario.queue_capacity
-    return np.asarray(0.5 * np.minimum(np.maximum(fill, 0.0), 1.0) + 0.5 * overflow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +46,7 @@ class Reach:
         # In place: of many sensors, new memory takes as long as the sums.
         packets = np.minimum(queue, links.packets)
         packets *= links.hold
-        worth = urgency * packets
-        worth += VELOCITY_BONUS * np.arange(len(packets), dtype=np.float64)[:, None]
+        worth = with_bonus(urgency * packets, np.arange(len(packets)))
         best = worth.argmax(axis=0)
         return cls(links, packets, worth, best, packets[best, np.arange(len(best))])
 

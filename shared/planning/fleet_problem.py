@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.planning.queue_chains import QueueChains
-from shared.world.channel import FloatArray, IntArray, link_holds, packets_per_step, rate_bps
+from shared.world.channel import FloatArray, IntArray, Links, packets_per_step
 from shared.world.scenario import Scenario
+from shared.world.step_rule import arrive, joules_a_packet, transfer
 from shared.world.trajectory import Trajectory
 
 
@@ -47,7 +48,7 @@ class FleetProblem:
             the first one.
 
     Raises:
-        ValueError: a shape or a value is wrong; the message names the field.
+        ValueError: a shape is wrong, or the search would read past an array; the message names the field.
     """
 
     scenario: Scenario
@@ -68,75 +69,49 @@ class FleetProblem:
     stages: Sequence[IntArray] | None = None
 
     def __post_init__(self) -> None:
-        count = len(self.places)
-        if self.arrivals.ndim != 2 or not len(self.arrivals):
+        steps, count, levels = len(self.arrivals), len(self.places), self.scenario.max_velocity + 1
+        if self.arrivals.ndim != 2 or not steps:
             raise ValueError(f"arrivals has shape {self.arrivals.shape}, must be (H, {count}) with H at least 1")
-        shapes = {
-            "progress_m": (len(self.trajectories),),
+        shapes: dict[str, tuple[int, ...]] = {
+            "progress_m": (self.uavs,),
             "places": (count, 2),
             "queue": (count,),
             "battery": (count,),
-            "arrivals": (self.horizon, count),
+            "arrivals": (steps, count),
+            "usable": (steps, count),
+            "allowed": (levels,),
+            "weights": (count,),
+            "late": (steps + 1, steps + 1, count),
         }
-        if self.usable is not None:
-            shapes["usable"] = (self.horizon, count)
-        if self.allowed is not None:
-            shapes["allowed"] = (self.scenario.max_velocity + 1,)
-        if self.weights is not None:
-            shapes["weights"] = (count,)
-        if self.late is not None:
-            shapes["late"] = (self.horizon + 1, self.horizon + 1, count)
         for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}, must be {shape}")
-        for name in ("queue", "arrivals"):
-            if getattr(self, name).dtype.kind not in "iu" or getattr(self, name).min(initial=0) < 0:
-                raise ValueError(f"{name} must be whole packets, at least 0")
-        if self.queue.max(initial=0) > self.scenario.queue_capacity:
-            raise ValueError(f"queue has {self.queue.max()} packets, the capacity is {self.scenario.queue_capacity}")
+            if (value := getattr(self, name)) is not None and value.shape != shape:
+                raise ValueError(f"{name} has shape {value.shape}, must be {shape}")
+        self._check_tables(steps * (levels - 1) + 1, count)
         if self.allowed is not None and not self.allowed.any():
             raise ValueError("allowed has no velocity")
-        self._check_links(count)
-        self._check_stages(count)
+        # The compiled search reads the stages as indices, without a check.
+        most = 0 if self.chains is None else len(self.chains.after)
+        if any(table.min() < 0 or table.max() >= most for table in self.stages or ()):
+            raise ValueError(f"stages must be those of chains, 0..{most - 1}")
+
+    def _check_tables(self, sums: int, count: int) -> None:
+        steps = (1, self.horizon)
+        for name, dimensions in (("links", 3), ("chances", 3), ("stages", 2)):
+            tables = getattr(self, name) or ()
+            if len(tables) not in (0, self.uavs):
+                raise ValueError(f"{name} has tables of {len(tables)} UAVs, there are {self.uavs}")
+            for uav, table in enumerate(tables):
+                right = table.ndim == dimensions and (dimensions == 2 or len(table) in steps)
+                if not right or table.shape[-2] < sums or table.shape[-1] != count:
+                    first = "" if dimensions == 2 else f"1 or {self.horizon}, "
+                    raise ValueError(f"{name}[{uav}] has shape {table.shape}, must be ({first}{sums}, {count})")
+        if self.chances is not None and [c.shape for c in self.chances] != [t.shape for t in self.links or ()]:
+            raise ValueError("chances must have the shapes of links")
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
-                shape = actions.shape
-                raise ValueError(f"fixed[{uav}] has shape {shape}, must be (at most {self.horizon}, 2) of a UAV")
-
-    def _check_links(self, count: int) -> None:
-        sums = self.horizon * self.scenario.max_velocity + 1
-        for uav, table in enumerate(self.links or ()):
-            if (
-                table.ndim != 3
-                or len(table) not in (1, self.horizon)
-                or table.shape[1] < sums
-                or table.shape[2] != count
-            ):
                 raise ValueError(
-                    f"links[{uav}] has shape {table.shape}, must be (1 or {self.horizon}, {sums}, {count})"
+                    f"fixed[{uav}] has shape {actions.shape}, must be (at most {self.horizon}, 2) of a UAV"
                 )
-        if self.links is not None and len(self.links) != self.uavs:
-            raise ValueError(f"links has tables of {len(self.links)} UAVs, there are {self.uavs}")
-        if any(table.dtype.kind not in "iu" or table.min(initial=0) < 0 for table in self.links or ()):
-            raise ValueError("links must be whole packets, at least 0")
-        if self.chances is not None and [c.shape for c in self.chances] != [table.shape for table in self.links or ()]:
-            raise ValueError(f"chances has shapes {[c.shape for c in self.chances]}, must have those of links")
-        if not all(((chance >= 0) & (chance <= 1)).all() for chance in self.chances or ()):
-            raise ValueError("chances must be probabilities, 0..1")
-
-    def _check_stages(self, count: int) -> None:
-        if self.stages is None:
-            return
-        if self.chains is None:
-            raise ValueError("stages needs chains")
-        most, sums = len(self.chains.after), self.horizon * self.scenario.max_velocity + 1
-        if len(self.stages) != self.uavs:
-            raise ValueError(f"stages has tables of {len(self.stages)} UAVs, there are {self.uavs}")
-        for uav, table in enumerate(self.stages):
-            if table.shape != (sums, count):
-                raise ValueError(f"stages[{uav}] has shape {table.shape}, must be ({sums}, {count})")
-            if table.min() < 0 or table.max() >= most:
-                raise ValueError(f"stages[{uav}] must be stages, 0..{most - 1}")
 
     @property
     def horizon(self) -> int:
@@ -221,67 +196,42 @@ class Course:
 
 
 def fly(problem: FleetProblem, actions: IntArray) -> Course:
-    """Fly actions ``(H, I, 2)`` as the simulated world does: move, transfer, arrive, overflow.
-
-    The transfers go in the order of the UAVs. A transfer fails if the link does not hold, if the sensor has served
-    another UAV in this step, or if its battery cannot pay for one packet.
-    """
-    capacity = problem.scenario.queue_capacity
-    queue, lost = [problem.queue], []
-    battery = problem.battery.copy()
-    link = np.zeros(actions.shape[:2], dtype=np.int64)
-    for step, transfers in enumerate(_transfers(problem, actions)):
-        left, served = queue[-1].copy(), set[int]()
-        for uav, (sensor, budget, joules) in enumerate(transfers):
-            affordable = int(battery[sensor] / joules + 1e-9)
-            if budget is None or sensor in served or affordable < 1:
-                continue
-            served.add(sensor)
-            link[step, uav] = budget
-            moved = min(int(left[sensor]), budget, affordable)
-            left[sensor] -= moved
-            battery[sensor] = max(0.0, float(battery[sensor]) - moved * joules)
-        filled = left + problem.arrivals[step]
-        queue.append(np.minimum(filled, capacity))
-        lost.append(filled - queue[-1])
+    """Fly actions ``(H, I, 2)`` by the rule of :mod:`shared.world.step_rule`."""
+    queue, lost, battery = [problem.queue], [], problem.battery.copy()
+    sensor, (holds, budget, joules) = actions[:, :, 0], _transfers(problem, actions)
+    link = np.zeros(sensor.shape, dtype=np.int64)
+    for step, arrivals in enumerate(problem.arrivals):
+        left = queue[-1].copy()
+        served, _ = transfer(left, battery, sensor[step], holds[step], budget[step], joules[step])
+        link[step] = budget[step] * served
+        filled, over = arrive(left, arrivals, problem.scenario.queue_capacity)
+        queue.append(filled)
+        lost.append(over)
     return Course(np.array(queue), np.array(lost), link)
 
 
-def with_fixed(problem: FleetProblem, actions: IntArray | None) -> IntArray:
-    """The actions, or full speed and sensor 0 for all UAVs, with the problem's fixed ones at the beginning.
-
-    The nearest allowed velocity replaces a forbidden one.
-    """
-    if actions is None:
-        start = np.zeros((problem.horizon, problem.uavs, 2), dtype=np.int64)
-        start[:, :, 1] = problem.levels[-1]
-    else:
-        start = actions.copy()
-        start[:, :, 1] = problem.levels[np.abs(start[:, :, 1, None] - problem.levels).argmin(axis=-1)]
+def with_fixed(problem: FleetProblem, actions: IntArray) -> IntArray:
+    """The actions with the fixed ones at the beginning; the nearest allowed velocity replaces a forbidden one."""
+    start = actions.copy()
+    start[:, :, 1] = problem.levels[np.abs(start[:, :, 1, None] - problem.levels).argmin(axis=-1)]
     for uav, fixed in problem.fixed.items():
         start[: len(fixed), uav] = fixed
     return start
 
 
-def _transfers(problem: FleetProblem, actions: IntArray) -> Iterator[list[tuple[int, int | None, float]]]:
-    """By step and UAV: sensor, packets of the link (``None``: it does not hold), joules a packet."""
+def _transfers(problem: FleetProblem, actions: IntArray) -> tuple[NDArray[np.bool_], IntArray, FloatArray]:
+    """Whether each transfer's link holds, its packets, and joules a packet, ``(H, I)`` each."""
     world = problem.scenario
     flown, sensor = np.cumsum(actions[:, :, 1], axis=0), actions[:, :, 0]
-    if problem.links is None:
-        columns = []
-        for uav in range(problem.uavs):
-            distance = problem.distance(uav, flown[:, uav])
-            columns.append(np.take_along_axis(distance, sensor[:, uav, None], axis=1)[:, 0])
-        reach = np.stack(columns, axis=1)
-        holds, budget = link_holds(reach, world), packets_per_step(reach, world)
-        joules = world.transmit_power_w * (world.packet_bits / np.maximum(rate_bps(reach, world), 1e-12))
-    else:
+    if problem.links is not None:
         budget = _chosen(problem.links, flown, sensor)
-        holds = budget > 0
-        joules = world.transmit_power_w * world.step_s / np.maximum(budget, 1)
-    for step in range(len(actions)):
-        rows = zip(*(a[step].tolist() for a in (sensor, holds, budget, joules)), strict=True)
-        yield [(j, packets if held else None, joule) for j, held, packets, joule in rows]
+        return budget > 0, budget, world.transmit_power_w * world.step_s / np.maximum(budget, 1)
+    columns = [
+        np.take_along_axis(problem.distance(uav, flown[:, uav]), sensor[:, uav, None], axis=1)[:, 0]
+        for uav in range(problem.uavs)
+    ]
+    links = Links.at(np.stack(columns, axis=1), world)
+    return links.hold, links.packets, joules_a_packet(links.rate_bps, world)
 
 
 def _chosen(tables: Sequence[NDArray[Any]], flown: IntArray, sensor: IntArray) -> NDArray[Any]:

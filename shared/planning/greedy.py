@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from shared.planning.fleet_problem import FleetProblem
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
+from shared.world.step_rule import arrive
+from shared.world.urgency import urgency_of, with_bonus
 
-# The worth of a metre a second in urgent packets: while a UAV dwells at few packets, sensors further on overflow.
-_VELOCITY_BONUS = 0.5
 _erf = np.frompyfunc(math.erf, 1, 1)
 
 
@@ -21,8 +21,8 @@ def look_ahead(problem: FleetProblem) -> IntArray:
 
     Step by step and in the order of their indices, every UAV takes the sensor and the velocity of greatest
     ``U_j min(q_j, packets movable from the new position) + 0.5 v``, with the urgency
-    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.features.augmented_state`, with a normal of the same mean for
-    its Poisson. No two UAVs take a sensor in the same step. Batteries are assumed to last. A sensor's urgent packets
+    ``U_j = q_j / 2W + P(overflow) / 2`` of :mod:`shared.world.urgency`, with a normal of the same mean for its Poisson.
+    No two UAVs take a sensor in the same step. Batteries are assumed to last. A sensor's urgent packets
     have the weight of its lost ones, and for a sensor in reach the price of being overdue counts too.
     """
     world = problem.scenario
@@ -33,7 +33,8 @@ def look_ahead(problem: FleetProblem) -> IntArray:
     since = np.zeros(problem.sensors, dtype=np.int64)
     every = np.arange(problem.sensors)
     for step in range(problem.horizon):
-        urgent = _urgency(queue, problem.arrivals[step : step + window].mean(axis=0), world)
+        overflow = _overflow(queue, problem.arrivals[step : step + window].mean(axis=0), world)
+        urgent = urgency_of(queue, overflow, world)
         late = None if problem.late is None else problem.late[since, step, every]
         if problem.weights is not None:
             urgent = urgent * problem.weights
@@ -54,29 +55,24 @@ def look_ahead(problem: FleetProblem) -> IntArray:
             flown[uav] += velocity
             moved[sensor] = max(moved[sensor], float(packets[sensor]))
         since[moved > 0] = step + 1
-        queue = np.minimum(np.maximum(queue - moved, 0.0) + problem.arrivals[step], world.queue_capacity)
+        queue, _ = arrive(np.maximum(queue - moved, 0.0), problem.arrivals[step], world.queue_capacity)
     return actions
 
 
-def _normal_below(z: FloatArray) -> FloatArray:
-    """``Phi(z)`` by the standard library: planning needs no scipy."""
+def _overflow(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArray:
+    """``P(overflow)`` by the standard library's normal distribution: planning needs no scipy."""
+    arrived = np.maximum(rate * world.overflow_horizon_steps, 1e-9)
+    z = (arrived - (world.queue_capacity - queue)) / np.sqrt(arrived)
     return np.asarray(0.5 * (1.0 + np.asarray(_erf(z / math.sqrt(2.0)), dtype=np.float64)))
 
 
-def _urgency(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArray:
-    arrived = np.maximum(rate * world.overflow_horizon_steps, 1e-9)
-    room = world.queue_capacity - queue
-    return np.asarray(0.5 * queue / world.queue_capacity + 0.5 * _normal_below((arrived - room) / np.sqrt(arrived)))
-
-
-def _expected(problem: FleetProblem, uav: int, velocity: IntArray, step: int) -> IntArray | FloatArray:
+def _expected(problem: FleetProblem, uav: int, velocity: IntArray, step: int) -> FloatArray:
     """The packets that links are expected to move, ``(n, J)``."""
-    packets = problem.packets(uav, velocity, step)
-    return packets if problem.chances is None else packets * problem.chance(uav, velocity, step)
+    return problem.packets(uav, velocity, step) * problem.chance(uav, velocity, step)
 
 
 def _best(
-    links: IntArray | FloatArray,
+    links: FloatArray,
     queue: FloatArray,
     urgent: FloatArray,
     usable: NDArray[np.bool_],
@@ -87,7 +83,6 @@ def _best(
     worth = urgent * np.minimum(queue, links)
     if late is not None:
         worth = worth + late * (links > 0)
-    worth = np.where(usable, worth, -1.0)
-    worth += _VELOCITY_BONUS * levels[:, None]
+    worth = with_bonus(np.where(usable, worth, -1.0), levels)
     level, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
     return int(sensor), int(level)

@@ -89,7 +89,7 @@ class Draft:
         last = annealing.priced(with_fixed(self.problem, self.before))
         if last.expected_loss < _NEGLIGIBLE:
             return last
-        greedy = annealing.priced(with_fixed(self.problem, look_ahead(self.problem)))
+        greedy = annealing.priced(look_ahead(self.problem))
         starts = sorted((last, greedy), key=_loss)
 
         def run(number: int) -> Found:
@@ -179,6 +179,9 @@ class RecedingHorizon:
         def renamed(actions: IntArray) -> IntArray:
             return np.array([(index.get(sensor, nowhere), v) for sensor, v in actions.tolist()], dtype=np.int64)
 
+        # Other UAVs have reserved some sensors in this step.
+        usable = np.ones((horizon, len(kept) + 1), dtype=np.bool_)
+        usable[0, :-1] = ~np.isin(kept, list(set(taken) - {sensor for sensor, _ in decided.values()}))
         links = self._links(present, kept, horizon)
         ahead = self._chances_ahead(present, kept, horizon) if self._joint else None
         problem = FleetProblem(
@@ -187,7 +190,7 @@ class RecedingHorizon:
             progress_m=np.array([belief.uavs[u].progress_m for u in present], dtype=np.float64),
             places=np.concatenate((np.nan_to_num(belief.places[kept], nan=FAR_M), [[FAR_M, FAR_M]])),
             fixed={present.index(u): renamed(actions) for u, actions in fixed.items()},
-            usable=self._usable(kept, horizon, set(taken) - {sensor for sensor, _ in decided.values()}),
+            usable=usable,
             chains=self._chains(kept, horizon, ahead),
             stages=None if ahead is None else self._stages(ahead, horizon),
             **links,
@@ -265,12 +268,6 @@ class RecedingHorizon:
             "links": [np.pad(links.packets[:, kept], nowhere)[None] for links in expected],
             "chances": [np.pad(links.hold[:, kept], nowhere)[None] for links in expected],
         }
-
-    def _usable(self, kept: IntArray, horizon: int, taken: Collection[int]) -> NDArray[np.bool_]:
-        """Every sensor and step, except the sensors that other UAVs have reserved in this step."""
-        usable = np.ones((horizon, len(kept) + 1), dtype=np.bool_)
-        usable[0, :-1] = ~np.isin(kept, list(taken))
-        return usable
 
     def _outlook(self, kept: IntArray, horizon: int) -> dict[str, Any]:
         """The expected queues and arrivals of the kept sensors, and of one nowhere without packets."""

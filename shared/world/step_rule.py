@@ -1,10 +1,10 @@
 """The rule of a step: what the UAVs collect, what arrives, and what overflows.
 
-The world, plans, bounds and trials with simulated radios use these functions. Where speed needs another form, a
-property test compares it with them: the flights of the rollout evaluator (compiled), the costs of the annealing
-(distributions of queues) and the constraints of the clairvoyant bound.
+The world, flown plans and trials with simulated radios use these functions. Where speed needs another form, a property
+test compares it with them: the flights of the rollout evaluator (compiled), the costs of the annealing (distributions
+of queues) and the constraints of the clairvoyant bound.
 
-In a step UAV i names sensor ``s_i``. Its link holds or not; a link that holds can move ``p_i`` packets in the step,
+In a step UAV i names sensor ``s_i``. Its link holds or not. A link that holds can move ``p_i`` packets in the step,
 each for ``w_i`` joules. Sensor j has a queue ``q_j`` of at most W packets and ``e_j`` joules.
 
 1. **Transfers.** A sensor serves one UAV a step: of those that name it the one of the lowest index whose link holds and

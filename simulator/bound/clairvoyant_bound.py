@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
@@ -24,36 +24,9 @@ if TYPE_CHECKING:
 _CHASES = ((10, 0.3), (None, 3.0))
 
 
-@dataclass(frozen=True, eq=False)
-class Bound:
-    """A bound on the packets lost in one world, and the best flight found.
-
-    Attributes:
-        lower_bound: proven; no flight loses fewer packets.
-        lost_packets: of the best flight found.
-        actions: of that flight, shape ``(T, I, 2)``: sensor, velocity.
-        seconds: of the search.
-    """
-
-    lower_bound: int
-    lost_packets: int
-    actions: NDArray[np.int64]
-    seconds: float
-
-    @property
-    def optimal(self) -> bool:
-        """Whether the flight is proven to be the best."""
-        return self.lost_packets == self.lower_bound
-
-    @property
-    def gap(self) -> int:
-        """Packets that the flight loses above the bound."""
-        return self.lost_packets - self.lower_bound
-
-
 def clairvoyant(
     site: Site, seed: int, time_limit_s: float = 60.0, workers: int = 8, on_news: Callable[[News], None] | None = None
-) -> Bound:
+) -> Plan:
     """Bound one world with all its arrivals, links, wind and faults known.
 
     The bound omits batteries where a link's strength decides the energy of a packet, which can only lower it. The
@@ -76,7 +49,7 @@ def clairvoyant(
     return confirmed(site, seed, least_loss(problem_of(site, seed), time_limit_s, workers, on_news))
 
 
-def confirmed(site: Site, seed: int, plan: Plan) -> Bound:
+def confirmed(site: Site, seed: int, plan: Plan) -> Plan:
     """The bound that a plan of the whole mission proves, and the losses of the plan's flight in the world.
 
     Where the world differs from the model, the flight may lose more than the plan, which omits what a weak link costs a
@@ -90,13 +63,12 @@ def confirmed(site: Site, seed: int, plan: Plan) -> Bound:
     if world.truth.wind.blows:
         tried = [_chased(_reset(site, seed), steps, work) for steps, work in _CHASES]
     flown, actions = min(((replay(site, seed, actions), actions) for actions in tried), key=itemgetter(0))
-    # Lost packets are whole numbers; the margin covers the solver's rounding.
-    proven = int(np.ceil(plan.lower_bound - 1e-6))
-    if flown < proven or (flown != plan.lost_packets and not world.truth.differs):
+    if flown < plan.lower_bound or (flown != plan.lost_packets and not world.truth.differs):
         raise RuntimeError(
-            f"the plan of seed {seed} loses {plan.lost_packets} packets, at least {proven}; flown in the world {flown}"
+            f"the plan of seed {seed} loses {plan.lost_packets} packets, at least {plan.lower_bound}; "
+            f"flown in the world {flown}"
         )
-    return Bound(proven, flown, actions, plan.seconds)
+    return replace(plan, actions=actions, lost_packets=flown)
 
 
 def problem_of(site: Site, seed: int) -> FleetProblem:
@@ -120,13 +92,12 @@ def _reset(site: Site, seed: int) -> PipelineWorld:
 
 def _chased(world: PipelineWorld, steps: int | None, work: float) -> NDArray[np.int64]:
     """Fly a world in wind with all of it known, each step by a plan of the next ones, and return the actions."""
-    from shared.planning.greedy import look_ahead
     from simulator.bound.solver import Budget, plan
 
     actions = []
     while world.agents:
         problem = true_problem(world, steps)
-        chosen = plan(problem, Budget(work=work), "cautious", look_ahead(problem)).actions[0].copy()
+        chosen = plan(problem, Budget(work=work), "cautious").actions[0].copy()
         chosen[:, 1] = velocities_towards(world, targets(world, chosen[:, 1]))
         actions.append(chosen)
         world.step({agent: chosen[uav] for agent, uav in world.live.items()})

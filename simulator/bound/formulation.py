@@ -8,8 +8,9 @@ sensor j, ``q_jt`` is the queue before step t and ``l_jt`` its lost packets in t
     q_j(t+1) + l_jt >= q_jt + a_jt - sum_ik p_k x_ijtk,   q_j(t+1) + l_jt >= a_jt,   q_jt <= W
 
 with at most one x for each UAV and step, and at most one for each sensor and step. Smaller queues are never worse, so
-that minimising the sum of ``l`` makes these inequalities the world's recursion. Redundant constraints make the search
-quick, one for every sensor and every run of steps s..e in which more than W packets come together:
+that minimising the sum of ``l`` makes these inequalities the rule of :mod:`shared.world.step_rule`, with which a
+property test compares them. Redundant constraints make the search quick, one for every sensor and every run of steps
+s..e in which more than W packets come together:
 
     sum_t l_jt + excess x sum_t x_jt >= excess,   excess = the queue at its start and the arrivals since, less W
 
@@ -32,6 +33,7 @@ from ortools.sat.python import cp_model
 
 from shared.planning.fleet_problem import Course, FleetProblem, fly
 from shared.world.channel import IntArray, rate_bps
+from shared.world.step_rule import joules_a_packet
 
 # The Booleans that serve a sensor in a step, and the packets that each moves.
 Visits = list[tuple[Any, int]]
@@ -102,41 +104,30 @@ class Formulation:
         return np.concatenate((most, np.zeros_like(most[:1])))
 
     def _fly(self, uav: int) -> None:
-        """Add one UAV's variables: velocities within 0..max, the fixed ones, and the sensors that it can serve."""
+        """Add one UAV's variables: velocities within 0..max, and the sensors that it can serve."""
         problem, model = self.problem, self.model
         fastest = problem.scenario.max_velocity
-        fixed = problem.fixed.get(uav, np.empty((0, 2), dtype=np.int64))
-        row: list[Any] = np.cumsum(fixed[:, 1]).tolist()
-        start = row[-1] if row else 0
-        farthest = start + (problem.horizon - len(row)) * fastest
-        summed = np.arange(farthest + 1)
+        row: list[Any] = []
+        summed = np.arange(problem.horizon * fastest + 1)
         same = problem.links is None or len(problem.links[uav]) == 1
         first = problem.packets(uav, summed, 0)
         links = [first if same else problem.packets(uav, summed, step) for step in range(problem.horizon)]
-        for step, (sensor, _) in enumerate(fixed.tolist()):
-            packets = min(int(links[step][row[step], sensor]), int(self._most[step, sensor]))
-            if packets and not any((s.sensor, s.step) == (sensor, step) for s in self.serves):
-                self.serves[Serve(uav, sensor, step, packets, packets)] = model.new_constant(1)
-        for step in range(len(row), problem.horizon):
-            reached = links[step][start : start + (step + 1 - len(fixed)) * fastest + 1]
-            now = model.new_int_var(start, start + len(reached) - 1, f"c_{uav}_{step}")
+        for step in range(problem.horizon):
+            reached = links[step][: (step + 1) * fastest + 1]
+            now = model.new_int_var(0, len(reached) - 1, f"c_{uav}_{step}")
             velocity = now - (row[-1] if row else 0)
             model.add_linear_constraint(velocity, 0, fastest)
             row.append(now)
-            self._serve_within(uav, step, now, np.minimum(reached, self._most[step]), start)
+            self._serve_within(uav, step, now, np.minimum(reached, self._most[step]))
         self.flown.append(row)
 
-    def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray, start: int) -> None:
+    def _serve_within(self, uav: int, step: int, now: Any, packets: IntArray) -> None:
         """Add a Boolean for every sensor that the UAV can serve in this step and for every level of its links."""
-        servable = packets.any(axis=0)
-        if self.problem.usable is not None:
-            servable &= self.problem.usable[step]
-        summed = start + np.arange(len(packets))
-        for sensor in np.flatnonzero(servable).tolist():
+        for sensor in np.flatnonzero(packets.any(axis=0)).tolist():
             for level in _levels(packets[:, sensor], self._links):
                 serve = Serve(uav, sensor, step, level.packets, level.needed)
                 literal = self.model.new_bool_var(f"x_{uav}_{sensor}_{step}_{level.needed}")
-                within = cp_model.Domain.from_values(summed[level.within].tolist())
+                within = cp_model.Domain.from_values(np.flatnonzero(level.within).tolist())
                 self.model.add_linear_expression_in_domain(now, within).only_enforce_if(literal)
                 self.serves[serve] = literal
 
@@ -197,17 +188,15 @@ class Formulation:
                     self.model.add(_total(costs[max(start - 1, 0) : end]) + excess * within >= excess)
 
     def hint(self, actions: IntArray) -> None:
-        """Let the search start from these actions ``(H, I, 2)``, which begin with the fixed ones."""
+        """Let the search start from these actions ``(H, I, 2)``."""
         course = fly(self.problem, actions)
         flown = np.cumsum(actions[:, :, 1], axis=0)
         for uav, row in enumerate(self.flown):
             for step, variable in enumerate(row):
-                if not isinstance(variable, int):
-                    self.model.add_hint(variable, int(flown[step, uav]))
+                self.model.add_hint(variable, int(flown[step, uav]))
         served = self._served(actions, course)
         for serve, literal in self.serves.items():
-            if not isinstance(self.flown[serve.uav][serve.step], int):
-                self.model.add_hint(literal, int(serve in served))
+            self.model.add_hint(literal, int(serve in served))
         for sensor, row in enumerate(self._queue):
             for step, variable in enumerate(row):
                 self.model.add_hint(variable, int(course.queue[step + 1, sensor]))
@@ -225,14 +214,12 @@ class Formulation:
     def actions(self, value: Any) -> IntArray:
         """The actions ``(H, I, 2)`` of a solution, ``value`` giving the value of a variable."""
         problem = self.problem
-        flown = np.array([[c if isinstance(c, int) else value(c) for c in row] for row in self.flown], dtype=np.int64)
+        flown = np.array([[value(c) for c in row] for row in self.flown], dtype=np.int64)
         velocity = np.diff(flown, axis=1, prepend=0)
         sensor = np.full((problem.horizon, problem.uavs), -1)
         for serve, literal in self.serves.items():
             if value(literal):
                 sensor[serve.step, serve.uav] = serve.sensor
-        for uav, fixed in problem.fixed.items():
-            sensor[: len(fixed), uav] = fixed[:, 0]
         for step, row in enumerate(sensor):
             for uav in np.flatnonzero(row < 0).tolist():
                 row[uav] = self._spare(row, uav, int(flown[uav, step]), problem.queue)
@@ -265,8 +252,7 @@ def _levels(packets: IntArray, links: Links) -> list[Level]:
 def _affordable(problem: FleetProblem) -> IntArray:
     """Packets that each battery pays for over the best link, the one from right above, shape ``(J,)``."""
     world = problem.scenario
-    # The lower limit is that of the flown world, for a world so noisy that no packet arrives.
-    joules = world.transmit_power_w * world.packet_bits / max(float(rate_bps(0.0, world)), 1e-12)
+    joules = joules_a_packet(rate_bps(0.0, world), world)
     return np.asarray(np.floor(np.minimum(problem.battery / joules, 1e9) + 1e-6), dtype=np.int64)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from shared.planning.fleet_problem import FleetProblem, fly, with_fixed
+from shared.planning.fleet_problem import FleetProblem, fly
 from shared.planning.greedy import look_ahead
 from shared.world.channel import IntArray
 
@@ -30,7 +30,6 @@ _NEAR = 8
 _CORES: _Strategies = (({"optimize_with_core": True}, 1 / 3), ({}, 2 / 3))
 # With less work the first search proves nothing.
 _WORK_FOR_CORES = 0.05
-_INTERRUPTED = "INTERRUPTED"
 _USUAL: _Strategies = (({}, 1.0),)
 
 
@@ -43,13 +42,11 @@ class Budget:
             that with one worker the same problem gives the same plan on a busy machine too.
         seconds: limit of the wall clock; the plan then depends on the machine.
         workers: threads.
-        seed: of the solver's random choices.
     """
 
     work: float = math.inf
     seconds: float = math.inf
     workers: int = 1
-    seed: int = 0
 
 
 class News(NamedTuple):
@@ -66,25 +63,27 @@ class Plan:
     Attributes:
         actions: shape ``(H, I, 2)``: sensor, velocity. A UAV with nothing to collect names a sensor that no other
             UAV's transfer needs.
-        lost_packets: the packets that the actions lose over the horizon, with the real batteries and links.
+        lost_packets: the packets that the actions lose over the horizon, with the real batteries and links; of a flight
+            in the world those lost there.
         lower_bound: proven: no actions lose fewer, with any batteries. With ``cautious`` links it holds only if every
             link were as weak as those.
-        status: the solver's, such as OPTIMAL, FEASIBLE or UNKNOWN.
         seconds: wall clock, building included.
-        work: deterministic time used.
     """
 
     actions: IntArray
     lost_packets: int
-    lower_bound: float
-    status: str
-    seconds: float
-    work: float
+    lower_bound: int = 0
+    seconds: float = 0.0
 
     @property
     def optimal(self) -> bool:
         """Whether the plan is proven to be the best (with ``cautious`` links: if every link were so weak)."""
-        return self.lost_packets <= self.lower_bound + 1e-9
+        return self.gap <= 0
+
+    @property
+    def gap(self) -> int:
+        """Packets that the actions lose above the bound."""
+        return self.lost_packets - self.lower_bound
 
 
 class Interrupted(KeyboardInterrupt):
@@ -108,44 +107,40 @@ def plan(
         problem: to solve.
         budget: the limits; without limits the search ends when the optimum is proven.
         links: how exactly to take the capacity of links; see :class:`~simulator.bound.formulation.Formulation`.
-        hint: actions ``(H, I, 2)`` to start from, such as an earlier plan's, shifted by a step. They become the plan
-            unless the search finds better ones.
+        hint: actions ``(H, I, 2)`` to start from, by default the greedy plan's. They become the plan unless the search
+            finds better ones.
         on_news: called with each better plan or bound, from a thread of the solver.
 
     Returns:
-        The best plan found; otherwise the hint; without one, all UAVs at full speed.
+        The best plan found; otherwise the hint.
 
     Raises:
-        ValueError: the problem has uncertain links or queues, or guidance; only
+        ValueError: the problem has uncertain links or queues, guidance, or sensors or actions that are given; only
             :class:`shared.planning.annealing.Annealing` plans with these.
         ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
         Interrupted: Ctrl-C came, and the budget limits seconds.
     """
     from simulator.bound.formulation import Formulation
 
-    for name in ("chances", "chains", "allowed", "weights", "late"):
-        if getattr(problem, name) is not None:
-            raise ValueError(f"{name}: CP-SAT plans over certain links and arrivals, without guidance")
+    for name in ("chances", "chains", "allowed", "weights", "late", "usable", "fixed"):
+        if (value := getattr(problem, name)) is not None and not (name == "fixed" and not value):
+            raise ValueError(f"{name}: CP-SAT plans over certain links and arrivals, without orders")
     begun = time.perf_counter()
-    best = _flown(problem, with_fixed(problem, hint))
-    found = _Search(None, 0.0, "UNKNOWN", 0.0)
+    best = _flown(problem, look_ahead(problem) if hint is None else hint)
     for strategy, share in _CORES if budget.workers == 1 and budget.work >= _WORK_FOR_CORES else _USUAL:
         formulation = Formulation(problem, links)
-        if hint is not None or best.found:
-            formulation.hint(best.actions)
+        formulation.hint(best.actions)
         left = budget.seconds - (time.perf_counter() - begun)
         now = replace(budget, work=budget.work * share, seconds=max(left, 0.0))
         search = _search(formulation, now, strategy, on_news)
-        found = search._replace(lower_bound=max(search.lower_bound, found.lower_bound), work=found.work + search.work)
-        if search.actions is not None:
-            best = min(best, _flown(problem, search.actions)._replace(found=True), key=lambda p: p.lost_packets)
-        if search.status in ("OPTIMAL", _INTERRUPTED):
+        better = best if search.actions is None else min(best, _flown(problem, search.actions), key=_lost)
+        best = replace(better, lower_bound=max(best.lower_bound, search.lower_bound))
+        if search.proven or search.interrupted:
             break
-    seconds = time.perf_counter() - begun
-    whole = Plan(best.actions, best.lost_packets, found.lower_bound, found.status, seconds, found.work)
-    if found.status == _INTERRUPTED:
-        raise Interrupted(whole)
-    return whole
+    best = replace(best, seconds=time.perf_counter() - begun)
+    if search.interrupted:
+        raise Interrupted(best)
+    return best
 
 
 def least_loss(
@@ -160,15 +155,14 @@ def least_loss(
         Interrupted: Ctrl-C came.
     """
     begun = time.perf_counter()
-    start = best = _unproven(_flown(problem, with_fixed(problem, look_ahead(problem))))
+    start = best = _flown(problem, look_ahead(problem))
     try:
         for best in _improved(problem, start, seconds, workers, on_news):
             if best.optimal:
                 break
     except KeyboardInterrupt:
         raise Interrupted(replace(best, seconds=time.perf_counter() - begun)) from None
-    status = "OPTIMAL" if best.optimal else "FEASIBLE"
-    return replace(best, seconds=time.perf_counter() - begun, status=status)
+    return replace(best, seconds=time.perf_counter() - begun)
 
 
 def _improved(
@@ -186,8 +180,7 @@ def _improved(
     for links, budget, share in searches:
         if links == "cautious":
             left = seconds - (time.perf_counter() - begun)
-            near = _unproven(_flown(problem, _receding(problem, left * share)))
-            best = _better(best, near, links)
+            best = _better(best, _flown(problem, _receding(problem, left * share)), links)
             yield best
         left = seconds - (time.perf_counter() - begun)
         if left <= 0:
@@ -202,22 +195,12 @@ def _improved(
         yield best
 
 
-def _unproven(flown: _Flown) -> Plan:
-    return Plan(flown.actions, flown.lost_packets, 0.0, "FEASIBLE", 0.0, 0.0)
-
-
 def _receding(problem: FleetProblem, seconds: float) -> IntArray:
     """Actions from plans of a few steps each, one after another: a start for a problem too large as a whole."""
     begun, flown = time.perf_counter(), []
     now = problem
     while True:
-        near = replace(
-            now,
-            arrivals=now.arrivals[:_NEAR],
-            fixed={},
-            usable=None,
-            links=now.links_until(_NEAR),
-        )
+        near = replace(now, arrivals=now.arrivals[:_NEAR], links=now.links_until(_NEAR))
         left = seconds - (time.perf_counter() - begun)
         actions = look_ahead(near)
         if left > 0:
@@ -237,9 +220,8 @@ def _receding(problem: FleetProblem, seconds: float) -> IntArray:
 
 def _better(best: Plan, found: Plan, links: Links) -> Plan:
     """The better plan, with the higher of the bounds that hold in the world."""
-    proven = 0.0 if links == "cautious" else found.lower_bound
-    better = min(best, found, key=lambda p: p.lost_packets)
-    return replace(better, lower_bound=max(best.lower_bound, proven), work=best.work + found.work)
+    proven = 0 if links == "cautious" else found.lower_bound
+    return replace(min(best, found, key=_lost), lower_bound=max(best.lower_bound, proven))
 
 
 def _of_all(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
@@ -259,21 +241,18 @@ class _Search(NamedTuple):
     """The result of one run of the solver; ``actions`` is ``None`` if it found no plan."""
 
     actions: IntArray | None
-    lower_bound: float
-    status: str
-    work: float
+    lower_bound: int
+    proven: bool
+    interrupted: bool
 
 
-class _Flown(NamedTuple):
-    """Actions and what they lose; ``found`` is true for the solver's own."""
-
-    actions: IntArray
-    lost_packets: int
-    found: bool = False
+def _flown(problem: FleetProblem, actions: IntArray) -> Plan:
+    """Actions as a plan without a bound."""
+    return Plan(actions, int(fly(problem, actions).lost.sum()))
 
 
-def _flown(problem: FleetProblem, actions: IntArray) -> _Flown:
-    return _Flown(actions, int(fly(problem, actions).lost.sum()))
+def _lost(plan: Plan) -> int:
+    return plan.lost_packets
 
 
 def _search(
@@ -283,7 +262,7 @@ def _search(
 
     solver = cp_model.CpSolver()
     solver.parameters.num_workers = budget.workers
-    solver.parameters.random_seed = budget.seed
+    solver.parameters.random_seed = 0
     # Probing takes longer than the search itself.
     solver.parameters.cp_model_probing_level = 0
     for name, value in strategy.items():
@@ -305,9 +284,8 @@ def _search(
     found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
     actions = formulation.actions(solver.value) if found else None
     # Lost packets are whole numbers; any fraction is the solver's rounding.
-    bound = float(max(0, math.ceil(solver.best_objective_bound - 1e-6)))
-    name = _INTERRUPTED if stopped else solver.status_name(status)
-    return _Search(actions, bound, name, solver.deterministic_time)
+    bound = max(0, math.ceil(solver.best_objective_bound - 1e-6))
+    return _Search(actions, bound, status == cp_model.OPTIMAL, stopped)
 
 
 def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any, bool]:

@@ -58,7 +58,7 @@ class BoundOptions:
 
 
 class BoundRecord(Record):
-    """The JSON file: a :class:`Bound`, its world, and EOF's losses there."""
+    """The JSON file: the bound and the best flight, the world, and EOF's losses there."""
 
     scenario: str
     seed: int

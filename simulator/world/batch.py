@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,27 +14,11 @@ from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.step_rule import joules_a_packet, transfer
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
-from simulator.world.observation import Cost, StepTally
+from simulator.world.observation import Cost, Observation, StepTally
 from simulator.world.sensors import Sensors, Streams
 from simulator.world.truth import Truth
 
 _T = TypeVar("_T")
-
-
-class BatchObservation(TypedDict):
-    """The observations of all UAVs of all worlds: the entries of ``Observation`` with leading dimensions ``(B, I)``.
-
-    Those of a UAV that left mean nothing.
-    """
-
-    step: IntArray
-    position: FloatArray
-    progress: FloatArray
-    sensor_position: FloatArray
-    queue: FloatArray
-    battery: FloatArray
-    channel_gain: FloatArray
-    last_heard: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +45,6 @@ class BatchStep:
     lost_packets: IntArray
     collected: IntArray
 
-    @property
-    def failures(self) -> IntArray:
-        """Failed transmissions of each world, ``(B,)``."""
-        return np.asarray(self.failed.sum(axis=1))
-
-    @property
-    def events(self) -> IntArray:
-        """Eq. 5's loss of each world, ``(B,)``."""
-        return self.failures + self.overflows
-
     def tally(self, world: int, step: int) -> StepTally:
         """The step of one of the worlds."""
         failures, overflows = int(self.failed[world].sum()), int(self.overflows[world])
@@ -90,26 +64,19 @@ class Draw:
     truth: Truth
 
     @classmethod
-    def of(
-        cls,
-        scenario: Scenario,
-        seeds: Sequence[int | np.random.SeedSequence],
-        trace: IntArray | None = None,
-        gains: GainTrace | None = None,
-    ) -> Draw:
-        """The worlds of these seeds; the traces of arrivals and gains act as they do in ``PipelineWorld``."""
-        return stacked([cls.one(scenario, seed, trace, gains) for seed in seeds])
+    def of(cls, scenario: Scenario, seeds: Sequence[int]) -> Draw:
+        """The worlds of these seeds."""
+        return stacked([cls.one(scenario, np.random.SeedSequence(int(seed))) for seed in seeds])
 
     @classmethod
     def one(
         cls,
         scenario: Scenario,
-        seed: int | np.random.SeedSequence,
+        root: np.random.SeedSequence,
         trace: IntArray | None = None,
         gains: GainTrace | None = None,
     ) -> Draw:
-        """The world of a seed."""
-        root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(int(seed))
+        """The world of a seed; the traces of arrivals and gains act as they do in ``PipelineWorld``."""
         streams = Streams.of(root)
         return cls(
             Sensors.draw(scenario, streams, trace),
@@ -127,19 +94,18 @@ def stacked(worlds: Sequence[_T]) -> _T:
     if not is_dataclass(first):
         return worlds[0]
     parts = {field.name: stacked([getattr(world, field.name) for world in worlds]) for field in fields(first)}
-    return replace(first, **parts)  # type: ignore[type-var]
+    return cast(_T, replace(cast(Any, first), **parts))
 
 
 class VectorWorld:
     """B worlds that step together, by the rules in :class:`PipelineWorld`.
 
-    All worlds have the scenario's T steps and end together. Observations are the world's own arrays, not copies, and
-    are valid until the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B
+    All worlds have the scenario's T steps and end together. The entries of an observation have leading dimensions
+    ``(B, I)``; those of a UAV that left mean nothing. They are the world's own arrays, not copies, and are valid until
+    the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B
     worlds the true ``sensors`` and the ``fleet``.
 
     Args:
-        arrivals: a trace, shape ``(at least T, J)``, instead of drawn arrivals.
-        gains: recorded excess losses, beside the drawn ones.
         cost: the negative of the reward; see :class:`PipelineWorld`.
 
     Raises:
@@ -147,14 +113,7 @@ class VectorWorld:
             cost.
     """
 
-    def __init__(
-        self,
-        scenario: Scenario = SCENARIOS["paper"],
-        *,
-        arrivals: IntArray | None = None,
-        gains: GainTrace | None = None,
-        cost: Cost = "default",
-    ) -> None:
+    def __init__(self, scenario: Scenario = SCENARIOS["paper"], *, cost: Cost = "default") -> None:
         if cost not in ("default", "paper"):
             raise ValueError(f"unknown cost {cost!r}: choose one of default, paper")
         self.scenario = scenario
@@ -162,15 +121,13 @@ class VectorWorld:
         self.steps_flown = 0
         self.sensors: Sensors
         self.fleet: Fleet
-        self._trace = arrivals
-        self._gains = gains
         self._truth: Truth | None = None
 
-    def reset(self, seeds: Sequence[int]) -> BatchObservation:
+    def reset(self, seeds: Sequence[int]) -> Observation:
         """Draw one world a seed, and return the first observations."""
-        return self.start(Draw.of(self.scenario, seeds, self._trace, self._gains))
+        return self.start(Draw.of(self.scenario, seeds))
 
-    def start(self, draw: Draw) -> BatchObservation:
+    def start(self, draw: Draw) -> Observation:
         """Begin B worlds that are drawn already, and return the first observations."""
         self._truth = draw.truth
         self.steps_flown = 0
@@ -185,7 +142,7 @@ class VectorWorld:
         self._surveyed = np.broadcast_to(draw.sensors.positions[:, None], (*shape, 2))
         return self._observe(*self._links(draw.truth))
 
-    def step(self, sensors: ArrayLike, velocities: ArrayLike) -> tuple[BatchObservation, BatchStep]:
+    def step(self, sensors: ArrayLike, velocities: ArrayLike) -> tuple[Observation, BatchStep]:
         """Fly one step of every world.
 
         Args:
@@ -200,7 +157,7 @@ class VectorWorld:
         chosen = self._checked("sensors", np.asarray(sensors), last_sensor)
         return self.fly(chosen, self._checked("velocities", np.asarray(velocities), fastest))
 
-    def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[BatchObservation, BatchStep]:
+    def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[Observation, BatchStep]:
         """As :meth:`step`, of actions known to be right."""
         assert self._truth is not None
         truth, fleet, ground, scenario, step = (
@@ -262,7 +219,7 @@ class VectorWorld:
         distance = np.hypot(position[..., 0, None] - sensors[..., 0], position[..., 1, None] - sensors[..., 1])
         return position, truth.channel.links(distance, position, self.fleet.progress_m, self.steps_flown)
 
-    def _observe(self, position: FloatArray, links: Links) -> BatchObservation:
+    def _observe(self, position: FloatArray, links: Links) -> Observation:
         """Record the beacons in range, and return all observations."""
         assert self._truth is not None
         heard = np.flatnonzero(links.distance_m <= self.scenario.radio_radius_m)
@@ -271,7 +228,7 @@ class VectorWorld:
         self._heard_battery.put(heard, self.sensors.battery.take(sensor))
         self._heard_gain.put(heard, links.gain_db.take(heard))
         self._last_heard.put(heard, self.steps_flown)
-        return BatchObservation(
+        return Observation(
             step=np.full((*position.shape[:2], 1), self.steps_flown),
             position=self._truth.reported(position, self.steps_flown),
             progress=self.fleet.progress_m[..., None],

@@ -14,7 +14,7 @@ from shared.world.channel import IntArray
 from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.trajectory import trajectories
 from simulator.world.actions import checked_actions
-from simulator.world.batch import BatchObservation, BatchStep, Draw, VectorWorld, stacked
+from simulator.world.batch import BatchStep, Draw, VectorWorld, stacked
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Cost, Info, Observation, StepTally
@@ -224,7 +224,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
 
         return render_map(self.scenario, len(self.tally), self.sensors, self.fleet)
 
-    def _own(self, observed: BatchObservation) -> dict[str, Observation]:
+    def _own(self, observed: Observation) -> dict[str, Observation]:
         """A copy of every live UAV's observation."""
         columns: Any = {key: values[0] for key, values in cast(dict[str, NDArray[Any]], observed).items()}
         return {
@@ -232,7 +232,7 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             for agent, uav in self.live.items()
         }
 
-    def _infos(self, observed: BatchObservation, outcome: BatchStep | None) -> dict[str, Info]:
+    def _infos(self, observed: Observation, outcome: BatchStep | None) -> dict[str, Info]:
         """The info of every live agent; without an outcome that of a reset."""
         selectable = observed["last_heard"][0] >= 0
         selectable |= ~selectable.any(axis=1, keepdims=True)

@@ -79,18 +79,15 @@ class TrueChannel:
         return cls(scenario, own, pairs / scale, mixture, fading, faults, trajectories(scenario), trace)
 
     @property
-    def mean_only(self) -> bool:
-        """Whether every link has the mean path loss."""
-        return mean_only(self.scenario, self.trace)
-
-    @property
     def changes(self) -> bool:
         """Whether the links of one place differ between instants."""
         world = self.scenario
         return world.rician_k_db is not None or bool(world.dead_radios or world.link_share_drop)
 
     def links(self, distance_m: FloatArray, position: FloatArray, progress_m: FloatArray, instant: int) -> Links:
-        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``; out of range the loss is infinite.
+        """The links of all UAVs to all sensors at an instant, ``(..., I, J)``.
+
+        Past the radio radius the loss counts as infinite.
 
         Args:
             distance_m: horizontal, ``(..., I, J)``.
@@ -100,7 +97,8 @@ class TrueChannel:
         """
         # The path loss is the costliest number of a step. Of many links, indices are several times as fast as a mask.
         near = np.flatnonzero(distance_m <= self.scenario.radio_radius_m)
-        excess = 0.0 if self.mean_only else self.excess_db(position, progress_m, instant).take(near)
+        modelled = mean_only(self.scenario, self.trace)
+        excess = 0.0 if modelled else self.excess_db(position, progress_m, instant).take(near)
         loss = np.full(distance_m.shape, np.inf)
         loss.put(near, self.at(distance_m.take(near), excess, 1.0).loss_db)
         return Links(distance_m, loss, self.scenario, self.share(distance_m, instant))
@@ -108,7 +106,7 @@ class TrueChannel:
     def at(self, distance_m: FloatArray, excess_db: FloatArray | float, share: FloatArray | float) -> Links:
         """The links at these distances, metres, with these excess losses, dB, and shares of the rate."""
         loss = path_loss_db(distance_m, self.scenario)
-        if not self.mean_only:
+        if not mean_only(self.scenario, self.trace):
             loss = np.clip(loss + excess_db, *LOSS_BOUNDS_DB)
         return Links(distance_m, loss, self.scenario, share)
 

@@ -13,7 +13,7 @@ from simulator.world.faults import Faults
 from simulator.world.gain_trace import GainTrace
 from simulator.world.sensors import Streams
 from simulator.world.step_noise import StepNoise
-from simulator.world.true_channel import TrueChannel
+from simulator.world.true_channel import TrueChannel, mean_only
 from simulator.world.wind import Wind
 
 # The largest error of a reported position on each axis, in standard deviations.
@@ -40,7 +40,7 @@ class Truth:
     def differs(self) -> bool:
         """Whether links, wind or the fleet differ from what an edge plans with."""
         channel = self.channel
-        modelled = channel.mean_only and not channel.changes
+        modelled = mean_only(channel.scenario, channel.trace) and not channel.changes
         return not modelled or self.wind.blows or channel.scenario.departures > 0
 
     def reported(self, position: FloatArray, instant: int) -> FloatArray:

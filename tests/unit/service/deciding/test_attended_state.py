@@ -1,9 +1,10 @@
 import numpy as np
 
-from shared.features.augmented_state import FEATURES, urgency
+from shared.features.augmented_state import FEATURES
 from shared.wire.schemas import MissionSpec
 from shared.world.actions import Action
 from shared.world.channel import channel_gain_db
+from shared.world.urgency import urgency
 from tests.unit.service.making import PAPER, attended, mission, uav
 
 

@@ -19,7 +19,6 @@ from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.projection import to_metres
 from simulator.sites.site import Site
-from simulator.world.batch import VectorWorld
 from tests.unit.simulator.sites.files.made_folder import (
     EXAMPLE,
     GOOD,
@@ -146,8 +145,6 @@ def test_a_gain_trace_is_interpolated_around_the_trajectory(tmp_path: Path) -> N
     more = unaided["channel_gain"] - observed["channel_gain"]
     np.testing.assert_allclose(more, [0.0, expected], atol=1e-5)
     assert set(unaided["last_heard"]) == {0}
-    batch = VectorWorld(site.scenario, gains=site.gains).reset([1])
-    np.testing.assert_array_equal(batch["channel_gain"][0, 0], observed["channel_gain"])
 
 
 def test_the_same_files_are_the_same_site(tmp_path: Path) -> None:

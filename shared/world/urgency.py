@@ -1,0 +1,54 @@
+"""The worth of a visit: how urgent a sensor's packets are, and what flying on is worth.
+
+Look-ahead chooses the sensor j and the velocity v of greatest ``U_j min(q_j, packets movable from the new position) +
+0.5 v``. It exists for the edge's decisions (``Reach`` and ``service.deciding.advisers``), for a fleet's first plan
+(:mod:`shared.planning.greedy`) and, compiled, for the flights of the rollout evaluator.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared.world.channel import FloatArray
+from shared.world.poisson_tail import above_poisson
+from shared.world.scenario import Scenario
+
+# The worth of a metre a second in urgent packets: while a UAV dwells at few packets, sensors further on overflow.
+# On 30 worlds of scenario `paper`, 0.5 to 4 lost 54 to 61 packets, differences within their noise.
+VELOCITY_BONUS = 0.5
+
+
+def with_bonus(worth: FloatArray, velocities: NDArray[np.int64]) -> FloatArray:
+    """Add to the worth ``(V, J)`` of urgent packets, in place, that of the velocities ``(V,)``."""
+    worth += VELOCITY_BONUS * velocities[:, None]
+    return worth
+
+
+def overflow_probability(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:
+    """``Pof_j = P(Poisson(rate_j x horizon) > W - q_j)``, in 0..1, shape ``(J,)``.
+
+    Args:
+        queue: packets waiting, shape ``(J,)``; clipped to 0..W.
+        rate: arrival rate in packets a step, shape ``(J,)``, at least 0.
+    """
+    capacity = scenario.queue_capacity
+    # For a few numbers np.clip takes several times as long.
+    room = np.floor(capacity - np.minimum(np.maximum(np.asarray(queue, dtype=np.float64), 0), capacity))
+    mean = np.asarray(rate, dtype=np.float64) * scenario.overflow_horizon_steps
+    # Copies, because numba would compile the function again for arrays that are read-only.
+    rooms, means = np.array(np.broadcast_arrays(room, mean))
+    above = np.empty(rooms.shape)
+    above_poisson(rooms.ravel(), means.ravel(), above.ravel())
+    return above
+
+
+def urgency(queue: ArrayLike, rate: ArrayLike, scenario: Scenario) -> FloatArray:
+    """``U_j = 0.5 q_j / W + 0.5 Pof_j``, in 0..1, shape ``(J,)``; arguments as :func:`overflow_probability`."""
+    return urgency_of(queue, overflow_probability(queue, rate, scenario), scenario)
+
+
+def urgency_of(queue: ArrayLike, overflow: FloatArray, scenario: Scenario) -> FloatArray:
+    """As :func:`urgency`, from known probabilities ``Pof_j``, shape ``(J,)``."""
+    fill = np.asarray(queue, dtype=np.float64) / scenario.queue_capacity
+    return np.asarray(0.5 * np.minimum(np.maximum(fill, 0.0), 1.0) + 0.5 * overflow)
