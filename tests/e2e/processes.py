@@ -9,35 +9,58 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
+from lab import __main__ as lab
 from shared.kit import command_line as cli
+from tests.support.places import ROOT
 from tests.support.waiting import PATIENCE_S
 
 AICVDS = Path(sys.executable).with_name("aicvds")
 
 
+LAB = (sys.executable, "-m", "lab")
+
+
 def run(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
-    """One command to its end."""
-    return subprocess.run(
-        [AICVDS, *args], capture_output=True, text=True, timeout=170, env={**os.environ, **env}, check=False
-    )
+    """One command of ``aicvds`` to its end."""
+    return _run([str(AICVDS), *args], env)
+
+
+def run_lab(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """One command of ``python -m lab`` to its end."""
+    return _run([*LAB, *args], env)
 
 
 def run_here(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     """As :func:`run`, in this process: for commands that end before they start anything."""
+    return _run_here(cli.main, args, env)
+
+
+def run_lab_here(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """As :func:`run_lab`, in this process."""
+    return _run_here(lab.main, args, env)
+
+
+def _run(command: Sequence[str], env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=170, env={**os.environ, **env}, check=False
+    )
+
+
+def _run_here(main: Callable[[], int], args: Sequence[str], env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
     out, err = io.StringIO(), io.StringIO()
     with (
         patch.dict(os.environ, env),
-        patch.object(sys, "argv", ["aicvds", *args]),
+        patch.object(sys, "argv", ["a command", *args]),
         redirect_stdout(out),
         redirect_stderr(err),
     ):
         try:
-            code = cli.main()
+            code = main()
         except SystemExit as ended:
             code = int(ended.code or 0)
     return subprocess.CompletedProcess(args, code, out.getvalue(), err.getvalue())

@@ -15,7 +15,8 @@ import pytest
 from lab.experiments.catalogue import EXPERIMENTS
 from lab.experiments.result import Result
 from lab.experiments.stand_ins import answering, drawn
-from tests.e2e.processes import AICVDS, run, run_here, serving_edge
+from tests.e2e.processes import LAB, run_lab, run_lab_here, serving_edge
+from tests.support.places import ROOT
 from tests.support.waiting import PATIENCE_S, until
 
 
@@ -29,7 +30,7 @@ def flights_in(out: Path) -> dict[str, int]:
 
 def started(out: Path, *args: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [AICVDS, "experiment", *args, "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        [*LAB, "experiment", *args, "--out", str(out)], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
 
 
@@ -47,7 +48,7 @@ def edge_of(process: subprocess.Popen[bytes]) -> int:
 
 
 def test_help_tells_what_every_experiment_is() -> None:
-    shown = run_here("experiment", "--help")
+    shown = run_lab_here("experiment", "--help")
     assert shown.returncode == 0
     for name, experiment in EXPERIMENTS.items():
         assert f"{name}: {experiment.summary}" in shown.stdout.replace("\n", " ")
@@ -68,7 +69,7 @@ def test_help_tells_what_every_experiment_is() -> None:
     ],
 )
 def test_bad_use_is_one_line_and_code_2(args: list[str], said: str, tmp_path: Path) -> None:
-    ended = run_here("experiment", *args, "--out", str(tmp_path / "out"))
+    ended = run_lab_here("experiment", *args, "--out", str(tmp_path / "out"))
     assert ended.returncode == 2
     assert said in ended.stderr and ended.stderr.count("\n") == 1
 
@@ -76,7 +77,7 @@ def test_bad_use_is_one_line_and_code_2(args: list[str], said: str, tmp_path: Pa
 def test_without_the_extra_ray_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     args = ["fairness", "--llm", "none", "--seeds", "1", "--steps", "1", "--ray", "local", "--out", str(tmp_path)]
-    ended = run_here("experiment", *args)
+    ended = run_lab_here("experiment", *args)
     assert ended.returncode == 2
     assert "pip install 'aic-vds[ray]'" in ended.stderr and ended.stderr.count("\n") == 1
 
@@ -91,7 +92,7 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
         process.kill()
         process.communicate(timeout=PATIENCE_S)
     assert not (tmp_path / "fairness").exists()
-    ended = run("experiment", *args, "--out", str(tmp_path))
+    ended = run_lab("experiment", *args, "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
     after = flights_in(tmp_path)
     assert before.items() <= after.items(), "a flight was flown twice"
@@ -132,7 +133,7 @@ def test_an_edge_that_dies_is_told_with_its_log(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_an_edge_without_a_usable_llm_is_refused(tmp_path: Path) -> None:
     args = ["top-k", "--llm", "http://127.0.0.1:1/v1", "--steps", "2", "--seeds", "1"]
-    ended = run("experiment", *args, "--out", str(tmp_path))
+    ended = run_lab("experiment", *args, "--out", str(tmp_path))
     assert ended.returncode == 1
     assert "no LLM is ready (it is unavailable)" in ended.stderr
     assert "Traceback" not in ended.stderr
@@ -142,7 +143,7 @@ def test_an_edge_without_a_usable_llm_is_refused(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:
     with answering(drawn) as llm, serving_edge(AICVDS_LLM_URL=llm) as (url, _):
-        ended = run("experiment", "top-k", "--edge", url, "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
+        ended = run_lab("experiment", "top-k", "--edge", url, "--steps", "2", "--seeds", "1", "--out", str(tmp_path))
         assert "aicvds_decisions_total" in httpx.get(f"{url}/metrics").text
     assert ended.returncode == 0, ended.stderr
     result = result_in(tmp_path, "top-k")
@@ -152,7 +153,7 @@ def test_a_running_edge_can_be_asked_instead(tmp_path: Path) -> None:
 
 
 def test_the_page_is_a_command_of_its_own() -> None:
-    shown = run_here("experiment", "page", "--help")
+    shown = run_lab_here("experiment", "page", "--help")
     assert shown.returncode == 0 and "python -m lab experiment page" in shown.stdout
 
 
@@ -161,13 +162,13 @@ def test_help_comes_without_the_heavy_imports() -> None:
         "import sys; from simulator.commands import experiment; experiment.main(['--help']);"
         "print([m for m in ('matplotlib', 'pettingzoo', 'ray', 'scipy', 'torch') if m in sys.modules], file=sys.stderr)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run_lab([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
 
 
 @pytest.mark.long
 def test_the_embedded_llm_decides_and_draws_at_random_stand_beside_it(tmp_path: Path) -> None:
-    ended = run("experiment", "llm-models", "--steps", "1", "--seeds", "1", "--out", str(tmp_path))
+    ended = run_lab("experiment", "llm-models", "--steps", "1", "--seeds", "1", "--out", str(tmp_path))
     assert ended.returncode == 0, ended.stderr
     result = result_in(tmp_path, "llm-models")
     assert list(result.schemes) == [

@@ -16,7 +16,7 @@ from service.learning.initial_weights import initial_modules, initial_weights, s
 from service.learning.modules import Modules
 from shared.wire.schemas import Features
 from shared.world.scenario import SCENARIOS, Scenario
-from tests.e2e.processes import run, run_here
+from tests.e2e.processes import run_lab, run_lab_here
 
 PAPER = SCENARIOS["paper"]
 # Far past the training worlds that `python -m lab explore` records by default.
@@ -92,7 +92,7 @@ def test_a_checkpoint_of_another_preset_is_not_loaded(tmp_path: Path, monkeypatc
 @pytest.mark.long
 def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
     recorded, checkpoint = tmp_path / "r.jsonl.gz", tmp_path / "c" / "own.pt"
-    assert run("explore", "--out", str(recorded), "--missions", "2", "--untaught", "2").returncode == 0
+    assert run_lab("explore", "--out", str(recorded), "--missions", "2", "--untaught", "2").returncode == 0
     header, steps = read_rollouts(recorded)
     assert header.missions == 4
     assert [step.reference is not None for step in steps].count(True) > 100
@@ -100,7 +100,7 @@ def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
         weights = []
         for _ in range(2):
             options = ("--out", str(checkpoint), "--epochs", "1", "--features", features)
-            trained = run("pretrain", str(recorded), *options)
+            trained = run_lab("pretrain", str(recorded), *options)
             assert trained.returncode == 0, trained.stderr
             assert "held-out loss" in trained.stdout
             assert "look_ahead's sensor in the top 5" in trained.stdout
@@ -112,10 +112,10 @@ def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_papers_target_learns_something_else(tmp_path: Path) -> None:
     recorded, weights = tmp_path / "r.jsonl.gz", []
-    assert run("explore", "--out", str(recorded), "--missions", "0", "--untaught", "2").returncode == 0
+    assert run_lab("explore", "--out", str(recorded), "--missions", "0", "--untaught", "2").returncode == 0
     for target in ("return", "immediate"):
         out = tmp_path / f"{target}.pt"
-        trained = run("pretrain", str(recorded), "--out", str(out), "--epochs", "1", "--target", target)
+        trained = run_lab("pretrain", str(recorded), "--out", str(out), "--epochs", "1", "--target", target)
         assert trained.returncode == 0, trained.stderr
         weights.append(torch.load(out, weights_only=True)["weights"]["attention.score.weight"])
     assert not torch.equal(*weights)
@@ -126,14 +126,14 @@ def test_the_papers_target_learns_something_else(tmp_path: Path) -> None:
     [("--epochs", "not at least 1"), ("--temperature", "not above 0"), ("--batch", "not at least 1")],
 )
 def test_bad_use_is_one_clear_line(tmp_path: Path, option: str, said: str) -> None:
-    ended = run_here("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"), option, "0")
+    ended = run_lab_here("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"), option, "0")
     assert ended.returncode == 2
     assert f"{option} 0 is {said}" in ended.stderr
     assert ended.stderr.count("\n") == 1
 
 
 def test_a_run_without_a_file_is_one_clear_line(tmp_path: Path) -> None:
-    ended = run_here("pretrain", "--out", str(tmp_path / "c.pt"))
+    ended = run_lab_here("pretrain", "--out", str(tmp_path / "c.pt"))
     assert ended.returncode == 2
     assert "name a file" in ended.stderr
 
@@ -150,7 +150,7 @@ def test_several_files_train_one_checkpoint_and_each_is_reported(tmp_path: Path)
     printed, weights = [], []
     for chosen in (files, files[:1]):
         out = tmp_path / f"{len(chosen)}.pt"
-        ended = run_here("pretrain", *map(str, chosen), "--out", str(out), "--epochs", "1", "--features", "reach")
+        ended = run_lab_here("pretrain", *map(str, chosen), "--out", str(out), "--epochs", "1", "--features", "reach")
         assert ended.returncode == 0, ended.stderr
         printed.append(ended.stdout)
         weights.append(torch.load(out, weights_only=True)["weights"]["attention.score.weight"])
@@ -164,7 +164,7 @@ def test_files_whose_uavs_have_other_velocities_are_refused(tmp_path: Path) -> N
     fast = PAPER.model_copy(update={"steps": 12})
     slow = fast.model_copy(update={"max_velocity": 8})
     files = [recorded(tmp_path / "fast.gz", fast), recorded(tmp_path / "slow.gz", slow)]
-    ended = run_here("pretrain", *map(str, files), "--out", str(tmp_path / "c.pt"))
+    ended = run_lab_here("pretrain", *map(str, files), "--out", str(tmp_path / "c.pt"))
     assert ended.returncode == 2
     assert "up to 14 m/s" in ended.stderr
     assert "up to 8 m/s" in ended.stderr
@@ -174,7 +174,7 @@ def test_a_file_whose_recording_was_stopped_is_one_clear_line(tmp_path: Path) ->
     whole = recorded(tmp_path / "whole.gz", PAPER.model_copy(update={"steps": 12}))
     cut = tmp_path / "cut.gz"
     cut.write_bytes(whole.read_bytes()[:-500])
-    ended = run_here("pretrain", str(cut), "--out", str(tmp_path / "c.pt"))
+    ended = run_lab_here("pretrain", str(cut), "--out", str(tmp_path / "c.pt"))
     assert ended.returncode == 2
     assert "its recording was stopped" in ended.stderr
     assert "Traceback" not in ended.stderr
@@ -183,7 +183,7 @@ def test_a_file_whose_recording_was_stopped_is_one_clear_line(tmp_path: Path) ->
 @pytest.mark.parametrize("content", [b"", b"not gzip"])
 def test_a_broken_file_is_one_clear_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "r.gz").write_bytes(content)
-    ended = run_here("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"))
+    ended = run_lab_here("pretrain", str(tmp_path / "r.gz"), "--out", str(tmp_path / "c.pt"))
     assert ended.returncode == 2
     assert "Traceback" not in ended.stderr
     assert "r.gz" in ended.stderr or "gzip" in ended.stderr

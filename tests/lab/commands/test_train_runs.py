@@ -10,7 +10,7 @@ import pytest
 
 from lab.marl.checkpoint import PolicyCheckpoint
 from lab.marl.curve import read_csv
-from tests.e2e.processes import run, run_here
+from tests.e2e.processes import run_lab, run_lab_here
 from tests.support.waiting import until
 
 EPISODES = ("--episodes", "120")
@@ -38,7 +38,7 @@ def weights_of(folder: Path) -> list[list[float]]:
 @pytest.mark.long
 def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    ended = run("train", "mappo", *EPISODES, "--out", str(whole))
+    ended = run_lab("train", "mappo", *EPISODES, "--out", str(whole))
     assert ended.returncode == 0, ended.stderr
     command = [sys.executable, "-c", STANDS_STILL, "mappo", *EPISODES, "--out", str(killed), "--save-s", "0"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -48,7 +48,7 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
         process.kill()
         process.wait()
     assert (killed / "state.pt").exists() and not (killed / "mappo.pt").exists()
-    resumed = run("train", "mappo", *EPISODES, "--out", str(killed), "--resume")
+    resumed = run_lab("train", "mappo", *EPISODES, "--out", str(killed), "--resume")
     assert resumed.returncode == 0, resumed.stderr
     assert weights_of(killed) == weights_of(whole)
     assert read_csv(killed / "mappo.csv") == read_csv(whole / "mappo.csv")
@@ -56,13 +56,13 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
         left = {path.suffix for path in folder.glob("mappo.*")}
         assert left == {".pt", ".csv", ".png", ".svg"}
         assert list((folder / "tensorboard").glob("events.*"))
-    again = run("train", "mappo", *EPISODES, "--out", str(whole))
+    again = run_lab("train", "mappo", *EPISODES, "--out", str(whole))
     assert again.returncode == 2
     assert "has a training: give --resume" in again.stderr
 
 
 def test_help_teaches() -> None:
-    told = run_here("train", "--help").stdout
+    told = run_lab_here("train", "--help").stdout
     for word in ("madqn", "mappo", "--resume", "--episodes", "tensorboard"):
         assert word in told
 
@@ -78,7 +78,7 @@ def test_help_teaches() -> None:
     ],
 )
 def test_bad_use_is_one_line_that_names_the_option(options: list[str], message: str) -> None:
-    ended = run_here("train", *options)
+    ended = run_lab_here("train", *options)
     assert ended.returncode == 2
     assert message in ended.stderr
     assert len(ended.stderr.strip().splitlines()) == 1
