@@ -35,7 +35,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from service.api.openapi_examples import STATE
+from service.api.openapi_examples import REQUESTS
 
 GOAL_RATIO, GOAL_HELP_S = 1.5, 0.3
 AICVDS = str(Path(sys.executable).with_name("aicvds"))
@@ -106,7 +106,7 @@ def _timed(env: dict[str, str]) -> dict[str, Callable[[], float]]:
 
 def _request() -> dict[str, object]:
     """The first request of a new mission, which is not in the store, with a deadline that a busy machine can meet."""
-    return {**STATE, "step": 0, "mission_id": uuid.uuid4().hex, "deadline_ms": 60_000}
+    return {**REQUESTS["post /decide"]["paper"]["value"], "mission_id": uuid.uuid4().hex, "deadline_ms": 60_000}
 
 
 def _ended(command: list[str], env: dict[str, str]) -> float:

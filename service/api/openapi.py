@@ -29,7 +29,7 @@ def schema_of(app: FastAPI) -> dict[str, Any]:
         for path, methods in schema["paths"].items():
             for method, operation in methods.items():
                 _add_security(operation, method.upper(), path)
-                _add_examples(operation, (method, path))
+                _add_examples(operation, f"{method} {path}")
         app.openapi_schema = schema
     return app.openapi_schema
 
@@ -44,7 +44,7 @@ def _add_security(operation: dict[str, Any], method: str, path: str) -> None:
     operation["responses"] = dict(sorted(responses.items()))
 
 
-def _add_examples(operation: dict[str, Any], route: tuple[str, str]) -> None:
+def _add_examples(operation: dict[str, Any], route: str) -> None:
     if route in REQUESTS:
         operation["requestBody"]["content"][JSON]["examples"] = REQUESTS[route]
     for status, response in operation["responses"].items():
