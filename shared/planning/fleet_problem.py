@@ -103,15 +103,12 @@ class FleetProblem:
             for uav, table in enumerate(tables):
                 right = table.ndim == dimensions and (dimensions == 2 or len(table) in steps)
                 if not right or table.shape[-2] < sums or table.shape[-1] != count:
-                    first = "" if dimensions == 2 else f"1 or {self.horizon}, "
-                    raise ValueError(f"{name}[{uav}] has shape {table.shape}, must be ({first}{sums}, {count})")
+                    raise ValueError(f"{name}[{uav}] has shape {table.shape}, must end with ({sums}, {count})")
         if self.chances is not None and [c.shape for c in self.chances] != [t.shape for t in self.links or ()]:
             raise ValueError("chances must have the shapes of links")
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
-                raise ValueError(
-                    f"fixed[{uav}] has shape {actions.shape}, must be (at most {self.horizon}, 2) of a UAV"
-                )
+                raise ValueError(f"fixed[{uav}] has shape {actions.shape}, must be (n, 2) of a UAV")
 
     @property
     def horizon(self) -> int:

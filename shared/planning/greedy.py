@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shared.planning.fleet_problem import FleetProblem
 from shared.world.channel import FloatArray, IntArray
@@ -48,7 +47,9 @@ def look_ahead(problem: FleetProblem) -> IntArray:
                 packets = _expected(problem, uav, flown[uav] + np.array([velocity]), step)[0]
             else:
                 links = _expected(problem, uav, flown[uav] + problem.levels, step)
-                sensor, level = _best(links, queue, urgent, free, problem.levels, late)
+                worth = urgent * np.minimum(queue, links) + (0.0 if late is None else late * (links > 0))
+                worth = with_bonus(np.where(free, worth, -1.0), problem.levels)
+                level, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
                 velocity, packets = int(problem.levels[level]), links[level]
                 free[sensor] = False
             actions[step, uav] = sensor, velocity
@@ -69,20 +70,3 @@ def _overflow(queue: FloatArray, rate: FloatArray, world: Scenario) -> FloatArra
 def _expected(problem: FleetProblem, uav: int, velocity: IntArray, step: int) -> FloatArray:
     """The packets that links are expected to move, ``(n, J)``."""
     return problem.packets(uav, velocity, step) * problem.chance(uav, velocity, step)
-
-
-def _best(
-    links: FloatArray,
-    queue: FloatArray,
-    urgent: FloatArray,
-    usable: NDArray[np.bool_],
-    levels: IntArray,
-    late: FloatArray | None,
-) -> tuple[int, int]:
-    """The best sensor and the index of its velocity level, from links ``(levels, J)``."""
-    worth = urgent * np.minimum(queue, links)
-    if late is not None:
-        worth = worth + late * (links > 0)
-    worth = with_bonus(np.where(usable, worth, -1.0), levels)
-    level, sensor = np.unravel_index(int(worth.argmax()), worth.shape)
-    return int(sensor), int(level)
