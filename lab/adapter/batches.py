@@ -25,7 +25,7 @@ _NINE_OF_FASTEST = 9 / 14
 
 
 @dataclass(frozen=True)
-class Batch:
+class PromptBatch:
     """B prompts of r rows with V options: tokens ``(B, T)``, targets ``(B, r, V)``, the places of the rows' letters.
 
     ``regret`` ``(B, r, V)`` is what each answer is expected to lose above the best of all sensors and options;
@@ -39,7 +39,7 @@ class Batch:
     planned: Tensor
 
 
-class Tokens:
+class PromptTokens:
     """The tokens of prompts, as numbers in the model's cut vocabulary; ``tokens.json`` of :mod:`lab.adapter.base`."""
 
     def __init__(self, file: Path, device: str) -> None:
@@ -54,10 +54,10 @@ class Tokens:
         self.sign_of = {sign: place for place, sign in enumerate(known["signs"])}
 
 
-class Records:
-    """Records on a device, and batches of them; those of each eleventh world are held out."""
+class RecordTensors:
+    """Records as tensors on a device, and batches of them; those of each eleventh world are held out."""
 
-    def __init__(self, arrays: Mapping[str, np.ndarray], tokens: Tokens, device: str) -> None:
+    def __init__(self, arrays: Mapping[str, np.ndarray], tokens: PromptTokens, device: str) -> None:
         self._tokens, self._device = tokens, device
         kept = arrays["n"] >= 2
         names = ("fleet", "rows", "vel", "lost", "ref", "refv", "failing", "n")
@@ -85,7 +85,7 @@ class Records:
         shown = self._of["n"][own].clamp(max=k)
         return {int(rows): own[shown == rows] for rows in shown.unique().tolist()}
 
-    def batch(self, which: Tensor, k: int, rows: int, experiences: int, drawn: torch.Generator) -> Batch:
+    def batch(self, which: Tensor, k: int, rows: int, experiences: int, drawn: torch.Generator) -> PromptBatch:
         """The prompts of these decisions, all of so many rows and experiences."""
         own, count, tokens = {name: one[which] for name, one in self._of.items()}, len(which), self._tokens
         columns = torch.tensor(_COLUMNS[max(1, min(4, len(LETTERS) // k))], device=self._device)
@@ -116,7 +116,7 @@ class Records:
         at = head.shape[1] + lines.shape[2] * torch.arange(1, rows + 1, device=self._device)
         planned = _planned(velocities, order == own["ref"][:, None], own["refv"])
         targets = _targets(lost, velocities, planned, shuffled("failing"))
-        return Batch(text, targets, at, lost - own["best"][:, None, None], planned)
+        return PromptBatch(text, targets, at, lost - own["best"][:, None, None], planned)
 
     def _read(self, entries: Tensor, signs: Tensor) -> Tensor:
         """The tokens of experiences ``(B, e, 4)``."""

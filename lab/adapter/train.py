@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from lab.adapter.batches import Batch, Records, Tokens
+from lab.adapter.batches import PromptBatch, PromptTokens, RecordTensors
 from lab.adapter.model import Model
 
 # How often a prompt may show at most 1, 2, ... 10 rows.
@@ -31,7 +31,7 @@ _ROWS_EVALUATED, _MOST_EVALUATED = (3, 5, 7, 10), 4000
 _TINY = 1e-9
 
 
-def loss_of(model: Model, tokens: Tokens, batch: Batch) -> Tensor:
+def loss_of(model: Model, tokens: PromptTokens, batch: PromptBatch) -> Tensor:
     """The loss of :mod:`lab.distilling.loss`: the answer, its sensor, each row's letter and each row's worth."""
     rows, options = batch.targets.shape[1:]
     states = model(batch.tokens)
@@ -50,7 +50,7 @@ def loss_of(model: Model, tokens: Tokens, batch: Batch) -> Tensor:
 
 
 @torch.no_grad()
-def evaluation(model: Model, tokens: Tokens, records: Records, device: str) -> str:
+def evaluation(model: Model, tokens: PromptTokens, records: RecordTensors, device: str) -> str:
     """Held-out decisions: the packets lost above the best option, and how often the sensor is the planner's."""
     drawn = torch.Generator(device).manual_seed(1)
     lines = []
@@ -71,7 +71,7 @@ def evaluation(model: Model, tokens: Tokens, records: Records, device: str) -> s
     return "\n".join(lines)
 
 
-def train(model: Model, tokens: Tokens, records: Records, seconds: float, rate: float, device: str) -> None:
+def train(model: Model, tokens: PromptTokens, records: RecordTensors, seconds: float, rate: float, device: str) -> None:
     """Train for a time; the learning rate follows it along a cosine."""
     draws, drawn = np.random.default_rng(0), torch.Generator(device).manual_seed(0)
     weights = [weight for weight in model.parameters() if weight.requires_grad]
@@ -120,10 +120,10 @@ def main() -> None:
     tensors = {name: values for number in (0, 1) for name, values in np.load(args.base / f"base{number}.npz").items()}
     kinds = json.loads((args.base / "tokens.json").read_text())["kinds"]
     dtype = torch.bfloat16 if device == "cuda" else torch.float32
-    model, tokens = Model(tensors, kinds, _RANK, dtype).to(device), Tokens(args.base / "tokens.json", device)
+    model, tokens = Model(tensors, kinds, _RANK, dtype).to(device), PromptTokens(args.base / "tokens.json", device)
     if args.begin is not None:
         model.load_adapter(np.load(args.begin))
-    records = Records(np.load(args.records), tokens, device)
+    records = RecordTensors(np.load(args.records), tokens, device)
     print(evaluation(model, tokens, records, device), flush=True)
     train(model, tokens, records, args.seconds, args.rate, device)
     np.savez_compressed(args.out / "adapter.npz", **model.adapter())

@@ -7,7 +7,7 @@ import sys
 import tyro
 from rich.console import Console
 
-from lab.distilling.options import Distill, DistillOrders, Training
+from lab.distilling.options import Distill, DistillOrders, TrainingOptions
 from service.llm.model_file import ModelMissing
 
 
@@ -16,7 +16,7 @@ def main(argv: list[str]) -> int:
     return trained(Distill, "distill", argv)
 
 
-def trained(options: type[Training], name: str, argv: list[str]) -> int:
+def trained(options: type[TrainingOptions], name: str, argv: list[str]) -> int:
     """Train by a command's options and write; returns the exit code."""
     args = tyro.cli(options, prog=f"python -m lab {name}", args=argv)
     console = Console()
@@ -44,7 +44,7 @@ def trained(options: type[Training], name: str, argv: list[str]) -> int:
     return 0
 
 
-def _check(args: Training) -> None:
+def _check(args: TrainingOptions) -> None:
     if isinstance(args, Distill) and not args.rollouts and args.begin is None:
         raise ValueError("name at least one file of `python -m lab explore`, or an adapter with --begin")
     for name in ("steps", "batch", "workers"):

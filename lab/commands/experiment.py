@@ -27,7 +27,7 @@ PAGE = "page"
 
 
 @dataclass(frozen=True)
-class Options:
+class ExperimentOptions:
     __doc__ = f"""Make a figure or table of the paper, or one beyond it, over many worlds.
 
     NAME is one of these, or `{ALL}` for every one:
@@ -86,11 +86,11 @@ def main(argv: list[str]) -> int:
 
         return page.main(argv[1:])
     return command_main(
-        Options, "python -m lab experiment", argv, lambda options, console: experiment(options, argv, console)
+        ExperimentOptions, "python -m lab experiment", argv, lambda options, console: experiment(options, argv, console)
     )
 
 
-def experiment(options: Options, argv: list[str], console: Console) -> int:
+def experiment(options: ExperimentOptions, argv: list[str], console: Console) -> int:
     """Fly the missing flights, write, print; returns the exit code.
 
     Raises:
@@ -115,7 +115,7 @@ def experiment(options: Options, argv: list[str], console: Console) -> int:
     return 0
 
 
-def setup_of(options: Options) -> Setup:
+def setup_of(options: ExperimentOptions) -> Setup:
     """The setup from the options; raises ``UsageError`` for the first option out of bounds."""
     seeds = options.seeds if options.seeds is not None else QUICK_SEEDS if options.quick else SEEDS
     llm_seeds = options.llm_seeds if options.llm_seeds is not None else QUICK_LLM_SEEDS if options.quick else LLM_SEEDS

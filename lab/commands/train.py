@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from lab.marl.plan import MOST_EPISODES, STATE, Plan
+from lab.marl.plan import MOST_EPISODES, STATE, TrainingPlan
 from shared.world.scenario import Scenario
 from simulator.commands.options import check_between, check_seed, scenario_from_options
 from simulator.commands.running import command_main
@@ -24,7 +24,7 @@ from simulator.records.run_folder import naming_out
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from lab.marl.training import Learner, Round, Training
+    from lab.marl.training import MarlScheme, Round, Training
 
 _EXTRA = "Install the extra: pip install -e '.[lab]'"
 
@@ -115,16 +115,16 @@ def check(options: Train) -> None:
     check_between("--save-s", options.save_s, 0, 3600)
 
 
-def _planned(options: Train, scenario: Scenario) -> tuple[Callable[[Scenario, int, int], Learner], Plan]:
+def _planned(options: Train, scenario: Scenario) -> tuple[Callable[[Scenario, int, int], MarlScheme], TrainingPlan]:
     try:
         from lab.marl import madqn, mappo
     except ModuleNotFoundError as missing:
         raise UsageError(f"{missing.name} is not installed. {_EXTRA}") from None
 
-    learner: Callable[[Scenario, int, int], Learner] = madqn.Madqn if options.scheme == "madqn" else mappo.Mappo
+    learner: Callable[[Scenario, int, int], MarlScheme] = madqn.Madqn if options.scheme == "madqn" else mappo.Mappo
     episodes = madqn.EPISODES if options.scheme == "madqn" else mappo.EPISODES
     chosen = episodes if options.episodes is None else options.episodes
-    return learner, Plan(options.scheme, scenario, chosen, options.seed, options.threads)
+    return learner, TrainingPlan(options.scheme, scenario, chosen, options.seed, options.threads)
 
 
 def _run(training: Training, options: Train, console: Console) -> None:

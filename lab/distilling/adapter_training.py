@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from lab.distilling.batches import Batches
-from lab.distilling.options import Training
+from lab.distilling.options import TrainingOptions
 from shared.kit.cores import usable_cores
 
 _WARM_UP_STEPS = 30
@@ -23,7 +23,7 @@ _CHECKPOINT_STEPS = 25
 _RECENT = 50
 
 
-class Example(Protocol):
+class TrainingExample(Protocol):
     """What is trained on: a text that the student reads, with what it is to answer."""
 
     @property
@@ -32,11 +32,11 @@ class Example(Protocol):
         ...
 
 
-E = TypeVar("E", bound=Example)
-Read = TypeVar("Read", bound=Example, contravariant=True)
+E = TypeVar("E", bound=TrainingExample)
+Read = TypeVar("Read", bound=TrainingExample, contravariant=True)
 
 
-class Learner(Protocol[Read]):
+class AdapterStudent(Protocol[Read]):
     """A student of some kind of example."""
 
     model: Any
@@ -46,7 +46,9 @@ class Learner(Protocol[Read]):
         ...
 
 
-def train(student: Learner[E], examples: Sequence[E], args: Training, checkpoint: Path) -> Generator[float, None, None]:
+def train(
+    student: AdapterStudent[E], examples: Sequence[E], args: TrainingOptions, checkpoint: Path
+) -> Generator[float, None, None]:
     """Train, and yield each step's loss; goes on from the checkpoint, which is written every 25 steps.
 
     Raises:
@@ -87,14 +89,16 @@ def train(student: Learner[E], examples: Sequence[E], args: Training, checkpoint
         yield float(loss.detach())
 
 
-def prepared(args: Training) -> str:
+def prepared(args: TrainingOptions) -> str:
     """Set torch's threads and seed; returns the device."""
     torch.set_num_threads(args.threads or usable_cores())
     torch.manual_seed(args.seed)
     return args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def train_showing(student: Learner[Any], training: Sequence[Example], args: Training, console: Console) -> None:
+def train_showing(
+    student: AdapterStudent[Any], training: Sequence[TrainingExample], args: TrainingOptions, console: Console
+) -> None:
     """Train in the folder of the arguments, and show the progress; raises as :func:`train`."""
     with Progress(console=console) as progress:
         task = progress.add_task("Training", total=args.steps)
@@ -110,7 +114,7 @@ def train_showing(student: Learner[Any], training: Sequence[Example], args: Trai
         progress.update(task, advance=left)
 
 
-def _run(examples: Sequence[Example], args: Training) -> str:
+def _run(examples: Sequence[TrainingExample], args: TrainingOptions) -> str:
     """What determines a run's weights, as text."""
     texts = hashlib.sha256("\n".join(example.text for example in examples).encode()).hexdigest()
     return f"{texts} {args.begin} {args.steps} {args.batch} {args.rank} {args.learning_rate} {args.seed}"

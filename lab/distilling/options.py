@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training:
+class TrainingOptions:
     """What both trainings have."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
@@ -36,7 +36,7 @@ class Training:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Distill(Training):
+class Distill(TrainingOptions):
     """Train a LoRA adapter: the embedded LLM learns the compact prompt and the teachers' decisions.
 
     Record first, a file for each scenario:  python -m lab explore --scenario shadowed --out runs/shadowed.jsonl.gz
@@ -63,7 +63,7 @@ class Distill(Training):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistillOrders(Training):
+class DistillOrders(TrainingOptions):
     """Train the adapter that reads operators' notes: the embedded LLM learns to write them as orders.
 
     python -m lab distill-orders --out runs/orders

@@ -66,7 +66,7 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Finding:
+class ClaimFinding:
     """A line of the verdict table; without a ``verdict`` the claim is not judged, for the reason ``why``."""
 
     stated: str
@@ -83,12 +83,12 @@ class Finding:
         return self.seeds is not None and self.seeds < CLAIM_SEEDS
 
 
-def judge(runs: Runs) -> list[Finding]:
+def judge(runs: Runs) -> list[ClaimFinding]:
     """A finding for each of the paper's claims, including those of experiments not run."""
     return [_finding(claim, runs) for claim in CLAIMS]
 
 
-def judge_with_adapter(runs: Runs) -> list[Finding]:
+def judge_with_adapter(runs: Runs) -> list[ClaimFinding]:
     """The findings of experiment ``adapter-claims``, whose flights test every claim; none where it was not run."""
     result = runs.get(WITH_ADAPTER)
     if result is None:
@@ -97,21 +97,21 @@ def judge_with_adapter(runs: Runs) -> list[Finding]:
     return [replace(finding, experiment=WITH_ADAPTER) for finding in found]
 
 
-def _finding(claim: Claim, runs: Runs) -> Finding:
+def _finding(claim: Claim, runs: Runs) -> ClaimFinding:
     result = runs.get(claim.experiment)
     if result is None:
-        return Finding(claim.stated, claim.experiment, "", None, "not run")
+        return ClaimFinding(claim.stated, claim.experiment, "", None, "not run")
     try:
         judged = claim.rule(result, runs)
     except Unmeasured as lack:
-        return Finding(claim.stated, claim.experiment, "", None, f"not measured: {lack}", model=result.model)
+        return ClaimFinding(claim.stated, claim.experiment, "", None, f"not measured: {lack}", model=result.model)
     if result.quick:
         why = "quick run: no verdict"
-        return Finding(claim.stated, claim.experiment, judged.ours, None, why, judged.seeds, result.model)
+        return ClaimFinding(claim.stated, claim.experiment, judged.ours, None, why, judged.seeds, result.model)
     not_the_papers = elsewhere(result)
     verdict = Verdict.NOT_COMPARABLE if not_the_papers else judged.verdict
     why = not_the_papers or judged.why
-    return Finding(claim.stated, claim.experiment, judged.ours, verdict, why, judged.seeds, result.model)
+    return ClaimFinding(claim.stated, claim.experiment, judged.ours, verdict, why, judged.seeds, result.model)
 
 
 def elsewhere(result: Result) -> str | None:

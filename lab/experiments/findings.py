@@ -12,7 +12,7 @@ from lab.experiments.flight import FlightRecord
 from lab.experiments.group import Group, groups_of
 from lab.experiments.intervals import METHOD, curve, interval
 from lab.experiments.measures import MEASURES, STEP_MEASURES, substituted_decisions
-from lab.experiments.plan import Experiment, FigureSpec, Plan, Setup
+from lab.experiments.plan import Experiment, ExperimentPlan, FigureSpec, Setup
 from lab.experiments.result import Curve, Figure, Interval, Result
 from lab.experiments.schemes import BOUND, OverEdge
 from simulator.errors import UsageError
@@ -23,7 +23,7 @@ _FEW_PCT = 3.0
 
 
 def findings(
-    plan: Plan,
+    plan: ExperimentPlan,
     setup: Setup,
     command: str,
     commit: str | None,
@@ -158,7 +158,7 @@ def _model(flying: Sequence[Group]) -> str | None:
     return ", ".join(dict.fromkeys(models)) or None
 
 
-def _notes(plan: Plan, setup: Setup, groups: Sequence[Group]) -> list[str]:
+def _notes(plan: ExperimentPlan, setup: Setup, groups: Sequence[Group]) -> list[str]:
     notes = [f"Intervals: {METHOD} over seeds; a curve's likewise, at each step. Comparisons are paired by seed."]
     if setup.quick:
         steps = next((group.flights[0].steps for group in groups), 0)

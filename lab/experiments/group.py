@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from lab.experiments.flight import FlightRecord
-from lab.experiments.plan import Plan
+from lab.experiments.plan import ExperimentPlan
 from lab.experiments.schemes import Scheme
 
 
@@ -25,7 +25,7 @@ class Group:
         return [flight.seed for flight in self.flights]
 
 
-def groups_of(plan: Plan, load: Callable[[str], FlightRecord | None]) -> list[Group]:
+def groups_of(plan: ExperimentPlan, load: Callable[[str], FlightRecord | None]) -> list[Group]:
     sites = list(dict.fromkeys(planned.site_name for planned in plan.flights))
     flights: dict[tuple[str, str], list[FlightRecord]] = {}
     schemes = {planned.scheme.name: planned.scheme for planned in plan.flights}

@@ -29,7 +29,7 @@ FIGURES = "figures"
 
 
 @dataclass(frozen=True)
-class Options:
+class PageOptions:
     """Write the results page: the paper's numbers beside ours, and every experiment's figures and tables.
 
     Experiments that were not run are listed as such. The command replaces an existing page and its figures.
@@ -47,10 +47,10 @@ class Options:
 
 def main(argv: list[str]) -> int:
     """Run ``python -m lab experiment page``; returns the exit code."""
-    return command_main(Options, "python -m lab experiment page", argv, _page)
+    return command_main(PageOptions, "python -m lab experiment page", argv, _page)
 
 
-def _page(options: Options, console: Console) -> int:
+def _page(options: PageOptions, console: Console) -> int:
     write_page(options.runs, options.out)
     console.print(f"Wrote {options.out}", markup=False, highlight=False)
     return 0

@@ -113,7 +113,7 @@ class Planned:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class ExperimentPlan:
     """An experiment's flights in display order, by scheme and then by site, and the schemes omitted."""
 
     experiment: Experiment
@@ -121,7 +121,7 @@ class Plan:
     left_out: list[Scheme]
 
 
-def plan(experiment: Experiment, setup: Setup) -> Plan:
+def plan(experiment: Experiment, setup: Setup) -> ExperimentPlan:
     """The flights that an experiment needs."""
     flights, left_out = [], []
     first = next(iter(setup.sites))
@@ -137,7 +137,7 @@ def plan(experiment: Experiment, setup: Setup) -> Plan:
             for seed in range(setup.llm_seeds if scheme.asks_llm else setup.seeds):
                 key = flight_key(scheme, _identity(scheme, setup), flown_at, seed)
                 flights.append(Planned(key, scheme, name, flown_at, seed))
-    return Plan(experiment, flights, left_out)
+    return ExperimentPlan(experiment, flights, left_out)
 
 
 def _identity(scheme: Scheme, setup: Setup) -> str | None:

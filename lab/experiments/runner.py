@@ -18,7 +18,7 @@ from lab.experiments.execution import CannotFly, commit, fly_locally, fly_with_e
 from lab.experiments.flight import FlightRecord, FlightStore
 from lab.experiments.measures import substituted_decisions
 from lab.experiments.pace import Pace, duration_text
-from lab.experiments.plan import Experiment, Plan, Planned, Setup, plan
+from lab.experiments.plan import Experiment, ExperimentPlan, Planned, Setup, plan
 from lab.experiments.result import Result
 from simulator.errors import UsageError
 from simulator.records.run_folder import naming_out
@@ -69,7 +69,7 @@ class Run:
                         results.append(self._write(p))
         return results
 
-    def _plans(self, experiments: Sequence[Experiment]) -> list[Plan]:
+    def _plans(self, experiments: Sequence[Experiment]) -> list[ExperimentPlan]:
         plans = [plan(each, self.setup) for each in experiments if each.chosen(self.setup)]
         empty = [p.experiment.name for p in plans if not p.flights]
         if len(empty) == len(plans):
@@ -78,7 +78,7 @@ class Run:
             self.console.print(f"Without an LLM there is nothing to fly for {', '.join(empty)}.", highlight=False)
         return [p for p in plans if p.flights]
 
-    def _missing(self, plans: Sequence[Plan]) -> dict[str, Planned]:
+    def _missing(self, plans: Sequence[ExperimentPlan]) -> dict[str, Planned]:
         missing, stored = {}, set()
         for planned in (flight for p in plans for flight in p.flights):
             if planned.key in stored or planned.key in missing:
@@ -91,7 +91,7 @@ class Run:
                 self.pace.took(planned, flight.duration_s)
         return missing
 
-    def _print_start(self, plans: Sequence[Plan], missing: dict[str, Planned]) -> None:
+    def _print_start(self, plans: Sequence[ExperimentPlan], missing: dict[str, Planned]) -> None:
         needed = {flight.key for p in plans for flight in p.flights}
         left = f"about {duration_text(self.pace.left_s(missing.values()))}" if missing else "nothing to fly"
         self.console.print(
@@ -148,7 +148,7 @@ class Run:
                 highlight=False,
             )
 
-    def _write(self, plan: Plan) -> Result:
+    def _write(self, plan: ExperimentPlan) -> Result:
         from lab.experiments.findings import findings, tidy
         from lab.experiments.plots import draw
 
@@ -164,7 +164,7 @@ class Run:
         return result
 
 
-def _concerns(plan: Plan, label: str) -> bool:
+def _concerns(plan: ExperimentPlan, label: str) -> bool:
     return any(label == f"{flight.scheme.label} on {flight.site_name}" for flight in plan.flights)
 
 

@@ -48,7 +48,7 @@ class Teacher(Protocol):
         """Take the outcome of the UAV's action in that step."""
 
 
-class Planner(RecedingHorizonPolicy):
+class PlannerTeacher(RecedingHorizonPolicy):
     """The receding-horizon planner with the fleet's belief; it has a reference action at every step."""
 
     deviations = 0.5
@@ -65,7 +65,7 @@ class Planner(RecedingHorizonPolicy):
         self.belief.tell(uav, step, *action)
 
 
-class Clairvoyant:
+class ClairvoyantTeacher:
     """Plans to the mission's end with the true state of the world and all arrivals, and again after a deviation.
 
     It has no reference action in a step in which the fleet deviates.
@@ -115,4 +115,7 @@ class Clairvoyant:
         return first
 
 
-TEACHERS: dict[TeacherName, type[Planner] | type[Clairvoyant]] = {"planner": Planner, "clairvoyant": Clairvoyant}
+TEACHERS: dict[TeacherName, type[PlannerTeacher] | type[ClairvoyantTeacher]] = {
+    "planner": PlannerTeacher,
+    "clairvoyant": ClairvoyantTeacher,
+}

@@ -14,7 +14,7 @@ MOST_EPISODES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """The inputs of a training: the same plan gives the same weights to the bit on the same machine."""
 
     scheme: str

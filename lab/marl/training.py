@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 from lab.marl import checkpoint
 from lab.marl.curve import Point
 from lab.marl.evaluate import lost_packets
-from lab.marl.plan import STATE, Plan
+from lab.marl.plan import STATE, TrainingPlan
 from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
@@ -34,7 +34,7 @@ class Round(NamedTuple):
     reward: float
 
 
-class Learner(Protocol):
+class MarlScheme(Protocol):
     """A scheme in training; a round is ``worlds`` missions, and ``network`` is that of the actors."""
 
     @property
@@ -65,7 +65,7 @@ class Training:
         episodes: the missions flown so far.
     """
 
-    def __init__(self, plan: Plan, make: Callable[[Scenario, int, int], Learner], out: Path) -> None:
+    def __init__(self, plan: TrainingPlan, make: Callable[[Scenario, int, int], MarlScheme], out: Path) -> None:
         torch.set_num_threads(plan.threads)
         torch.manual_seed(plan.seed)
         self.plan = plan

@@ -130,7 +130,7 @@ class Choices:
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
+class ExampleBatch:
     """B examples: ``features`` ``(B, n, d)`` of as many sensors as the largest example has, padded with zeros.
 
     ``admissible`` ``(B, n)`` distinguishes sensors from padding. ``taught`` ``(B,)`` is true where there is a teacher's
@@ -168,8 +168,8 @@ class Batch:
     def __len__(self) -> int:
         return len(self.reward)
 
-    def __getitem__(self, rows: Tensor) -> Batch:
-        return Batch(
+    def __getitem__(self, rows: Tensor) -> ExampleBatch:
+        return ExampleBatch(
             self.features[rows],
             self.admissible[rows],
             self.reward[rows],

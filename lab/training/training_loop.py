@@ -18,7 +18,7 @@ from torch.nn import functional
 from lab.exploration.rollouts import read_rollouts
 from lab.training.options import Pretrain
 from lab.training.reward import Reward
-from lab.training.rollout_examples import Batch, Choices, Example, replay
+from lab.training.rollout_examples import Choices, Example, ExampleBatch, replay
 from lab.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from service.learning.initial_weights import initial_weights, save
 from service.learning.modules import Modules
@@ -38,7 +38,7 @@ def pretrain(args: Pretrain, console: Console) -> None:
     recordings = [_replayed(path, reward, args, console) for path in args.rollouts]
     levels = _levels(recordings)
     train, test = ([*chain.from_iterable(missions)] for missions in zip(*map(_split, recordings), strict=True))
-    modules = fit(Batch.of(train, args.speed), Batch.of(test, args.speed), levels, args, console)
+    modules = fit(ExampleBatch.of(train, args.speed), ExampleBatch.of(test, args.speed), levels, args, console)
     for recording in recordings:
         console.print(_report(modules, recording, args, levels))
     args.out.parent.mkdir(parents=True, exist_ok=True)
@@ -108,7 +108,7 @@ def _report(modules: Modules, recording: _Recording, args: Pretrain, levels: int
     return table
 
 
-def losses(modules: Modules, batch: Batch, temperature: float = 1.0) -> tuple[Tensor, Tensor]:
+def losses(modules: Modules, batch: ExampleBatch, temperature: float = 1.0) -> tuple[Tensor, Tensor]:
     """Mean value regression, and mean cross-entropy that ranks the teacher's sensor, and a velocity for it, first.
 
     ``(s_j - r)^2 + (u_v - r)^2`` of the recorded decision, and
@@ -131,7 +131,7 @@ def losses(modules: Modules, batch: Batch, temperature: float = 1.0) -> tuple[Te
     return torch.as_tensor(regression), (sensor * batch.reaches + velocity * batch.taught).mean()
 
 
-def fit(train: Batch, test: Batch, levels: int, args: Pretrain, console: Console) -> Modules:
+def fit(train: ExampleBatch, test: ExampleBatch, levels: int, args: Pretrain, console: Console) -> Modules:
     """Minibatch Adam with a cosine schedule; prints the held-out loss after every epoch."""
     modules = Modules(args.features, levels, args.seed)
     adam = torch.optim.Adam(modules.parameters(), lr=args.learning_rate)

@@ -30,7 +30,7 @@ from service.server.middleware import SecurityHeaders
 from service.storage.store import Store
 
 
-class State(TypedDict):
+class RequestState(TypedDict):
     """The content of ``request.state``."""
 
     engine: Engine
@@ -51,7 +51,7 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
     traces = Traces(provider_from_environment(version("aic-vds")), settings)
 
     @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[State]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[RequestState]:
         # One thread computes the small modules faster than it can start others, and llama.cpp needs the other cores.
         torch.set_num_threads(1)
         metrics = Metrics()

@@ -53,7 +53,7 @@ class Remove:
 
 
 @dataclass(frozen=True)
-class Options:
+class KeysOptions:
     """The API keys of an edge, once AICVDS_KEYS names their file. Exit code: 0 done, 2 usage error."""
 
     do: (
@@ -66,7 +66,7 @@ class Options:
 def main(argv: list[str]) -> int:
     """Run ``aicvds keys``; returns the exit code."""
     config = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
-    command = tyro.cli(Options, prog="aicvds keys", args=argv, config=config).do
+    command = tyro.cli(KeysOptions, prog="aicvds keys", args=argv, config=config).do
     try:
         return (
             _add(command)

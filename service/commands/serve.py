@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Serve:
+class ServeOptions:
     """Run the edge decision service.
 
     Decides at once by its LLM-free policy, and by the LLM as soon as that is loaded (watch /readyz). With no LLM server
@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
     # GNU OpenMP's threads spin at llama.cpp's barriers, even while another process has the core that they wait for. The
     # library reads this variable once, when torch loads it.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    args = tyro.cli(Serve, prog="aicvds serve", args=argv)
+    args = tyro.cli(ServeOptions, prog="aicvds serve", args=argv)
     if not 0 <= args.port <= 65535:
         return _refused(f"--port {args.port} is not between 0 and 65535")
     # The edges on a cluster listen on their machines' addresses.

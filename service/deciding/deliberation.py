@@ -83,7 +83,7 @@ class LlmAdvice:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Conclusion:
     """The action to fly, what the response tells of it, and what trust is to learn from it."""
 
     action: Action
@@ -143,7 +143,7 @@ class Deliberation:
         *,
         calibrated: bool,
         reserved: Collection[int] = (),
-    ) -> Verdict | None:
+    ) -> Conclusion | None:
         """Weigh the advice; None where every candidate's sensor is reserved.
 
         Args:
@@ -174,7 +174,7 @@ class Deliberation:
             calibrated=calibrated,
             candidates=self._reported(score, mixture, regret, heard.get(LLM)),
         )
-        return Verdict(self.candidates.actions[best], report, advice)
+        return Conclusion(self.candidates.actions[best], report, advice)
 
     def _regret(self, lost: FloatArray) -> FloatArray:
         """Packets lost above the best candidate, or above the plan's unless that is a disaster.

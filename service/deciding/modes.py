@@ -57,7 +57,7 @@ class Mode(Protocol):
         ...
 
 
-class Policy:
+class PolicyMode:
     """No LLM and no learned values: the plan decides, or look-ahead where there is no plan."""
 
     plan_share: ClassVar[float | None] = 1.0
@@ -74,7 +74,7 @@ class Policy:
         return Fallback("mode_policy")
 
 
-class Value(Policy):
+class ValueMode(PolicyMode):
     """The learned values decide."""
 
     plan_share: ClassVar[float | None] = None
@@ -86,7 +86,7 @@ class Value(Policy):
         return Choice(state.best_by_value(), "mode_value")
 
 
-class Llm(Policy):
+class LlmMode(PolicyMode):
     """The paper's mode: the LLM's answer is the decision, once it has passed every check."""
 
     def __init__(self, queries: LlmQueries) -> None:
@@ -117,7 +117,7 @@ class Llm(Policy):
         return Choice(answer, None, completion, completion.model)
 
 
-class LlmByLetter(Policy):
+class LetterMode(PolicyMode):
     """Mode ``llm`` with the compact prompt: the likeliest letter is the decision, once it has passed every check."""
 
     def __init__(self, queries: LlmQueries) -> None:
@@ -149,7 +149,7 @@ class LlmByLetter(Policy):
         return Choice(answer, None, advice.completion, advice.model)
 
 
-class Guided(Policy):
+class GuidedMode(PolicyMode):
     """The LLM's preference is weighed with the other advisers' and with the rollout evaluator's losses."""
 
     plan_share: ClassVar[float | None] = 0.5
@@ -220,8 +220,8 @@ def _evaluation_of(result: asyncio.Future[Evaluation]) -> Evaluation | None:
 
 def modes_by_name(queries: LlmQueries, evaluating: Executor) -> dict[tuple[ModeName, bool], Mode]:
     """Every mode, by its name and by whether the mission has the compact prompt."""
-    guided, value, policy = Guided(queries, evaluating), Value(), Policy()
-    modes: dict[tuple[ModeName, bool], Mode] = {("llm", False): Llm(queries), ("llm", True): LlmByLetter(queries)}
+    guided, value, policy = GuidedMode(queries, evaluating), ValueMode(), PolicyMode()
+    modes: dict[tuple[ModeName, bool], Mode] = {("llm", False): LlmMode(queries), ("llm", True): LetterMode(queries)}
     for compact in (False, True):
         modes |= {("guided", compact): guided, ("value", compact): value, ("policy", compact): policy}
     return modes

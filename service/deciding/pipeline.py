@@ -30,7 +30,7 @@ _OWN_S, _OWN_MEMORY = 0.03, 20
 
 
 @dataclass(frozen=True, slots=True)
-class Decided:
+class RecordedDecision:
     """A decision that its mission has recorded.
 
     Attributes:
@@ -63,7 +63,7 @@ class Pipeline:
         self._plans: set[asyncio.Task[None]] = set()
         self._modes = modes_by_name(queries, self._evaluating)
 
-    async def decide_one(self, task: DecisionTask) -> Decided:
+    async def decide_one(self, task: DecisionTask) -> RecordedDecision:
         """Decide for one UAV, and record the decision in its mission; raises as :meth:`Mission.commit`."""
         mode = self._modes[task.mission.mode, task.mission.spec.prompt.format == "compact"]
         if mode.plan_first:
@@ -88,7 +88,7 @@ class Pipeline:
         times = task.watch.milliseconds(perf_counter())
         waited_ms = times.get("llm", 0.0) + times.get("plan", 0.0)
         self.own_s += ((times["total"] - waited_ms) / 1e3 - self.own_s) / _OWN_MEMORY
-        return Decided(decision_id, task, state, question.prompt, tokens, choice, times)
+        return RecordedDecision(decision_id, task, state, question.prompt, tokens, choice, times)
 
     def begin_plan(
         self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline

@@ -9,7 +9,7 @@ from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import RESERVE_S, DecisionTask
 from service.deciding.deliberation import LlmAdvice
 from service.deciding.llm_query import LlmQueries
-from service.deciding.pipeline import Decided, Pipeline
+from service.deciding.pipeline import Pipeline, RecordedDecision
 from service.deciding.stopwatch import Deadline, Stopwatch
 from service.mission.mission import Mission
 from shared.wire.schemas import BatchRequest
@@ -28,7 +28,7 @@ class BatchDecider:
 
     async def decide(
         self, mission: Mission, request: BatchRequest, watch: Stopwatch, deadline: Deadline
-    ) -> list[Decided]:
+    ) -> list[RecordedDecision]:
         """The decisions for every UAV of a request whose outcomes are applied.
 
         One plan serves all UAVs until one of them gets another action than the plan's; the rest is planned again. Each
@@ -46,7 +46,7 @@ class BatchDecider:
             states = [AttendedState.of(mission, uav, step, watch) for uav in request.uavs]
             advice = await self._queries.ask_for_fleet(mission, states, Deadline(watch.started + query_s))
             watch.ended.append(("llm", perf_counter()))
-        decisions: list[Decided] = []
+        decisions: list[RecordedDecision] = []
         for index, uav in enumerate(request.uavs):
             own = Stopwatch() if index else watch
             now, later = perf_counter(), len(uavs) - index - 1

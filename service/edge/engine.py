@@ -13,7 +13,7 @@ from structlog.contextvars import bind_contextvars, clear_contextvars
 from service.config.settings import Settings
 from service.deciding.decision_task import RESERVE_S, DecisionTask
 from service.deciding.llm_query import LlmQueries
-from service.deciding.pipeline import Decided, Pipeline
+from service.deciding.pipeline import Pipeline, RecordedDecision
 from service.deciding.stopwatch import Deadline, Stopwatch
 from service.edge.batch import BatchDecider
 from service.edge.feedback import Feedback
@@ -120,7 +120,7 @@ class Engine:
         watch, deadline = self._start(request)
         mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, deadline=deadline)
 
-        async def make() -> list[Decided]:
+        async def make() -> list[RecordedDecision]:
             # Every outcome is applied before the first decision: none is lost while the UAVs wait for the LLM.
             for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
                 self._feedback.apply_reported(mission, outcome)
@@ -203,7 +203,7 @@ class Engine:
 
     async def _decide_one(
         self, mission: Mission, request: DecideRequest, watch: Stopwatch, deadline: Deadline
-    ) -> list[Decided]:
+    ) -> list[RecordedDecision]:
         if request.outcome is not None:
             self._feedback.apply_reported(mission, request.outcome)
         attempt = mission.observe(request, request.step)
@@ -217,11 +217,11 @@ class Engine:
         mission: Mission,
         request: DecideRequest | BatchRequest,
         key: str | None,
-        make: Callable[[], Awaitable[list[Decided]]],
+        make: Callable[[], Awaitable[list[RecordedDecision]]],
         deadline: Deadline,
     ) -> list[DecideResponse]:
         """The answers under the idempotency key, made unless there are some, once they are on disk or late for it."""
-        decisions: list[Decided] = []
+        decisions: list[RecordedDecision] = []
         answers: list[DecideResponse] = []
         try:
             if key is None:
@@ -248,10 +248,10 @@ class Engine:
         mission: Mission,
         request: DecideRequest | BatchRequest,
         key: str,
-        make: Callable[[], Awaitable[list[Decided]]],
-    ) -> tuple[list[Decided], list[DecideResponse]]:
+        make: Callable[[], Awaitable[list[RecordedDecision]]],
+    ) -> tuple[list[RecordedDecision], list[DecideResponse]]:
         """The answers under an idempotency key, and the decisions if they are made now."""
-        decisions: list[Decided] = []
+        decisions: list[RecordedDecision] = []
         answers: list[DecideResponse] = []
 
         async def made() -> str:
@@ -263,13 +263,13 @@ class Engine:
         text = await mission.idempotent_answers.once(key, request.model_dump_json(), made, mission.record)
         return decisions, answers or _ANSWERS.validate_json(text)
 
-    def _follow_up(self, mission: Mission, decisions: list[Decided], answers: list[DecideResponse]) -> None:
+    def _follow_up(self, mission: Mission, decisions: list[RecordedDecision], answers: list[DecideResponse]) -> None:
         """What is left to do for a request whose answer is sent: report it, and write a checkpoint where one is due."""
         self._feedback.follow_up(mission)
         for decided, answer in zip(decisions, answers, strict=False):
             self._report(decided, answer)
 
-    def _report(self, decided: Decided, answer: DecideResponse) -> None:
+    def _report(self, decided: RecordedDecision, answer: DecideResponse) -> None:
         """Report an answer to metrics, traces, the log and the mission page; nothing else reports decisions to them."""
         task, choice = decided.task, decided.choice
         self._metrics.record_decision(answer)
@@ -291,7 +291,7 @@ def _taken_over() -> Unavailable:
     return Unavailable("mission_id", "another edge has taken over the mission, nothing was recorded: send it again")
 
 
-def _answer(decided: Decided, settings: Settings) -> DecideResponse:
+def _answer(decided: RecordedDecision, settings: Settings) -> DecideResponse:
     """The wire's form of a decision."""
     task, choice = decided.task, decided.choice
     return DecideResponse(

@@ -14,7 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import Misdirected
 from service.observability.metrics import Metrics
-from service.storage.leases import Leases, Owner
+from service.storage.leases import LeaseHolder, Leases
 from service.storage.store import cause
 
 log = logging.getLogger(__name__)
@@ -123,7 +123,7 @@ class LeasedOwnership:
         """
         asked_at = time.monotonic()
         answer = self._leases.acquire(mission_id, self._address, self._term_s)
-        if isinstance(answer, Owner):
+        if isinstance(answer, LeaseHolder):
             self._leased.pop(mission_id, None)
             raise _misdirected(mission_id, answer)
         lease = self._leased.get(mission_id)
@@ -188,6 +188,6 @@ class LeasedOwnership:
         self._failure = failure
 
 
-def _misdirected(mission_id: str, owner: Owner) -> Misdirected:
+def _misdirected(mission_id: str, owner: LeaseHolder) -> Misdirected:
     detail = f"another edge has mission {mission_id}: send the request there"
     return Misdirected("mission_id", detail, owner.address or None, owner.left_s)

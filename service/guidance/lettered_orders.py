@@ -29,7 +29,7 @@ _ROUNDING = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class NoteReading:
     """What a note was read as.
 
     Attributes:
@@ -57,7 +57,7 @@ def grammar(note: LetteredNote) -> str:
     )
 
 
-def meaning(answer: str, note: LetteredNote, scenario: Scenario) -> Reading:
+def meaning(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading:
     """The reading of an answer.
 
     Raises:
@@ -70,7 +70,7 @@ def meaning(answer: str, note: LetteredNote, scenario: Scenario) -> Reading:
     if words != NOTHING:
         for order in words.split(SEPARATOR):
             orders.add(order)
-    return Reading(orders.guidance(), tuple(orders.doubts))
+    return NoteReading(orders.guidance(), tuple(orders.doubts))
 
 
 class _Orders:

@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from service.guidance.lettered_orders import Reading
+from service.guidance.lettered_orders import NoteReading
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
 from service.guidance.note_readings import read_note
 from service.guidance.operator_guidance import OperatorGuidance
@@ -127,7 +127,7 @@ def _waits_for(mission: NoteOwner, note: str) -> bool:
     return mission.guidance.status == "compiling" and mission.guidance.note == note
 
 
-async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Reading:
+async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
     """The note's reading: with the orders' adapter, or else the first answer that passes every check.
 
     Raises:
@@ -145,7 +145,7 @@ async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> Readin
     return reading
 
 
-async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> Reading:
+async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
     rewriting = Rewriting(
         INSTRUCTION, similar_examples(note), note, lambda constraint: constrain_orders(constraint, note)
     )
@@ -161,5 +161,5 @@ async def _rewrite_note(note: str, scenario: Scenario, llm: ServerPool) -> Readi
             log.debug("note, attempt %d: %r: %s", attempt, text[:80], error)
             faults.append(error)
             continue
-        return Reading(guidance, (_NOT_JUDGED,))
+        return NoteReading(guidance, (_NOT_JUDGED,))
     raise faults[0]

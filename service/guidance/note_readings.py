@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from service.guidance.lettered_orders import STATIC, Reading, grammar, meaning
+from service.guidance.lettered_orders import STATIC, NoteReading, grammar, meaning
 from service.guidance.note_numbers import LetteredNote
 from service.guidance.note_orders import BadOrders
 from service.llm.answers import Completion
@@ -29,7 +29,7 @@ _DIFFER = "The note can be read in more than one way."
 _UNLIKELY = "The LLM is not sure of this reading."
 
 
-async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> Reading:
+async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
     """The note's reading.
 
     Raises:
@@ -37,7 +37,7 @@ async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> Reading:
         Impossible: most answers order something that the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
-    found: list[tuple[Reading | BadOrders | Impossible, float]] = []
+    found: list[tuple[NoteReading | BadOrders | Impossible, float]] = []
     for seed in range(_READINGS):
         try:
             lettered = LetteredNote.of(note, seed)
@@ -56,7 +56,7 @@ def _request(note: LetteredNote) -> Rewriting:
     return Rewriting(STATIC, [], note.text, constrain)
 
 
-def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> Reading | BadOrders | Impossible:
+def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading | BadOrders | Impossible:
     try:
         reading = meaning(answer, note, scenario)
         reading.guidance.check(scenario)
@@ -72,7 +72,7 @@ def _probability(answer: Completion) -> float:
     return math.prod(position.likeliest.get(position.token.strip(), 0.0) for position in answer.positions)
 
 
-def _most(found: Sequence[tuple[Reading | BadOrders | Impossible, float]]) -> Reading:
+def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]]) -> NoteReading:
     """The reading that comes most often, the likelier of two; raises the error that comes so."""
     said = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
     often = Counter(said)
@@ -85,4 +85,4 @@ def _most(found: Sequence[tuple[Reading | BadOrders | Impossible, float]]) -> Re
         doubts.append(_DIFFER)
     elif min(probability for _, probability in found) < _SURE:
         doubts.append(_UNLIKELY)
-    return Reading(reading.guidance, tuple(doubts))
+    return NoteReading(reading.guidance, tuple(doubts))

@@ -79,12 +79,12 @@ def _grammar(orders: Sequence[str], available: Counter[int]) -> str:
     the states. Where a note has so many numbers that there would be too many rules, a fixed grammar allows more orders,
     and ``parse_orders`` refuses the wrong ones.
     """
-    start = _State(frozenset(available.items()))
+    start = _GrammarState(frozenset(available.items()))
     index = {start: 0}
     queue, rules = [start], []
     # The loop extends the list that it iterates over.
     for state in queue:
-        by_next: dict[_State, list[str]] = {}
+        by_next: dict[_GrammarState, list[str]] = {}
         for order in orders:
             if (after := state.after(order)) is not None:
                 by_next.setdefault(after, []).append(f'"{order}"')
@@ -105,13 +105,13 @@ def _grammar(orders: Sequence[str], available: Counter[int]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class _GrammarState:
     """The numbers that are left, with the uses left of each, and the sensors that the orders so far name."""
 
     left: frozenset[tuple[int, int]]
     sensors: frozenset[int] = frozenset()
 
-    def after(self, order: str) -> _State | None:
+    def after(self, order: str) -> _GrammarState | None:
         """The state after one more order; None where the order uses a number too often."""
         words, numbers = parse_order(order)
         sensors = frozenset(numbers[:1]) if words in (VISIT, WEIGHT) else frozenset[int]()
@@ -120,7 +120,7 @@ class _State:
         left = Counter(dict(self.left))
         if used - left:
             return None
-        return _State(frozenset((left - used).items()), self.sensors | sensors)
+        return _GrammarState(frozenset((left - used).items()), self.sensors | sensors)
 
 
 def _filled(words: str, numbers: Sequence[int]) -> str:

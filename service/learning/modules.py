@@ -41,7 +41,7 @@ class Sample(NamedTuple):
     velocity: int
 
 
-class AttentionWeights(NamedTuple):
+class AttentionTensors(NamedTuple):
     """``W_q``, ``W_k``, ``W_v`` ``(d', d)``, and the score's ``w`` ``(1, d')`` and ``b`` ``(1,)``."""
 
     query: Tensor
@@ -51,7 +51,7 @@ class AttentionWeights(NamedTuple):
     bias: Tensor
 
 
-class VelocityWeights(NamedTuple):
+class VelocityTensors(NamedTuple):
     """``W_1``, ``b_1``, ``W_2``, ``b_2``."""
 
     hidden: Tensor
@@ -78,7 +78,7 @@ class Parameters(NamedTuple):
     out_bias: Array
 
 
-def attend(weights: AttentionWeights, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def attend(weights: AttentionTensors, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
 
     Args:
@@ -114,18 +114,18 @@ def top_k(scores: Array, k: int) -> list[int]:
     return best
 
 
-def by_distance(weights: VelocityWeights, z: Tensor, distance: Tensor) -> Tensor:
+def by_distance(weights: VelocityTensors, z: Tensor, distance: Tensor) -> Tensor:
     """Values ``(..., levels)`` from the context ``(..., d')`` and the normalised distance ``(..., 1)``."""
     return _values(weights, torch.cat([z, distance], dim=-1))
 
 
-def by_reach(weights: VelocityWeights, z: Tensor, levels: Tensor) -> Tensor:
+def by_reach(weights: VelocityTensors, z: Tensor, levels: Tensor) -> Tensor:
     """Values ``(..., levels)`` from the context ``(..., d')`` and the levels' features ``(..., levels, 4)``."""
     context = z[..., None, :].expand(*levels.shape[:-1], z.shape[-1])
     return _values(weights, torch.cat([context, levels], dim=-1))[..., 0]
 
 
-def _values(weights: VelocityWeights, x: Tensor) -> Tensor:
+def _values(weights: VelocityTensors, x: Tensor) -> Tensor:
     hidden = torch.relu(functional.linear(x, weights.hidden, weights.hidden_bias))
     return functional.linear(hidden, weights.out, weights.out_bias)
 
@@ -148,7 +148,7 @@ class Weights:
     @property
     def attention(self) -> dict[str, Array]:
         """The attention module's parameters by name."""
-        return {name: getattr(self.parameters, name) for name in AttentionWeights._fields}
+        return {name: getattr(self.parameters, name) for name in AttentionTensors._fields}
 
     def attend(self, features: Array) -> Attended:
         """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`."""
@@ -242,7 +242,7 @@ class Attention(nn.Module):
     def forward(self, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """As :func:`attend`."""
         linear = self.query.weight, self.key.weight, self.value.weight
-        return attend(AttentionWeights(*linear, self.score.weight, self.score.bias), x, admissible)
+        return attend(AttentionTensors(*linear, self.score.weight, self.score.bias), x, admissible)
 
 
 class VelocityScorer(nn.Module):
@@ -275,8 +275,8 @@ class ReachVelocityScorer(nn.Module):
         return by_reach(_weights(self.hidden, self.out), z, levels)
 
 
-def _weights(hidden: nn.Linear, out: nn.Linear) -> VelocityWeights:
-    return VelocityWeights(hidden.weight, hidden.bias, out.weight, out.bias)
+def _weights(hidden: nn.Linear, out: nn.Linear) -> VelocityTensors:
+    return VelocityTensors(hidden.weight, hidden.bias, out.weight, out.bias)
 
 
 class Modules(nn.Module):

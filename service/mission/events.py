@@ -8,7 +8,7 @@ from typing import Any
 from service.learning.trust import Advice
 from service.mission.decisions import Pending
 from service.mission.idempotency import Answered
-from service.mission.sensor_readings import Reading
+from service.mission.sensor_readings import PlacedReading
 from shared.wire.schemas import Outcome, UavState
 
 
@@ -46,20 +46,20 @@ class Settled:
 
 
 @dataclass(frozen=True, slots=True)
-class Guided:
+class GuidanceChanged:
     """The operator's guidance has changed; ``state`` is its :meth:`OperatorGuidance.state_dict`."""
 
     state: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Read:
+class ReadingsMerged:
     """Readings of sensors, each with the step that it was placed in, changed the belief."""
 
-    readings: list[Reading]
+    readings: list[PlacedReading]
 
 
-Event = Reported | Decided | Settled | Guided | Answered | Read
+Event = Reported | Decided | Settled | GuidanceChanged | Answered | ReadingsMerged
 
 
 def ignore_event(event: Event) -> None:

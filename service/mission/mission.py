@@ -17,13 +17,22 @@ from service.learning.learner import Learner
 from service.learning.modules import Sample
 from service.learning.trust import PRIOR, PRIOR_UNPLANNED, Trust
 from service.mission.decisions import PENDING_PER_UAV, Pending, PendingDecisions, Reservation, Reservations
-from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled, ignore_event
+from service.mission.events import (
+    AdviserReport,
+    Decided,
+    Event,
+    GuidanceChanged,
+    ReadingsMerged,
+    Reported,
+    Settled,
+    ignore_event,
+)
 from service.mission.idempotency import IdempotentAnswers
-from service.mission.planner import Planner, can_plan
+from service.mission.planner import MissionPlanner, can_plan
 from service.mission.prompt_fit import PromptFit, template_for
 from service.mission.reports import Reports
 from service.mission.resolved_spec import ResolvedSpec
-from service.mission.sensor_readings import Reading, Readings
+from service.mission.sensor_readings import PlacedReading, Readings
 from service.mission.visit_orders import VisitOrders
 from service.prompting.experiences import Experience, Experiences
 from shared.belief.fleet_belief import FleetBelief
@@ -99,7 +108,7 @@ class Mission:
         self.reports = Reports(mission_id, self.scenario, self.belief, self.pending)
         self.readings = Readings(self.scenario, self.belief, self.records)
         planned = spec.planner == "on" and can_plan(self.scenario)
-        self.planner = Planner(self.scenario, self.belief) if planned else None
+        self.planner = MissionPlanner(self.scenario, self.belief) if planned else None
         self.guidance = OperatorGuidance(spec.note, self.scenario)
         self.visit_orders = VisitOrders()
         prior = PRIOR if self.planner is not None else PRIOR_UNPLANNED
@@ -124,7 +133,7 @@ class Mission:
     def _guidance_changed(self) -> None:
         if self.planner is not None:
             self.planner.follow(self.guidance.confirmed)
-        self.record(Guided(self.guidance.state_dict()))
+        self.record(GuidanceChanged(self.guidance.state_dict()))
 
     def observe(self, uav: UavState, step: int) -> int:
         """Add a UAV's report to the sensors' records and to the fleet's belief.
@@ -148,12 +157,12 @@ class Mission:
             results = self.take_readings(placed)
         return results
 
-    def take_readings(self, placed: Sequence[Reading]) -> list[ReadingResult]:
+    def take_readings(self, placed: Sequence[PlacedReading]) -> list[ReadingResult]:
         """Take readings that have their steps; those that change the belief are an event."""
         results = self.readings.take(placed)
         merged = [reading for reading, result in zip(placed, results, strict=True) if result == "merged"]
         if merged:
-            self.record(Read(merged))
+            self.record(ReadingsMerged(merged))
         return results
 
     def commit(self, decision: Pending, attempt: int = 1, advice: AdviserReport | None = None) -> None:

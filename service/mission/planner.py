@@ -25,7 +25,7 @@ def can_plan(scenario: Scenario) -> bool:
     return scenario.sensors <= MAX_SENSORS and scenario.uavs <= MAX_UAVS
 
 
-class Planner(RecedingHorizon):
+class MissionPlanner(RecedingHorizon):
     """One mission's plan, renewed with the reports of the UAVs. Only the event loop uses it; another thread searches.
 
     Args:

@@ -16,7 +16,7 @@ from shared.wire.readings import ReadingResult, SensorReading
 from shared.world.scenario import Scenario
 
 
-class Reading(NamedTuple):
+class PlacedReading(NamedTuple):
     """A sensor's reading at the start of a step, negative before the mission's first; ``battery`` in J, if known."""
 
     sensor_id: int
@@ -44,7 +44,7 @@ class Readings:
         self._messages: dict[int, str] = {}
         self.began = -1, 0.0
 
-    def placed(self, given: Sequence[SensorReading]) -> list[Reading] | None:
+    def placed(self, given: Sequence[SensorReading]) -> list[PlacedReading] | None:
         """The readings with their steps; None before the mission's first report.
 
         A reading within step n, after the fleet's first report of it, counts as of the start of step n: the queue has
@@ -72,7 +72,7 @@ class Readings:
         step, at_s = self.began
         since_began_s = time.monotonic() - at_s if step == newest else 0.0
         return [
-            Reading(
+            PlacedReading(
                 sensor_id=reading.sensor_id,
                 step=self._step_of(reading, newest, since_began_s),
                 queue=reading.queue,
@@ -88,7 +88,7 @@ class Readings:
         assert reading.age_s is not None
         return newest + min(0, math.floor((since_began_s - reading.age_s) / self._scenario.step_s))
 
-    def take(self, readings: Sequence[Reading]) -> list[ReadingResult]:
+    def take(self, readings: Sequence[PlacedReading]) -> list[ReadingResult]:
         """Merge the readings into records and belief; returns what became of each."""
         fresh = [r.message_id is None or self._messages.get(r.sensor_id) != r.message_id for r in readings]
         unknown = [reading for reading, new in zip(readings, fresh, strict=True) if new]

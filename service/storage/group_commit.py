@@ -33,7 +33,7 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
 _LINGER_S = 0.25
 
 
-class _State(Enum):
+class _CommitState(Enum):
     """What happens to the queue now, and what comes next."""
 
     # The queue is empty. The next change begins LINGERING.
@@ -67,7 +67,7 @@ class GroupCommit:
         self._on_lost = on_lost
         self._metrics = metrics
         self._loop = asyncio.get_running_loop()
-        self._state = _State.IDLE
+        self._state = _CommitState.IDLE
         # A change leaves the queue once it is durable.
         self._queue: deque[tuple[int, Change]] = deque()
         self._added = self._written = 0
@@ -98,7 +98,7 @@ class GroupCommit:
         """Queue a change behind all others."""
         self._added += 1
         self._queue.append((self._added, change))
-        if self._state is _State.IDLE:
+        if self._state is _CommitState.IDLE:
             self._linger()
 
     def supersede(self, checkpoint: Checkpoint) -> None:
@@ -122,8 +122,8 @@ class GroupCommit:
         reached: asyncio.Future[bool] = self._loop.create_future()
         request = self._added, reached
         self._requests.append(request)
-        if self._state is _State.LINGERING:
-            self._begin(_State.WRITING)
+        if self._state is _CommitState.LINGERING:
+            self._begin(_CommitState.WRITING)
         expiry = self._loop.call_later(max(0.0, within_s), _answer_late, reached)
         try:
             return await reached
@@ -136,11 +136,11 @@ class GroupCommit:
         """Try once more to write the queue; returns whether that ended before ``ends``, a time of the event loop."""
         closed = self._closed = self._loop.create_future()
         match self._state:
-            case _State.WRITING:
-                self._state = _State.DRAINING
-            case _State.LINGERING | _State.PAUSING:
-                self._begin(_State.FINISHING)
-            case _State.IDLE | _State.CLOSED:
+            case _CommitState.WRITING:
+                self._state = _CommitState.DRAINING
+            case _CommitState.LINGERING | _CommitState.PAUSING:
+                self._begin(_CommitState.FINISHING)
+            case _CommitState.IDLE | _CommitState.CLOSED:
                 self._end()
         try:
             async with asyncio.timeout_at(ends):
@@ -151,10 +151,10 @@ class GroupCommit:
         return True
 
     def _linger(self) -> None:
-        self._state = _State.LINGERING
-        self._timer = self._loop.call_later(_LINGER_S, self._begin, _State.WRITING)
+        self._state = _CommitState.LINGERING
+        self._timer = self._loop.call_later(_LINGER_S, self._begin, _CommitState.WRITING)
 
-    def _begin(self, state: _State) -> None:
+    def _begin(self, state: _CommitState) -> None:
         """Begin a transaction of the first changes of the queue."""
         self._stop_timer()
         self._state = state
@@ -182,26 +182,26 @@ class GroupCommit:
         for ticket, reached in self._requests:
             if not reached.done() and (ticket <= self._written or self._failure is not None):
                 reached.set_result(ticket <= self._written)
-        if self._state is _State.WRITING:
+        if self._state is _CommitState.WRITING:
             self._go_on()
         else:
             self._go_on_closing()
 
     def _go_on(self) -> None:
         if self._failure is not None:
-            self._state = _State.PAUSING
-            self._timer = self._loop.call_later(self._pause_s, self._begin, _State.WRITING)
+            self._state = _CommitState.PAUSING
+            self._timer = self._loop.call_later(self._pause_s, self._begin, _CommitState.WRITING)
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
         elif not self._queue:
-            self._state = _State.IDLE
+            self._state = _CommitState.IDLE
         elif any(not reached.done() for _, reached in self._requests):
-            self._begin(_State.WRITING)
+            self._begin(_CommitState.WRITING)
         else:
             self._linger()
 
     def _go_on_closing(self) -> None:
         assert self._closed is not None
-        given_up = self._failure is not None and self._state is _State.FINISHING
+        given_up = self._failure is not None and self._state is _CommitState.FINISHING
         if given_up and self._queue:
             log.error(
                 "the last write to the store failed: %d changes are not on disk, no acknowledged outcome among them",
@@ -210,10 +210,10 @@ class GroupCommit:
         if given_up or not self._queue or self._closed.done():
             self._end()
         else:
-            self._begin(_State.FINISHING)
+            self._begin(_CommitState.FINISHING)
 
     def _end(self) -> None:
-        self._state = _State.CLOSED
+        self._state = _CommitState.CLOSED
         self._stop_timer()
         if self._closed is not None and not self._closed.done():
             self._closed.set_result(None)

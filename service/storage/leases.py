@@ -83,7 +83,7 @@ class LeaseLost(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Owner:
+class LeaseHolder:
     """Another edge that owns a mission: its address, and the seconds until its lease ends unless it is renewed."""
 
     address: str
@@ -100,7 +100,7 @@ class Leases:
         self._engine = engine
         self._owner = str(uuid.uuid4())
 
-    def acquire(self, mission_id: str, address: str, term_s: float) -> int | Owner:
+    def acquire(self, mission_id: str, address: str, term_s: float) -> int | LeaseHolder:
         """Take a lease that is free, or has ended; returns its epoch, or who has it.
 
         An owner whose own lease has ended gets it again with the same epoch as long as nobody else has had it.
@@ -115,15 +115,15 @@ class Leases:
             if epoch is not None:
                 return int(epoch)
             row = db.execute(_OWNER, {"mission_id": mission_id}).one()
-        return Owner(row.address, max(0.0, row.left_s))
+        return LeaseHolder(row.address, max(0.0, row.left_s))
 
-    def owner(self, mission_id: str) -> Owner | None:
+    def owner(self, mission_id: str) -> LeaseHolder | None:
         """Who else has the mission's lease, whether the mission is stored or not; None where nobody has."""
         with self._alone() as db:
             row = db.execute(_OWNER, {"mission_id": mission_id}).first()
         if row is None or row.owner == self._owner or row.left_s <= 0:
             return None
-        return Owner(row.address, row.left_s)
+        return LeaseHolder(row.address, row.left_s)
 
     def renew(self, term_s: float) -> dict[str, int]:
         """Prolong every lease of this owner that has not ended; returns their missions with their epochs."""

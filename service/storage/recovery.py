@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.config.settings import Settings
-from service.mission.events import Decided, Event, Guided, Read, Reported, Settled
+from service.mission.events import Decided, Event, GuidanceChanged, ReadingsMerged, Reported, Settled
 from service.mission.idempotency import Answered
 from service.mission.mission import Mission
 from service.storage.store import StoredMission
@@ -37,9 +37,9 @@ def _replay(mission: Mission, event: Event) -> None:
             sample = mission.apply(outcome, for_training=used_for_training)
             if sample is not None and used_for_training:
                 mission.learn(sample, outcome.cost)
-        case Guided(state):
+        case GuidanceChanged(state):
             mission.restore_guidance(state)
         case Answered():
             mission.idempotent_answers.remember(event)
-        case Read(readings):
+        case ReadingsMerged(readings):
             mission.take_readings(readings)

@@ -1,6 +1,6 @@
 """The store's rows: the SQL that writes changes in one dialect, and the file format of their bytes.
 
-Events and states are MessagePack, with numpy arrays as an extension type. Reading it runs no code.
+Events and states are MessagePack, with numpy arrays as an extension type. Unpacking runs no code.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import sqlalchemy as sa
 
 from service.learning.trust import Advice
 from service.mission.decisions import Pending
-from service.mission.events import AdviserReport, Decided, Event, Guided, Read, Reported, Settled
+from service.mission.events import AdviserReport, Decided, Event, GuidanceChanged, ReadingsMerged, Reported, Settled
 from service.mission.idempotency import Answered
-from service.mission.sensor_readings import Reading
+from service.mission.sensor_readings import PlacedReading
 from service.storage.operations import Change, Checkpoint, Deleted, Entry, Made
 from service.storage.schema import checkpoints, journal, leases, missions
 from shared.wire.schemas import Outcome, SensorColumns, UavState
@@ -124,11 +124,11 @@ def encode(event: Event) -> tuple[Kind, bytes]:
             return "decided", pack([decision._asdict(), attempt, packed])
         case Settled(outcome, used_for_training):
             return "settled", pack([outcome.model_dump(include=_OUTCOME), used_for_training])
-        case Guided(state):
+        case GuidanceChanged(state):
             return "guided", pack(state)
         case Answered(key, digest, answer):
             return "answered", pack([key, digest, answer])
-        case Read(readings):
+        case ReadingsMerged(readings):
             return "read", pack(readings)
 
 
@@ -145,11 +145,11 @@ def decode(kind: str, data: bytes) -> Event:
             case "settled":
                 return Settled(Outcome.model_validate(body[0]), body[1])
             case "guided":
-                return Guided(body)
+                return GuidanceChanged(body)
             case "answered":
                 return Answered(*body)
             case "read":
-                return Read([Reading(*reading) for reading in body])
+                return ReadingsMerged([PlacedReading(*reading) for reading in body])
     except (AttributeError, IndexError, KeyError, TypeError) as damaged:
         raise ValueError(f"damaged event {kind}: {damaged}") from damaged
     raise ValueError(f"unknown event {kind}")

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from shared.kit.compiled import compiled, inlined
-from shared.planning.annealing_arrays import LEVELS, Course, Proposal, Tables
+from shared.planning.annealing_arrays import LEVELS, CurrentPlan, Proposal, Tables
 from shared.planning.annealing_costs import (
     accept,
     begin,
@@ -66,7 +66,7 @@ def _below(count: int) -> int:
 
 @inlined
 def _redraw(
-    tables: Tables, course: Course, new: Proposal, step: int, uav: int, temperature: float, packet: float
+    tables: Tables, current: CurrentPlan, new: Proposal, step: int, uav: int, temperature: float, packet: float
 ) -> None:
     """Draw the sensor of a UAV's step from all that it may collect from, as likely as at this temperature.
 
@@ -81,9 +81,9 @@ def _redraw(
             break
         if not _within(tables, new, step, uav, j):
             continue
-        know_odds(tables, course, new, j, step)
-        know_behind(tables, course, new, j, step)
-        odds, behind = course.odds[j, step, LEVELS:], course.behind[j, step]
+        know_odds(tables, current, new, j, step)
+        know_behind(tables, current, new, j, step)
+        odds, behind = current.odds[j, step, LEVELS:], current.behind[j, step]
         idle = dot(odds, behind[LEVELS:], new.terms)
         levels, chance = tables.moved[uav, at, place, j], tables.chance[uav, at, place, j]
         served = visited(new, odds, behind, idle, levels, chance)
@@ -103,19 +103,19 @@ def _redraw(
 
 @inlined
 def _propose(
-    tables: Tables, course: Course, new: Proposal, step: int, uav: int, temperature: float, kind: float
+    tables: Tables, current: CurrentPlan, new: Proposal, step: int, uav: int, temperature: float, kind: float
 ) -> bool:
     """Draw a change that begins with a UAV's step; returns whether there is one."""
-    steps = len(course.sensor)
+    steps = len(current.sensor)
     if kind < _SHIFT:
-        return _propose_velocity(tables, course, new, step, uav, temperature, kind)
+        return _propose_velocity(tables, current, new, step, uav, temperature, kind)
     # Two UAVs exchange their sensors of a step, or one UAV those of two steps.
     other, then = uav, step
     if np.random.random() < 0.5:
-        other = _below(course.sensor.shape[1])
+        other = _below(current.sensor.shape[1])
     else:
         then = _below(steps)
-    mine, its = course.sensor[step, uav], course.sensor[then, other]
+    mine, its = current.sensor[step, uav], current.sensor[then, other]
     if mine == its or then < tables.fixed[other]:
         return False
     new.sensor[step, uav], new.sensor[then, other] = its, mine
@@ -143,11 +143,11 @@ def _velocity(tables: Tables, now: int) -> int:
 
 @inlined
 def _propose_velocity(
-    tables: Tables, course: Course, new: Proposal, step: int, uav: int, temperature: float, kind: float
+    tables: Tables, current: CurrentPlan, new: Proposal, step: int, uav: int, temperature: float, kind: float
 ) -> bool:
     """Draw another velocity of a UAV's step, alone, with the opposite change at a later step, or for some steps."""
-    steps, drawn = len(course.sensor), _velocity(tables, course.velocity[step, uav])
-    more = drawn - course.velocity[step, uav]
+    steps, drawn = len(current.sensor), _velocity(tables, current.velocity[step, uav])
+    more = drawn - current.velocity[step, uav]
     new.velocity[step, uav] = drawn
     if kind < _RUN:
         for then in range(step + 1, step + 1 + _below(steps - step)):
@@ -164,24 +164,24 @@ def _propose_velocity(
             allowed = allowed or velocity == new.velocity[then, uav]
         if not allowed:
             return False
-    nowhere, place = len(tables.start) - 1, course.place[step, uav] - course.velocity[step, uav]
+    nowhere, place = len(tables.start) - 1, current.place[step, uav] - current.velocity[step, uav]
     anew = _ANEW if np.random.random() < _ANEW else 0.0
     changed = False
     for then in range(step, steps):
         place += new.velocity[then, uav]
-        if place == course.place[then, uav]:
+        if place == current.place[then, uav]:
             continue
         new.place[then, uav], changed = place, True
         j = new.sensor[then, uav]
         if j == nowhere or np.random.random() < anew or not _within(tables, new, then, uav, j):
-            _redraw(tables, course, new, then, uav, temperature, 0.0)
+            _redraw(tables, current, new, then, uav, temperature, 0.0)
     return changed
 
 
 @compiled
 def _anneal(
     tables: Tables,
-    course: Course,
+    current: CurrentPlan,
     new: Proposal,
     best: IntArray,
     least: float,
@@ -196,7 +196,7 @@ def _anneal(
     The temperature is ``hot`` at step 0 and falls by the factor ``falls`` a step.
     """
     np.random.seed(seed)
-    steps, uavs = course.sensor.shape
+    steps, uavs = current.sensor.shape
     temperature = hot * falls**first
     for turn in range(first, last):
         if turn % _SAME_TEMPERATURE == 0:
@@ -204,42 +204,42 @@ def _anneal(
         uav, step = _below(uavs), _below(steps)
         if step < tables.fixed[uav]:
             continue
-        copy(course, new)
+        copy(current, new)
         kind = np.random.random()
         if kind < _SENSOR:
-            _redraw(tables, course, new, step, uav, temperature, 0.0)
-            if new.sensor[step, uav] == course.sensor[step, uav]:
+            _redraw(tables, current, new, step, uav, temperature, 0.0)
+            if new.sensor[step, uav] == current.sensor[step, uav]:
                 continue
-        elif not _propose(tables, course, new, step, uav, temperature, kind):
+        elif not _propose(tables, current, new, step, uav, temperature, kind):
             continue
-        more = gain(tables, course, new)
+        more = gain(tables, current, new)
         if kind >= _SENSOR and more > 0.0 and np.random.random() >= np.exp(-more / temperature):
             continue
-        accept(tables, course, new)
-        cost = total(course.cost)
+        accept(tables, current, new)
+        cost = total(current.cost)
         if cost < least - 1e-6:
             least = cost
             for row in range(steps):
                 for column in range(uavs):
-                    best[row, column, 0] = course.sensor[row, column]
-                    best[row, column, 1] = course.velocity[row, column]
+                    best[row, column, 0] = current.sensor[row, column]
+                    best[row, column, 1] = current.velocity[row, column]
     return least
 
 
 @compiled
-def _settle(tables: Tables, course: Course, new: Proposal, best: IntArray) -> float:
+def _settle(tables: Tables, current: CurrentPlan, new: Proposal, best: IntArray) -> float:
     """Let each step collect the most packets of what saves the same; write the sensors and return the plan's cost."""
-    steps, uavs = course.sensor.shape
+    steps, uavs = current.sensor.shape
     for step in range(steps):
         for uav in range(uavs):
             if step < tables.fixed[uav]:
                 continue
-            copy(course, new)
-            _redraw(tables, course, new, step, uav, 1e-9, _PACKET)
-            if new.sensor[step, uav] != course.sensor[step, uav] and gain(tables, course, new) <= _PACKET:
-                accept(tables, course, new)
-            best[step, uav, 0] = course.sensor[step, uav]
-    return total(course.cost)
+            copy(current, new)
+            _redraw(tables, current, new, step, uav, 1e-9, _PACKET)
+            if new.sensor[step, uav] != current.sensor[step, uav] and gain(tables, current, new) <= _PACKET:
+                accept(tables, current, new)
+            best[step, uav, 0] = current.sensor[step, uav]
+    return total(current.cost)
 
 
 class Annealing:
@@ -254,14 +254,14 @@ class Annealing:
 
     def priced(self, actions: IntArray) -> Found:
         """What actions ``(H, I, 2)`` are expected to lose."""
-        course, _ = self._begun(actions)
-        return Found(actions, float(course.cost.sum()))
+        current, _ = self._begun(actions)
+        return Found(actions, float(current.cost.sum()))
 
-    def _begun(self, actions: IntArray) -> tuple[Course, Proposal]:
-        course, new = Course.empty(self._tables), Proposal.empty(self._tables)
-        course.sensor[:], course.velocity[:] = actions[:, :, 0], actions[:, :, 1]
-        begin(self._tables, course, new)
-        return course, new
+    def _begun(self, actions: IntArray) -> tuple[CurrentPlan, Proposal]:
+        current, new = CurrentPlan.empty(self._tables), Proposal.empty(self._tables)
+        current.sensor[:], current.velocity[:] = actions[:, :, 0], actions[:, :, 1]
+        begin(self._tables, current, new)
+        return current, new
 
     def search(self, start: IntArray, hot: float, number: int = 0, until: float = math.inf) -> Found:
         """The best actions of one run of 5,000 changes, at least as good as its start. Threads may search at a time.
@@ -272,16 +272,16 @@ class Annealing:
             number: of the run; each draws other changes.
             until: a time of ``time.perf_counter`` at which the run ends; its plan then depends on the machine.
         """
-        course, new = self._begun(start)
-        least, best = float(course.cost.sum()), start.copy()
+        current, new = self._begun(start)
+        least, best = float(current.cost.sum()), start.copy()
         falls = (_COLD / hot) ** (1.0 / _CHANGES)
         for first in range(0, _CHANGES, _AT_ONCE):
             if time.perf_counter() > until:
                 break
             last, seed = min(first + _AT_ONCE, _CHANGES), _CHANGES * number + first
-            least = _anneal(self._tables, course, new, best, least, first, last, hot, falls, seed)
-        course, new = self._begun(best)
-        return Found(best, _settle(self._tables, course, new, best))
+            least = _anneal(self._tables, current, new, best, least, first, last, hot, falls, seed)
+        current, new = self._begun(best)
+        return Found(best, _settle(self._tables, current, new, best))
 
 
 def warm_up() -> None:

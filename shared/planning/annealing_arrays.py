@@ -101,7 +101,7 @@ class Tables(NamedTuple):
         )
 
 
-class Course(NamedTuple):
+class CurrentPlan(NamedTuple):
     """A plan's actions, and what is expected of each sensor under them.
 
     Attributes:
@@ -148,11 +148,11 @@ class Course(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """A changed plan, as far as it differs from the course: room that each change writes anew.
+    """A changed plan, as far as it differs from the current plan: room that each change writes anew.
 
     Attributes:
-        sensor, velocity, place: as of :class:`Course`.
-        stage, cost: as of :class:`Course`, of the sensors touched.
+        sensor, velocity, place: as of :class:`CurrentPlan`.
+        stage, cost: as of :class:`CurrentPlan`, of the sensors touched.
         first, last: shape ``(J,)``, the first and the last changed step of each sensor touched, else H and -1; H is
             after the horizon.
         odds: shape ``(2, 3 Q)``, for computing; before and after the levels zeros.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from shared.kit.compiled import compiled, inlined
-from shared.planning.annealing_arrays import LEVELS, Course, Proposal, Tables
+from shared.planning.annealing_arrays import LEVELS, CurrentPlan, Proposal, Tables
 from shared.planning.queue_chains import Floats
 from shared.world.channel import IntArray
 
@@ -137,20 +137,20 @@ def lateness(tables: Tables, sensor: IntArray, place: IntArray, j: int) -> np.fl
 
 
 @inlined
-def _cost(tables: Tables, course: Course, new: Proposal, j: int) -> np.float32:
+def _cost(tables: Tables, current: CurrentPlan, new: Proposal, j: int) -> np.float32:
     """The cost of a sensor whose visits of its first to its last changed step are the proposal's."""
     steps, first, last = len(tables.lost), new.first[j], new.last[j]
-    know_odds(tables, course, new, j, first)
+    know_odds(tables, current, new, j, first)
     if last < steps:
-        know_behind(tables, course, new, j, last)
+        know_behind(tables, current, new, j, last)
     odds, after = new.odds[0], new.odds[1]
-    _set(odds, course.odds[j, first])
-    paid = course.paid[j, first]
+    _set(odds, current.odds[j, first])
+    paid = current.paid[j, first]
     late = lateness(tables, new.sensor, new.place, j) if len(tables.late) else np.float32(0.0)
     for step in range(first, steps):
         levels, chance = _visitor(tables, new.sensor, new.place, step, j)
         if step == last:
-            behind = course.behind[j, step]
+            behind = current.behind[j, step]
             idle = dot(odds[LEVELS:], behind[LEVELS:], new.terms)
             if levels:
                 idle = visited(new, odds[LEVELS:], behind, idle, levels, chance)
@@ -164,58 +164,58 @@ def _cost(tables: Tables, course: Course, new: Proposal, j: int) -> np.float32:
 
 
 @inlined
-def know_odds(tables: Tables, course: Course, new: Proposal, j: int, until: int) -> None:
+def know_odds(tables: Tables, current: CurrentPlan, new: Proposal, j: int, until: int) -> None:
     """Compute a sensor's odds and losses before each step, up to this one, where they are not known."""
-    for step in range(course.known[j], until):
+    for step in range(current.known[j], until):
         odds = new.odds[0]
-        _set(odds, course.odds[j, step])
-        levels, chance = _visitor(tables, course.sensor, course.place, step, j)
+        _set(odds, current.odds[j, step])
+        levels, chance = _visitor(tables, current.sensor, current.place, step, j)
         if levels:
             _serve(tables, new, odds, levels, chance)
-        course.paid[j, step + 1] = course.paid[j, step] + dot(odds[LEVELS:], tables.lost[step, j], new.terms)
-        _arrive(tables, new, step, j, odds, course.odds[j, step + 1])
-    course.known[j] = max(course.known[j], until)
+        current.paid[j, step + 1] = current.paid[j, step] + dot(odds[LEVELS:], tables.lost[step, j], new.terms)
+        _arrive(tables, new, step, j, odds, current.odds[j, step + 1])
+    current.known[j] = max(current.known[j], until)
 
 
 @inlined
-def know_behind(tables: Tables, course: Course, new: Proposal, j: int, first: int) -> None:
+def know_behind(tables: Tables, current: CurrentPlan, new: Proposal, j: int, first: int) -> None:
     """Compute a sensor's losses to come after each step from this one on, where they are not known."""
     steps, value = len(tables.lost), new.value
-    for step in range(course.unknown[j] - 1, first - 1, -1):
+    for step in range(current.unknown[j] - 1, first - 1, -1):
         if step == steps - 1:
-            _set(value[:LEVELS], tables.ends[course.stage[j], j])
+            _set(value[:LEVELS], tables.ends[current.stage[j], j])
         else:
-            levels, chance = _visitor(tables, course.sensor, course.place, step + 1, j)
-            stays, moves = course.behind[j, step + 1, LEVELS:], course.behind[j, step + 1, LEVELS - levels :]
+            levels, chance = _visitor(tables, current.sensor, current.place, step + 1, j)
+            stays, moves = current.behind[j, step + 1, LEVELS:], current.behind[j, step + 1, LEVELS - levels :]
             for q in range(len(stays)):
                 value[q] = stays[q] + chance * (moves[q] - stays[q])
-        behind, empty = course.behind[j, step, LEVELS:], course.behind[j, step, :LEVELS]
+        behind, empty = current.behind[j, step, LEVELS:], current.behind[j, step, :LEVELS]
         _before_arrivals(tables, step, j, value, behind)
         for q in range(len(empty)):
             empty[q] = behind[0]
-    course.unknown[j] = min(course.unknown[j], first)
+    current.unknown[j] = min(current.unknown[j], first)
 
 
 @compiled
-def begin(tables: Tables, course: Course, new: Proposal) -> None:
-    """Compute a course's places, stages and costs from its sensors and velocities."""
-    steps, uavs = course.sensor.shape
+def begin(tables: Tables, current: CurrentPlan, new: Proposal) -> None:
+    """Compute the current plan's places, stages and costs from its sensors and velocities."""
+    steps, uavs = current.sensor.shape
     for uav in range(uavs):
         summed = 0
         for step in range(steps):
-            summed += course.velocity[step, uav]
-            course.place[step, uav] = summed
-    for j in range(len(course.cost)):
-        course.stage[j] = _stage(tables, course.place, j)
-        course.known[j], course.unknown[j] = 0, steps
-        course.paid[j, 0] = 0.0
-        _set(course.odds[j, 0, LEVELS : 2 * LEVELS], tables.start[j])
-        know_odds(tables, course, new, j, steps)
-        course.cost[j] = course.paid[j, steps] + dot(
-            course.odds[j, steps, LEVELS:], tables.ends[course.stage[j], j], new.terms
+            summed += current.velocity[step, uav]
+            current.place[step, uav] = summed
+    for j in range(len(current.cost)):
+        current.stage[j] = _stage(tables, current.place, j)
+        current.known[j], current.unknown[j] = 0, steps
+        current.paid[j, 0] = 0.0
+        _set(current.odds[j, 0, LEVELS : 2 * LEVELS], tables.start[j])
+        know_odds(tables, current, new, j, steps)
+        current.cost[j] = current.paid[j, steps] + dot(
+            current.odds[j, steps, LEVELS:], tables.ends[current.stage[j], j], new.terms
         )
         if len(tables.late):
-            course.cost[j] += lateness(tables, course.sensor, course.place, j)
+            current.cost[j] += lateness(tables, current.sensor, current.place, j)
 
 
 @inlined
@@ -234,9 +234,9 @@ def _touch(new: Proposal, j: int, step: int) -> None:
 
 
 @inlined
-def gain(tables: Tables, course: Course, new: Proposal) -> np.float32:
-    """The cost of a proposal above the course's; it writes the costs of the sensors touched."""
-    steps, uavs = course.sensor.shape
+def gain(tables: Tables, current: CurrentPlan, new: Proposal) -> np.float32:
+    """The cost of a proposal above the current plan's; it writes the costs of the sensors touched."""
+    steps, uavs = current.sensor.shape
     nowhere = len(tables.start) - 1
     for j in range(nowhere):
         new.first[j] = steps
@@ -244,43 +244,43 @@ def gain(tables: Tables, course: Course, new: Proposal) -> np.float32:
     ends = False
     for step in range(steps):
         for uav in range(uavs):
-            before, now = course.sensor[step, uav], new.sensor[step, uav]
-            if before != now or course.place[step, uav] != new.place[step, uav]:
+            before, now = current.sensor[step, uav], new.sensor[step, uav]
+            if before != now or current.place[step, uav] != new.place[step, uav]:
                 if before != nowhere:
                     _touch(new, before, step)
                 if now != nowhere:
                     _touch(new, now, step)
     for uav in range(uavs):
-        ends = ends or course.place[-1, uav] != new.place[-1, uav]
+        ends = ends or current.place[-1, uav] != new.place[-1, uav]
     total = np.float32(0.0)
     for j in range(nowhere):
-        new.stage[j] = course.stage[j]
+        new.stage[j] = current.stage[j]
         if ends:
             new.stage[j] = _stage(tables, new.place, j)
-            if new.stage[j] != course.stage[j]:
+            if new.stage[j] != current.stage[j]:
                 _touch(new, j, steps)
         if new.last[j] >= 0:
-            new.cost[j] = _cost(tables, course, new, j)
-            total += new.cost[j] - course.cost[j]
+            new.cost[j] = _cost(tables, current, new, j)
+            total += new.cost[j] - current.cost[j]
     return total
 
 
 @inlined
-def copy(course: Course | Proposal, new: Course | Proposal) -> None:
+def copy(current: CurrentPlan | Proposal, new: CurrentPlan | Proposal) -> None:
     """Write actions over others."""
-    for step in range(course.sensor.shape[0]):
-        for uav in range(course.sensor.shape[1]):
-            new.sensor[step, uav] = course.sensor[step, uav]
-            new.velocity[step, uav] = course.velocity[step, uav]
-            new.place[step, uav] = course.place[step, uav]
+    for step in range(current.sensor.shape[0]):
+        for uav in range(current.sensor.shape[1]):
+            new.sensor[step, uav] = current.sensor[step, uav]
+            new.velocity[step, uav] = current.velocity[step, uav]
+            new.place[step, uav] = current.place[step, uav]
 
 
 @inlined
-def accept(tables: Tables, course: Course, new: Proposal) -> None:
+def accept(tables: Tables, current: CurrentPlan, new: Proposal) -> None:
     """Take a proposal whose costs are computed."""
-    copy(new, course)
+    copy(new, current)
     for j in range(len(tables.start) - 1):
         if new.last[j] >= 0:
-            course.stage[j], course.cost[j] = new.stage[j], new.cost[j]
-            course.known[j] = min(course.known[j], new.first[j])
-            course.unknown[j] = max(course.unknown[j], new.last[j])
+            current.stage[j], current.cost[j] = new.stage[j], new.cost[j]
+            current.known[j] = min(current.known[j], new.first[j])
+            current.unknown[j] = max(current.unknown[j], new.last[j])

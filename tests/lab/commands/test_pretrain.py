@@ -8,7 +8,7 @@ import torch
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
 from lab.training.reward import Reward
-from lab.training.rollout_examples import Batch, Example, replay
+from lab.training.rollout_examples import Example, ExampleBatch, replay
 from lab.training.teacher_agreement import recall, references
 from lab.training.training_loop import losses
 from service.learning import initial_weights as checkpoints
@@ -75,7 +75,7 @@ def test_a_scenario_with_a_lower_speed_limit_takes_the_levels_that_it_has(featur
 @pytest.mark.parametrize("features", ["paper", "reach"])
 def test_a_batch_loses_what_its_examples_lose_one_by_one(features: Features, untaught: list[RolloutStep]) -> None:
     examples, modules = held_out(untaught, features)[:40], Modules(features, 15, seed=0)
-    regression, _ = losses(modules, Batch.of(examples))
+    regression, _ = losses(modules, ExampleBatch.of(examples))
     alone = [modules.loss(example.sample, example.reward).item() for example in examples]
     assert len({len(example.sample.features) for example in examples}) > 1
     assert regression.item() == pytest.approx(sum(alone) / len(alone), rel=1e-4)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lab.experiments.claims import WITH_ADAPTER, Finding, Verdict, judge, judge_with_adapter
+from lab.experiments.claims import WITH_ADAPTER, ClaimFinding, Verdict, judge, judge_with_adapter
 from lab.experiments.evidence import beats_chance, difference, settled_at
 from lab.experiments.result import Result, Sweep
 from tests.lab.experiments.made_results import interval, result, zero_from
@@ -14,7 +14,7 @@ from tests.lab.experiments.made_results import interval, result, zero_from
 REPRODUCED, NOT, APART = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_COMPARABLE
 
 
-def finding(stated: str, *results: Result) -> Finding:
+def finding(stated: str, *results: Result) -> ClaimFinding:
     [found] = [f for f in judge({r.experiment: r for r in results}) if stated in f.stated]
     return found
 

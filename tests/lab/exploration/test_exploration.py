@@ -9,7 +9,7 @@ import pytest
 
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import RolloutStep
-from lab.exploration.teachers import TEACHERS, Clairvoyant, Planner, TeacherName
+from lab.exploration.teachers import TEACHERS, ClairvoyantTeacher, PlannerTeacher, TeacherName
 from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.client.errors import EdgeError
 from shared.world.scenario import SCENARIOS
@@ -76,11 +76,11 @@ def test_a_fleet_mostly_follows_its_teacher_and_sometimes_deviates(
 def test_a_planner_learns_from_every_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     learned: list[tuple[int, int, bool]] = []
 
-    def learn(planner: Planner, uav: int, step: int, failed: bool) -> None:
+    def learn(planner: PlannerTeacher, uav: int, step: int, failed: bool) -> None:
         learned.append((uav, step, failed))
         planner.belief.settle(uav, step, failed)
 
-    monkeypatch.setattr(Planner, "learn", learn)
+    monkeypatch.setattr(PlannerTeacher, "learn", learn)
     steps = list(explore(SHORT, 8, "planner"))
     assert learned == [(step.request.uav_id, step.request.step, step.failed) for step in steps]
     assert {failed for _, _, failed in learned} == {True, False}
@@ -95,7 +95,7 @@ def test_a_planner_has_references_after_deviations_too() -> None:
 
 @pytest.mark.long
 def test_a_planner_without_deviations_is_the_policy_mpc(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Planner, "deviations", 0.0)
+    monkeypatch.setattr(PlannerTeacher, "deviations", 0.0)
     steps = list(explore(SHORT, 8, "planner"))
     alone = rollout(PipelineWorld(SHORT), policy_named("mpc"), FIRST_TRAINING_SEED + 8)
     assert all(flown_as_advised(step) for step in steps)
@@ -103,7 +103,7 @@ def test_a_planner_without_deviations_is_the_policy_mpc(monkeypatch: pytest.Monk
 
 
 def test_a_clairvoyant_without_deviations_flies_one_almost_optimal_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Clairvoyant, "deviations", 0.0)
+    monkeypatch.setattr(ClairvoyantTeacher, "deviations", 0.0)
     steps = list(explore(SHORT, 9, "clairvoyant"))
     assert all(flown_as_advised(step) for step in steps)
     bound = clairvoyant(Site(SHORT), FIRST_TRAINING_SEED + 9, time_limit_s=20, workers=1)
@@ -111,7 +111,7 @@ def test_a_clairvoyant_without_deviations_flies_one_almost_optimal_plan(monkeypa
 
 
 def test_a_clairvoyant_has_no_reference_during_deviations_and_plans_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Clairvoyant, "deviations", 0.6)
+    monkeypatch.setattr(ClairvoyantTeacher, "deviations", 0.6)
     steps = list(explore(SHORT, 8, "clairvoyant"))
     silent = {step.request.step for step in steps if step.reference is None}
     assert silent

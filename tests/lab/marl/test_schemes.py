@@ -11,7 +11,7 @@ from torch import nn
 
 from lab.marl import madqn, mappo
 from lab.marl.evaluate import lost_packets
-from lab.marl.training import Learner
+from lab.marl.training import MarlScheme
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
@@ -20,11 +20,11 @@ from simulator.world.environment import PipelineWorld
 pytestmark = pytest.mark.long
 
 PAPER = SCENARIOS["paper"]
-MAKE: dict[str, Callable[[Scenario, int, int], Learner]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
+MAKE: dict[str, Callable[[Scenario, int, int], MarlScheme]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
 
 
 @pytest.fixture(params=["madqn", "mappo"])
-def learner(request: pytest.FixtureRequest) -> Learner:
+def learner(request: pytest.FixtureRequest) -> MarlScheme:
     torch.manual_seed(0)
     return MAKE[request.param](PAPER, 120, 5_000_000)
 
@@ -35,7 +35,7 @@ def test_the_table_of_the_paper() -> None:
     assert (mappo.LEARNING_RATE, mappo.CLIP, mappo.ENTROPY, mappo.VALUE, mappo.EPOCHS) == (3e-4, 0.2, 0.01, 0.5, 4)
 
 
-def test_a_trunk_of_400_and_300_with_a_head_of_sensors_and_one_of_velocities(learner: Learner) -> None:
+def test_a_trunk_of_400_and_300_with_a_head_of_sensors_and_one_of_velocities(learner: MarlScheme) -> None:
     layers = [layer for layer in learner.network.modules() if isinstance(layer, nn.Linear)]
     assert [layer.out_features for layer in layers] == [400, 300, 10 + 15]
 
@@ -64,7 +64,7 @@ def test_the_target_follows_every_third_iteration_by_tau() -> None:
         torch.testing.assert_close(value, before[name] + 0.005 * (online[name] - before[name]))
 
 
-def test_a_round_moves_the_weights_and_leaves_a_finite_loss(learner: Learner) -> None:
+def test_a_round_moves_the_weights_and_leaves_a_finite_loss(learner: MarlScheme) -> None:
     before = [value.clone() for value in learner.network.state_dict().values()]
     flown = learner.round()
     after = learner.network.state_dict().values()

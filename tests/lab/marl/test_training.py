@@ -13,8 +13,8 @@ from torch import Tensor
 
 from lab.marl import checkpoint, madqn, mappo
 from lab.marl.curve import Point, plot, read_csv, write_csv
-from lab.marl.plan import STATE, Plan
-from lab.marl.training import _HELD_OUT, Learner, Round, Training
+from lab.marl.plan import STATE, TrainingPlan
+from lab.marl.training import _HELD_OUT, MarlScheme, Round, Training
 from lab.training_seeds import FIRST_TRAINING_SEED
 from shared.world.scenario import Scenario
 from simulator.errors import UsageError
@@ -22,7 +22,7 @@ from simulator.errors import UsageError
 pytestmark = pytest.mark.long
 
 SMALL = Scenario(name="small", sensors=4, uavs=2, steps=6)
-MAKE: dict[str, Callable[[Scenario, int, int], Learner]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
+MAKE: dict[str, Callable[[Scenario, int, int], MarlScheme]] = {"madqn": madqn.Madqn, "mappo": mappo.Mappo}
 ROUNDS = 6
 WORLDS = {"madqn": madqn.WORLDS, "mappo": mappo.WORLDS}
 
@@ -33,11 +33,11 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(madqn, "WARM_UP", 150)
 
 
-def plan_of(scheme: str, seed: int = 0, rounds: int = ROUNDS) -> Plan:
-    return Plan(scheme, SMALL, rounds * WORLDS[scheme], seed, threads=1)
+def plan_of(scheme: str, seed: int = 0, rounds: int = ROUNDS) -> TrainingPlan:
+    return TrainingPlan(scheme, SMALL, rounds * WORLDS[scheme], seed, threads=1)
 
 
-def begun(plan: Plan, out: Path) -> Training:
+def begun(plan: TrainingPlan, out: Path) -> Training:
     return Training(plan, MAKE[plan.scheme], out)
 
 
@@ -45,7 +45,7 @@ def quiet(_: Round) -> None:
     pass
 
 
-def trained(plan: Plan, out: Path) -> dict[str, Tensor]:
+def trained(plan: TrainingPlan, out: Path) -> dict[str, Tensor]:
     training = begun(plan, out)
     training.run(quiet, save_every_s=3600)
     return training.learner.network.state_dict()
@@ -123,7 +123,7 @@ def test_resuming_from_nothing_or_from_rubbish_is_refused(tmp_path: Path) -> Non
 
 def test_episodes_that_make_no_whole_rounds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--episodes 25 is not a multiple of 10"):
-        begun(Plan("madqn", SMALL, 25, 0, 1), tmp_path)
+        begun(TrainingPlan("madqn", SMALL, 25, 0, 1), tmp_path)
 
 
 def test_a_save_cut_short_leaves_the_state_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import torch
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import Header, Reference, RolloutStep
 from lab.training.reward import Reward, fleet_cost
-from lab.training.rollout_examples import Batch, Example, TeacherDecision, replay
+from lab.training.rollout_examples import Example, ExampleBatch, TeacherDecision, replay
 from lab.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from lab.training.training_loop import losses
 from service.learning.modules import Modules, Sample
@@ -103,7 +103,7 @@ def test_ranking_rewards_the_teachers_sensor_only_where_it_reaches() -> None:
     gradients = []
     for case in (example, beyond):
         modules.zero_grad()
-        _, ranking = losses(modules, Batch.of([case]), temperature=0.05)
+        _, ranking = losses(modules, ExampleBatch.of([case]), temperature=0.05)
         ranking.backward()  # type: ignore[no-untyped-call]
         score = modules.attention.score.weight.grad
         gradients.append(0.0 if score is None else float(torch.linalg.vector_norm(score)))

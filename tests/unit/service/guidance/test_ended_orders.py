@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.mission.events import Guided
+from service.mission.events import GuidanceChanged
 from service.storage.rows import decode
 from tests.e2e.processes import serving_edge
 from tests.support.running import serving
@@ -117,7 +117,7 @@ def test_what_a_confirmation_ends_is_said_before_and_after_and_in_the_journal(ed
             rows = db.execute("SELECT body FROM journal WHERE kind = 'guided' ORDER BY seq DESC LIMIT 2").fetchall()
         db.close()
     events = [decode("guided", body) for (body,) in rows]
-    written = [(event.state["begun"], event.state["ended"]) for event in events if isinstance(event, Guided)]
+    written = [(event.state["begun"], event.state["ended"]) for event in events if isinstance(event, GuidanceChanged)]
     assert written == [(own["begun"], own["ended"]), (told["begun"], told["ended"])]
 
 

@@ -126,13 +126,13 @@ def test_one_uav_decides_from_what_another_heard(edge: Edge) -> None:
 
 def test_a_batch_is_planned_at_once_from_all_reports(edge: Edge, monkeypatch: pytest.MonkeyPatch) -> None:
     plans = []
-    real = planner.Planner.plan
+    real = planner.MissionPlanner.plan
 
-    async def counted(self: planner.Planner, uavs: Any, *args: Any) -> None:
+    async def counted(self: planner.MissionPlanner, uavs: Any, *args: Any) -> None:
         plans.append(list(uavs))
         await real(self, uavs, *args)
 
-    monkeypatch.setattr(planner.Planner, "plan", counted)
+    monkeypatch.setattr(planner.MissionPlanner, "plan", counted)
     client = edge(mode="policy", planner_ms=60_000)
     client.put("/missions/test", json={"scenario": SHORT.model_dump(mode="json")})
     world = PipelineWorld(SHORT)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from service.errors import Refused
-from service.mission.events import Event, Read
+from service.mission.events import Event, ReadingsMerged
 from service.mission.mission import Mission
 from service.mission.mission_status import status_of
 from shared.wire.readings import SensorReading
@@ -159,5 +159,5 @@ def test_only_what_changes_the_belief_is_an_event() -> None:
     m.record = events.append
     for _ in range(3):
         m.read([reading(step=5, message_id="a"), reading(sensor_id=0, step=5)])
-    assert [[r.sensor_id for r in event.readings] for event in events if isinstance(event, Read)] == [[9]]
+    assert [[r.sensor_id for r in event.readings] for event in events if isinstance(event, ReadingsMerged)] == [[9]]
     assert len(events) == 1

@@ -16,7 +16,7 @@ from psycopg.errors import DivisionByZero
 
 from service.config.settings import Settings
 from service.mission.resolved_spec import ResolvedSpec
-from service.storage.leases import LeaseLost, Leases, Owner
+from service.storage.leases import LeaseHolder, LeaseLost, Leases
 from service.storage.locks import StoreUnusable
 from service.storage.operations import Deleted, Made
 from service.storage.schema import SCHEMA
@@ -47,7 +47,7 @@ def expire(store: Store) -> None:
         db.exec_driver_sql("UPDATE leases SET expires_at = clock_timestamp() - interval '1 second'")
 
 
-def acquired(leases: Leases, mission_id: str = "m") -> int | Owner:
+def acquired(leases: Leases, mission_id: str = "m") -> int | LeaseHolder:
     return leases.acquire(mission_id, "http://here:1", TERM_S)
 
 
@@ -66,12 +66,12 @@ def test_a_lease_is_taken_over_only_once_it_has_ended(store: Store, edges: tuple
     one, other = edges
     assert one.acquire("m", "http://one:1", TERM_S) == 1
     refused = acquired(other)
-    assert isinstance(refused, Owner)
+    assert isinstance(refused, LeaseHolder)
     assert refused.address == "http://one:1" and TERM_S - 60 < refused.left_s <= TERM_S
     assert one.taken(["m"]) == set()
     expire(store)
     assert acquired(other) == 2
-    assert isinstance(acquired(one), Owner)
+    assert isinstance(acquired(one), LeaseHolder)
     assert one.taken(["m"]) == {"m"}
 
 
@@ -93,7 +93,7 @@ def test_a_renewal_prolongs_what_has_not_ended_and_revives_nothing(store: Store,
     assert (acquired(one, "a"), acquired(one, "b"), acquired(other, "others")) == (1, 1, 1)
     assert one.renew(TERM_S) == {"a": 1, "b": 1}
     assert acquired(other, "ended") == 2
-    assert isinstance(acquired(other, "a"), Owner)
+    assert isinstance(acquired(other, "a"), LeaseHolder)
 
 
 def test_a_released_lease_is_free_and_keeps_its_epoch(store: Store, edges: tuple[Leases, Leases]) -> None:
@@ -110,14 +110,14 @@ def test_of_two_edges_that_take_a_lease_at_once_exactly_one_gets_it(store: Store
     edges = [Leases(store._engine) for _ in range(4)]
     start = threading.Barrier(len(edges))
 
-    def take(leases: Leases, name: str) -> int | Owner:
+    def take(leases: Leases, name: str) -> int | LeaseHolder:
         start.wait(60)
         return acquired(leases, name)
 
     with ThreadPoolExecutor(len(edges)) as pool:
         for attempt in range(20):
             answers = list(pool.map(take, edges, [f"m{attempt}"] * len(edges)))
-            assert answers.count(1) == 1 and sum(isinstance(answer, Owner) for answer in answers) == 3
+            assert answers.count(1) == 1 and sum(isinstance(answer, LeaseHolder) for answer in answers) == 3
 
 
 def test_the_fence_stops_whom_another_owner_has_followed(store: Store, edges: tuple[Leases, Leases]) -> None:
@@ -159,7 +159,7 @@ def test_an_owner_that_stops_in_the_midst_of_a_transaction_does_not_keep_others_
     expire(store)
     with pytest.raises(sa.exc.DBAPIError, match="idle-in-transaction"), store._engine.begin() as db:
         fence(db, one, 1)
-        answer: int | Owner | None = None
+        answer: int | LeaseHolder | None = None
         while answer is None:
             try:
                 answer = acquired(other)
