@@ -116,7 +116,7 @@ def same(given: Guidance | None, meant: Guidance | None) -> bool:
     return (
         np.array_equal(given.allowed(levels), meant.allowed(levels))
         and np.array_equal(given.weights(most), meant.weights(most))
-        and np.array_equal(given.every(most), meant.every(most))
+        and np.array_equal(given.visit_intervals(most), meant.visit_intervals(most))
     )
 
 

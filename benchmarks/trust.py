@@ -90,7 +90,7 @@ class Pilot(EdgePilot):
         """The edge's choice."""
         self._echo.answer = self.planner.decide(uav, observation, taken)
         choice = super().decide(uav, observation, taken)
-        self.planner.belief.tell(uav, int(observation["step"][0]), choice.sensor, choice.velocity)
+        self.planner.belief.record_decision(uav, int(observation["step"][0]), choice.sensor, choice.velocity)
         guided = None if choice.exchange is None else choice.exchange.response.guided
         if guided is not None:
             self.trust.append(guided.trust["llm"])

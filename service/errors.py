@@ -1,4 +1,4 @@
-"""Why the edge does not do what it is asked to; ``api/`` makes problem documents of these."""
+"""Refusals of requests, which ``api/`` turns into problem documents."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from shared.wire.problem import INCOMPLETE
 
 
 class Refused(Exception):
-    """A request that cannot be served as it is; nothing was recorded for it."""
+    """A request that cannot be served; nothing was recorded for it."""
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY
     type = "about:blank"
@@ -26,29 +26,29 @@ class NotFound(Refused):
 
 
 class Conflict(Refused):
-    """The request contradicts what is there."""
+    """The request contradicts the present state."""
 
     status = HTTPStatus.CONFLICT
 
 
 class Incomplete(Conflict):
-    """The request leaves out what the edge does not hold: to be sent again in full."""
+    """The request omits data that the edge does not have: the client is to send it in full."""
 
     type = INCOMPLETE
 
 
 class Unavailable(Refused):
-    """The request is right, and the edge cannot serve it now, or not for sure: to be sent again."""
+    """The edge cannot serve a valid request now, or cannot confirm it: the client is to send it again."""
 
     status = HTTPStatus.SERVICE_UNAVAILABLE
 
 
 class Misdirected(Refused):
-    """Another edge owns the mission: the request is to be sent there.
+    """Another edge owns the mission: the client is to send the request there.
 
     Attributes:
         owner: that edge's URL; None where it gave none.
-        retry_s: seconds until its lease ends, unless it is renewed. From then on any edge may take the mission over.
+        retry_s: seconds until its lease ends, unless it is renewed. After that any edge may take over the mission.
     """
 
     status = HTTPStatus.MISDIRECTED_REQUEST

@@ -9,7 +9,7 @@ from itertools import accumulate
 import numpy as np
 
 from lab.experiments.flight import DecisionRecord, FlightRecord, TokenCounts
-from shared.planning.visit_deadlines import judged
+from shared.planning.visit_deadlines import count_deadlines
 from simulator.records.statistics import jain_index
 
 # Prefixes of the reasons of decisions taken because the LLM gave none. `no_candidate` is none of them, since the LLM
@@ -78,7 +78,7 @@ def _deadlines_met(flight: FlightRecord) -> float | None:
     for wish in flight.meant.sensors if flight.meant is not None else []:
         if wish.visit_every is not None:
             served = {d.step for d in flight.decisions if d.sensor == wish.sensor_id and not d.failed}
-            kept, missed = judged(wish.visit_every, 0, flight.steps - 1, served)
+            kept, missed = count_deadlines(wish.visit_every, 0, flight.steps - 1, served)
             met, total = met + kept, total + kept + missed
     return 100 * met / total if total else None
 

@@ -62,7 +62,7 @@ class PlannerTeacher(RecedingHorizonPolicy):
 
     def flown(self, uav: int, step: int, action: Action) -> None:
         """Fix the action for later plans."""
-        self.belief.tell(uav, step, *action)
+        self.belief.record_decision(uav, step, *action)
 
 
 class ClairvoyantTeacher:

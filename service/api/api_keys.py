@@ -30,7 +30,7 @@ Scope = Literal["decide", "admin", "readings"]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 _PREFIX = "aicvds_"
-# Seconds between two checks whether the file has changed.
+# Seconds between checks for changes of the file.
 _STALE_S = 1.0
 MOST_KEYS = 1000
 
@@ -107,7 +107,7 @@ class KeyFile(BaseModel):
 
 @contextmanager
 def editing(path: Path) -> Iterator[KeyFile]:
-    """The file's keys to change, under a lock, written at the end. Raises ``BadKeys``."""
+    """The file's keys for changes, locked, and written back at the end. Raises ``BadKeys``."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = path.with_name(f".{path.name}.lock").open("w")

@@ -61,7 +61,6 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         app.state.engine = engine
         llm.start()
         try:
-            # Beside the LLM, which loads meanwhile.
             await asyncio.to_thread(load_for_event_loop)
             yield {"engine": engine, "llm": llm, "metrics": metrics}
         finally:

@@ -20,7 +20,7 @@ _OPEN = frozenset(("/healthz", "/readyz", "/"))
 _OPEN_PREFIX = "/static/"
 _ATTENTION = re.compile(r"/missions/[^/]+/attention")
 _READINGS = re.compile(r"/missions/[^/]+/readings")
-# Counts of a key's requests that may be in memory: of this minute, the one before, and those that are over.
+# Counters of a key in memory: of this minute, the previous one, and expired ones.
 _COUNTS_A_KEY = 4
 # The ASGI scope's entry with the scopes of the request's key.
 SCOPES = "aicvds.scopes"
@@ -29,7 +29,7 @@ STILL_KNOWN = "aicvds.still_known"
 
 
 def scope_of(method: str, path: str) -> Scope | None:
-    """The scope that a key needs for a request; None where no key is needed, or any key may read."""
+    """The scope that a request needs; None if no key is needed, or any key may read."""
     if method in READING:
         # UAVs that prune their reports need the weights, so the scope `decide` is required.
         return "decide" if _ATTENTION.fullmatch(path) else None
@@ -40,7 +40,7 @@ def scope_of(method: str, path: str) -> Scope | None:
 
 def is_open(method: str, path: str) -> bool:
     """Whether the request needs no key."""
-    # Other methods need a key: their bodies would be read for nothing.
+    # Other methods need a key, so that their bodies are not read in vain.
     return method in READING and (path in _OPEN or path.startswith(_OPEN_PREFIX))
 
 
@@ -76,7 +76,7 @@ class KeyAuthentication:
             scope[STILL_KNOWN] = lambda: self._keys.find(presented) is not None
             await self.app(scope, receive, send)
             return
-        # The connection ends, so that the server does not wait for the rest of the request.
+        # The connection is closed, so that the server does not wait for the rest of the request.
         refusal.headers["Connection"] = "close"
         await refusal(scope, receive, send)
 
@@ -86,7 +86,7 @@ class KeyAuthentication:
         if limiter is None:
             window, quota = RateLimiterType.SLIDING_WINDOW.value, per_min(key.per_minute)
             limiter = self._limiters[key.per_minute] = Throttled(using=window, quota=quota, store=self._counts)
-        # A key whose rate was changed begins anew.
+        # A key whose rate was changed gets a new counter.
         found = limiter.limit(f"{key.name}:{key.per_minute}")
         return max(1, math.ceil(found.state.retry_after)) if found.limited else None
 

@@ -39,7 +39,7 @@ _KEY_CHECK_S = 1.0
 
 
 class Assets(StaticFiles):
-    """The page, its scripts and styles, sent from memory: a client that does not read keeps no file open."""
+    """The page, its scripts and styles, sent from memory: a slow client keeps no file open."""
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         response = await super().get_response(path, scope)
@@ -76,7 +76,7 @@ class EventStream(StreamingResponse):
             async with self._live.sending():
                 await send(message)
 
-        # The events are closed at once, so that none are made for a closed page.
+        # Closed immediately, so that no events are made for a closed page.
         with suppress(TimeoutError):
             async with aclosing(self._events):
                 await super().stream_response(in_time)
@@ -110,7 +110,7 @@ async def page(request: Request) -> Response:
 async def list_missions(engine: TheEngine, request: Request) -> MissionList:
     """The missions of this edge: the one that decided last first, those that are only in the store last.
 
-    Of a store that several edges share, the missions of the others are left out.
+    In a shared store, other edges' missions are left out.
     """
     missions = engine.missions
     loaded = {mission.mission_id: mission for mission in missions.loaded}
@@ -131,12 +131,13 @@ async def list_missions(engine: TheEngine, request: Request) -> MissionList:
     )
 
 
-# Not in the schema: it does not end, and describes itself by its first event.
+# Not in the schema: an endless stream, which its first event describes.
 @router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_listener)])
 async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
     """A mission's events: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
 
-    :mod:`service.live.snapshots` makes them. Comments come while nothing happens; a slow listener gets a snapshot.
+    :mod:`service.live.snapshots` makes them. Comments are sent while there are no events; a slow listener gets a
+    snapshot.
     """
     mission = await engine.missions.get(mission_id)
     still_known: Callable[[], bool] = request.scope.get(STILL_KNOWN, lambda: True)
@@ -145,7 +146,7 @@ async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> 
 
 @router.get("/missions/{mission_id}/decisions/{decision_id}/prompt", responses=documented(404, 422), tags=["decisions"])
 async def get_prompt(mission_id: MissionId, decision_id: DecisionId, engine: TheEngine) -> DecisionPrompt:
-    """The prompt by which a decision was made; only those of the newest decisions are kept, and not over a restart."""
+    """A decision's prompt; only those of the newest decisions are kept, and a restart drops them."""
     decision = engine.live.history.find(mission_id, decision_id)
     if decision is None or decision.prompt is None:
         raise NotFound("decision_id", f"the prompt of decision {decision_id} is unknown or forgotten")

@@ -18,7 +18,7 @@ READING = ("GET", "HEAD")
 _NEVER_REFUSED = frozenset(("/healthz", "/readyz", "/metrics"))
 # A page's stream lasts as long as the page and has a limit of its own.
 _STREAMS = re.compile(r"/missions/[^/]+/events")
-# A body that is still on its way counts against the limit of concurrent requests.
+# While a body arrives, its request counts against the limit of concurrent requests.
 _BODY_S = 10.0
 
 
@@ -34,7 +34,7 @@ class RequestLimits:
     """Pure ASGI middleware: bounds the requests at once, and reads their bodies.
 
     Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics and
-    the streams of pages do not count. Nor does a request once its answer begins, which its client may take slowly. It
+    the streams of pages do not count. A request counts until its answer begins, because a client may read slowly. It
     reads a body up to ``limit`` bytes and decodes ``Content-Encoding: gzip | zstd``. It answers 413 past the limit, 408
     for a body that takes longer than 10 s, 415 for another encoding and 400 for a damaged body. Each refusal is a
     problem document.
@@ -85,7 +85,7 @@ class RequestLimits:
             self._running -= counts
 
     async def _body(self, scope: Scope, receive: Receive, send: Send) -> bytes | None:
-        """The decoded body, which the scope's headers then describe; None where there is nothing to answer any more."""
+        """The decoded body, to which the scope's headers are adapted; None if the request is already answered."""
         headers = {name.lower(): value for name, value in scope["headers"]}
         encoding = headers.get(b"content-encoding", b"identity").decode("latin-1").strip().lower()
         if encoding not in _DECODERS and encoding not in _PLAIN:

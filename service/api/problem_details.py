@@ -42,7 +42,7 @@ _REQUESTS = (
     *(MissionSpec, PromptStyle, Scenario, GuidanceAnswer, Guidance, SensorWish),
     *(ReadingsRequest, SensorReading),
 )
-# The names of all fields that a request may have: one of them may be meant by a name that is none.
+# The names of all request fields, for suggestions for unknown names.
 _NAMES = sorted({name for model in _REQUESTS for name in model.model_fields})
 # The `Retry-After` of a request that cannot be served now.
 _RETRY_S = 1
@@ -64,7 +64,7 @@ def problem_response(
 
 def documented(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries for the problems of a route."""
-    # Every status has dicts of its own: its example is put into them.
+    # Each status needs its own dicts, because its example is added to them.
     return {
         status: {
             "description": HTTPStatus(status).phrase,
@@ -89,7 +89,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
-        # The deepest fault comes first: it is of the branch of a union that nearly fits.
+        # The deepest fault comes first: it belongs to the best-fitting branch of a union.
         faults = sorted(error.errors()[:20], key=lambda e: -len(e["loc"]))
         if not _sends_json(request) and _path(faults[0]["loc"]) == "body":
             return problem_response(415, "send the body as JSON, with the header Content-Type: application/json")
@@ -126,7 +126,7 @@ def _sends_json(request: Request) -> bool:
 
 
 def _problem(fault: Mapping[str, Any], body: Any) -> str:
-    """A fault in words; of a body that is no JSON, the line and column."""
+    """A fault in words, with the line and column for a body that is not JSON."""
     if fault["type"] != "json_invalid":
         return problem_of(fault, _NAMES)
     reason = str(fault.get("ctx", {}).get("error", "it cannot be read"))

@@ -41,8 +41,8 @@ _KEY, _KEY_PATTERN = "Idempotency-Key", re.compile(r"[\x21-\x7e]{1,64}")
 class DecideRoute(APIRoute):
     """``POST /decide``: it validates a well-formed request itself, from the bytes.
 
-    FastAPI's way to a function's arguments takes several times as long as validating the body. Any other request goes
-    that way, and gets its errors.
+    FastAPI's own handling takes several times as long as validating the body. It handles all other requests, and
+    reports their errors.
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
@@ -99,7 +99,7 @@ KnownTags = Annotated[str | None, Header(alias="If-None-Match", max_length=1000,
     tags=["decisions"],
 )
 async def decide(body: DecideRequest, request: Request, key: RequestKey = None) -> Response:
-    """Which sensor to collect from, and how fast to fly the next step."""
+    """The sensor to collect from, and the velocity of the next step."""
     engine: Engine = request.state.engine
     answer = await engine.decide(body, may_make=may_command(request), key=key)
     timing = {"Server-Timing": ", ".join(f"{k};dur={v}" for k, v in answer.latency_ms.items())}
@@ -117,13 +117,13 @@ async def decide_batch(
 
 @router.post("/feedback", responses=documented(400, 404, 408, 409, 413, 415, 421, 422, 503), tags=["decisions"])
 async def feedback(body: FeedbackRequest, engine: TheEngine) -> FeedbackResponse:
-    """What came of a decision. Sent twice, it is applied once; acknowledged, it is on disk."""
+    """A decision's outcome. A repeated outcome is applied once; an acknowledged outcome is on disk."""
     return await engine.feedback(body)
 
 
 @router.put("/missions/{mission_id}", responses=documented(400, 408, 409, 413, 415, 421, 422, 503), tags=["missions"])
 async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngine) -> MissionStatus:
-    """Make a mission with its scenario, mode, k and the operator's note; the same again changes nothing."""
+    """Make a mission with its scenario, mode, k and the operator's note; a repeated request changes nothing."""
     mission = await engine.missions.put(mission_id, body)
     engine.compiler.compile(mission)
     await engine.durable("mission_id", mission)
@@ -132,7 +132,7 @@ async def put_mission(mission_id: MissionId, body: MissionSpec, engine: TheEngin
 
 @router.get("/missions/{mission_id}", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
 async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus:
-    """Where a mission stands."""
+    """A mission's setup and progress."""
     return status_of(await engine.missions.get(mission_id))
 
 
@@ -140,7 +140,7 @@ async def get_mission(mission_id: MissionId, engine: TheEngine) -> MissionStatus
     "/missions/{mission_id}", status_code=204, responses=documented(404, 409, 421, 422, 503), tags=["missions"]
 )
 async def delete_mission(mission_id: MissionId, engine: TheEngine) -> None:
-    """Forget a mission and what it learned."""
+    """Delete a mission and everything it learned."""
     await engine.delete(mission_id)
 
 
@@ -160,7 +160,7 @@ async def get_attention(
 
 @router.get("/missions/{mission_id}/guidance", responses=documented(404, 409, 421, 422, 503), tags=["missions"])
 async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStatus:
-    """The operator's note, what was understood of it, and whether it is obeyed: only once it is confirmed."""
+    """The operator's note, the guidance from it, and its status; only confirmed guidance is obeyed."""
     return (await engine.missions.get(mission_id)).guidance.report(mission_id)
 
 
@@ -170,9 +170,9 @@ async def get_guidance(mission_id: MissionId, engine: TheEngine) -> GuidanceStat
     tags=["missions"],
 )
 async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: TheEngine) -> GuidanceStatus:
-    """Confirm or reject what was understood, give a structure or a new note, or withdraw the orders in force.
+    """Confirm or reject the proposed guidance, give a structure or a new note, or withdraw the orders in force.
 
-    Only confirmed orders are obeyed. `ends` of the status says which of those in force a confirmation ends.
+    Only confirmed orders are obeyed. The status's `ends` lists the orders in force that a confirmation ends.
     """
     mission = await engine.missions.get(mission_id)
     engine.missions.refuse_if_failing("answer")
@@ -189,21 +189,21 @@ async def post_guidance(mission_id: MissionId, body: GuidanceAnswer, engine: The
     tags=["missions"],
 )
 async def post_readings(mission_id: MissionId, body: ReadingsRequest, engine: TheEngine) -> ReadingsResponse:
-    """What sensors said of themselves over another network: merged into the fleet's belief, by its age."""
+    """Sensors' own readings over another network, merged into the fleet's belief by their age."""
     return await engine.read(mission_id, body)
 
 
 @router.get("/healthz", tags=["operation"])
 async def healthz() -> dict[str, str]:
-    """The process is alive; touches nothing else."""
+    """The process is alive; nothing else is checked."""
     return {"status": "ok"}
 
 
 @router.get("/readyz", responses={503: {"model": Readiness, "description": "not ready"}}, tags=["operation"])
 async def readyz(request: Request, response: Response) -> Readiness:
-    """Decisions can be made: by the policy at once, by the LLM when ``llm`` says ``ready``.
+    """Whether the edge can decide: by the policy immediately, by the LLM when ``llm`` is ``ready``.
 
-    Not ready (503) is an edge that cannot reach the PostgreSQL which it shares with other edges, or whose SQLite file
+    An edge is not ready (503) if it cannot reach the PostgreSQL that it shares with other edges, or if its SQLite file
     was deleted or replaced.
     """
     llm: ServerPool = request.state.llm

@@ -1,4 +1,4 @@
-"""A request and its answer on their way between the ingress and the owners of missions, and whom a request is for."""
+"""Requests and answers between the ingress and the owners of missions, and the routing of requests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.cluster.merging import Answer
 _BY_BODY = frozenset(("/decide", "/decide/batch", "/feedback"))
 _DEFAULT = "default"
 _EVENTS = re.compile(r"/missions/[^/]+/events")
-# The longest that a request may give.
+# The longest deadline of a request.
 _LONGEST_MS = 60_000
 # The entries of an ASGI scope that an application reads, apart from its own.
 _SENT = ("type", "http_version", "method", "scheme", "path", "raw_path", "query_string", "root_path", "headers")
@@ -30,7 +30,7 @@ class Exchanged:
 
     @classmethod
     async def read(cls, scope: Scope, receive: Receive) -> Exchanged:
-        """The request of an ASGI call, whose body somebody has bounded."""
+        """The request of an ASGI call, whose body is already bounded."""
         body = bytearray()
         while True:
             message = await receive()
@@ -40,9 +40,9 @@ class Exchanged:
 
     @property
     def mission_id(self) -> str | None:
-        """The mission that the request is about; None where it names none, or is malformed."""
+        """The mission of the request; None if it names none or is malformed."""
         path: str = self.scope["path"]
-        if self.names_a_decision_alone:
+        if self.lacks_mission:
             return None
         if path in _BY_BODY:
             return _named_in(self.body)
@@ -50,23 +50,23 @@ class Exchanged:
         return rest.partition("/")[0] or None
 
     @property
-    def names_a_decision_alone(self) -> bool:
-        """Whether it is an outcome without a mission: the owner of its decision is to be found."""
+    def lacks_mission(self) -> bool:
+        """Whether it is an outcome without a mission ID, so that every edge is asked for its decision."""
         return self.scope["path"] == "/feedback" and _fields(self.body).get("mission_id") is None
 
     @property
     def asks_for_events(self) -> bool:
-        """Whether its answer is a stream that lasts as long as somebody listens."""
+        """Whether its answer is a stream of events."""
         return self.scope["method"] == "GET" and _EVENTS.fullmatch(self.scope["path"]) is not None
 
     def deadline_s(self, default_s: float) -> float:
-        """Seconds until its sender has no more use for an answer."""
+        """The client's deadline for the answer, seconds."""
         asked = _fields(self.body).get("deadline_ms") if self.scope["path"] in _BY_BODY else None
         return asked / 1e3 if isinstance(asked, int | float) and 0 < asked <= _LONGEST_MS else default_s
 
 
 async def answer_of(app: ASGIApp, request: Exchanged) -> Answer:
-    """What an ASGI application answers."""
+    """The answer of an ASGI application."""
     pending: list[Message] = [{"type": "http.request", "body": request.body, "more_body": False}]
     answer = Answer(500)
 

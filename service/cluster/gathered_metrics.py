@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 
 def gathered(texts: Mapping[str, str]) -> str:
-    """One exposition of several processes' ones, by process, in Prometheus's text format.
+    """Merge several processes' expositions in Prometheus's text format.
 
-    The samples of a metric follow each other after one HELP and one TYPE, as the format demands. A process that is away
-    has no samples: a sum of rates over the others is right, and its counters begin again with it.
+    The samples of a metric follow each other after one HELP and one TYPE, as the format demands. An absent process has
+    no samples: the sum of rates over the others stays right, and its counters restart with it.
     """
     heads, samples = dict[str, list[str]](), dict[str, list[str]]()
     for process, text in texts.items():
@@ -26,7 +26,7 @@ def gathered(texts: Mapping[str, str]) -> str:
 
 
 def _labelled(sample: str, process: str) -> str:
-    """A sample with one label more; no metric's name has a brace or a space."""
+    """A sample with the label ``process``; no metric's name has a brace or a space."""
     name, brace, rest = sample.partition("{")
     if brace and " " not in name:
         return f'{name}{{process="{process}",{rest}'

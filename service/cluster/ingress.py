@@ -1,4 +1,4 @@
-"""The ingress of a cluster: it passes each request on to the edge that owns its mission, and its answer back."""
+"""The ingress of a cluster: it forwards each request to the edge that owns its mission, and returns its answer."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ log = logging.getLogger(__name__)
 _SLACK_S = 0.2
 _CONNECT_S = 1.0
 _REMEMBERED = 10_000
-# Headers of a connection, which the next one has of its own.
+# Headers of one connection, which are not forwarded.
 _OF_A_CONNECTION = frozenset((b"connection", b"content-length", b"date", b"host", b"server", b"transfer-encoding"))
 _WHOLE_EDGE = frozenset((("GET", "/metrics"), ("GET", "/readyz"), ("GET", "/missions")))
 
 
 class OwnersGone(Exception):
-    """The edge that is to answer has died, or does not answer in time."""
+    """The responsible edge has died, or does not answer in time."""
 
 
 class Owners(Protocol):
     """The edges of a cluster; each method raises :class:`OwnersGone` where there is no answer in time."""
 
     async def ask(self, request: Exchanged, within_s: float) -> Answer:
-        """The answer of the edge that the mission's ID leads to; of any, if there is no mission."""
+        """The answer of the edge to which the mission's ID maps; of any edge without a mission."""
         ...
 
     async def ask_all(self, request: Exchanged, within_s: float) -> dict[str, Answer]:
-        """The answer of each edge by its address; of one at least."""
+        """The answers of the edges by address; at least one."""
         ...
 
     async def address(self, mission_id: str | None, within_s: float) -> str:
-        """The URL of the edge that the mission's ID leads to."""
+        """The URL of the edge to which the mission's ID maps."""
         ...
 
 
 class Ingress:
     """An ASGI application; the edge's middleware has bounded the bodies.
 
-    A mission's ID leads to an edge. Where another one has the mission's lease, as after a change in their number, that
-    one is asked at its own address, and is remembered as the owner.
+    A mission's ID maps to an edge. If another edge has the mission's lease, as after a change of their number, the
+    ingress forwards the request to its address, and remembers it as the owner.
     """
 
     def __init__(self, owners: Owners, client: httpx.AsyncClient, deadline_s: float) -> None:
@@ -81,14 +81,14 @@ class Ingress:
         await response(scope, receive, send)
 
     def hurry(self) -> None:
-        """Do nothing: the edges end what is under way."""
+        """Do nothing: the edges finish the requests in progress."""
 
     async def _response(self, request: Exchanged, within_s: float) -> Response:
         if request.asks_for_events:
             return await self._events(request, await self._owners.address(request.mission_id, within_s))
         if (request.scope["method"], request.scope["path"]) in _WHOLE_EDGE:
             return _merged(request.scope["path"], await self._owners.ask_all(request, within_s))
-        if request.names_a_decision_alone:
+        if request.lacks_mission:
             answers = await self._owners.ask_all(request, within_s)
             return _passed_on(min(answers.values(), key=lambda answer: answer.status == 404))
         return _passed_on(await self._answer(request, within_s))
@@ -103,7 +103,7 @@ class Ingress:
                 del self._moved[mission_id]
             except httpx.TransportError as error:
                 del self._moved[mission_id]
-                # It may have made the decision: only the client can know whether to ask again.
+                # The edge may have made the decision, so only the client can decide whether to repeat the request.
                 if not isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
                     raise
         answer = await self._owners.ask(request, within_s)
@@ -124,7 +124,7 @@ class Ingress:
         return Answer(answer.status_code, [*_kept(answer), (b"content-length", b"%d" % len(body))], body)
 
     async def _events(self, request: Exchanged, owner: str) -> Response:
-        """The owner's stream, for as long as somebody listens."""
+        """The owner's stream, until the listener disconnects."""
         answer = await self._sent(request, owner)
         if answer.status_code == 421:
             await answer.aclose()
@@ -143,7 +143,7 @@ class Ingress:
 
 
 def _merged(path: str, answers: dict[str, Answer]) -> Response:
-    """One answer for all edges; what all refuse alike, as a request without a key, is one's refusal."""
+    """One answer for all edges; if all refuse the request, the first refusal."""
     first = next(iter(answers.values()))
     if path == "/readyz":
         return merged_readiness(answers.values(), None)
@@ -175,7 +175,7 @@ def _origin(url: str) -> str:
 
 
 def ingress_application(settings: Settings, owners: Owners, end: Callable[[], None]) -> Starlette:
-    """The application that a server serves as it serves an edge; ``end`` is called in a thread once it has ended."""
+    """The ingress's application; ``end`` is called in a thread when it has ended."""
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:

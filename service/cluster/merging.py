@@ -13,14 +13,14 @@ from service.cluster.gathered_metrics import gathered
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness
 
-# When an edge's newest decision was, in its answer to the ingress.
+# The header with the time of an edge's newest decision.
 DECIDED_AT = "x-decided-at"
 _MOST_LISTED = 200
 
 
 @dataclass
 class Answer:
-    """An answer that is not sent yet."""
+    """A buffered answer."""
 
     status: int = 0
     headers: list[tuple[bytes, bytes]] = field(default_factory=list)
@@ -50,10 +50,10 @@ def merged_metrics(answers: Mapping[str, Answer], own: Answer) -> Response:
 
 
 def merged_readiness(answers: Iterable[Answer], away: str | None) -> Response:
-    """Ready where all are; the LLM is ready where all have reached it.
+    """Ready if all edges are; the LLM is ready if all have reached it.
 
     Args:
-        away: what is missing, if something is; nobody is ready then.
+        away: what is missing, if anything; the cluster is not ready then.
     """
     found = [Readiness.model_validate_json(a.body) for a in answers if a.status in (200, 503)]
     shown = min(found, key=lambda one: (one.ready, one.llm == "ready"))
@@ -63,7 +63,7 @@ def merged_readiness(answers: Iterable[Answer], away: str | None) -> Response:
 
 
 def merged_missions(answers: Iterable[Answer], own: Answer) -> Response:
-    """The missions of all, each edge's in its order, one of each in turn: the one that decided last first.
+    """All edges' missions, interleaved, from the edge that decided last on; each edge's stay in their order.
 
     A mission that is only in the store may be in several lists.
     """

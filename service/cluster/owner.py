@@ -1,4 +1,4 @@
-"""An edge that owns missions: the ordinary one in a process of Ray, with an address of its own."""
+"""An edge that owns missions: an ordinary edge in a Ray process, with its own address."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 class Owner:
-    """One edge, whose requests come from the ingress; those for a mission that moved here come to its own address.
+    """One edge, whose requests come from the ingress; requests for missions that moved here come to its own address.
 
     Args:
-        host: the address at which it listens; None for that of its machine in the cluster.
+        host: the address at which it listens; None for its machine's address in the cluster.
     """
 
     def __init__(self, settings: Settings, host: str | None) -> None:
@@ -40,7 +40,7 @@ class Owner:
         return await answer_of(self._server.gate, request)
 
     async def named_answer(self, request: Exchanged) -> tuple[str, Answer]:
-        """The same with the edge's address, and when it made its newest decision."""
+        """The edge's address and its answer, with the time of its newest decision."""
         answer = await self.answer(request)
         app = self._server.gate.app
         decided_at: float = 0.0 if app is None else app.state.engine.live.history.decided_at
@@ -64,7 +64,7 @@ class Owner:
             raise RuntimeError(f"the edge has ended: {self._server.error}")
 
     async def __del__(self) -> None:
-        # Ray Serve awaits it, and has no other way to end an edge.
+        # Ray Serve awaits this method, and has no other way to end an edge.
         if self._serving is not None:
             self._server.should_exit = True
             await self._serving

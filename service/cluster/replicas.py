@@ -24,7 +24,7 @@ from shared.kit.ray_connection import RayUnusable
 
 _NAME = "aicvds-"
 _ROUTER = "ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
-# Requests at once of an edge, on average, from which on there is another one.
+# The average of concurrent requests for an edge above which another edge is started.
 _ONGOING = 8
 # An edge that is killed is replaced once a health check finds it gone.
 _HEALTH_PERIOD_S, _HEALTH_TIMEOUT_S = 1.0, 10.0
@@ -35,7 +35,7 @@ Answered = TypeVar("Answered")
 
 
 class ServeOwners:
-    """As :class:`service.cluster.ingress.Owners` has it: the replicas of the deployment, by a handle."""
+    """The replicas of a deployment, as :class:`service.cluster.ingress.Owners`."""
 
     def __init__(self, handle: Any) -> None:
         self._handle = handle
@@ -72,13 +72,13 @@ async def _in_time(ask: Callable[[], Awaitable[Answered]], within_s: float) -> A
 def deployed(settings: Settings, host: str | None, least: int, most: int) -> ServeOwners:
     """From ``least`` to ``most`` replicas, by load, on the Ray to which this process is connected.
 
-    Those that another ingress has started with the same settings are used.
+    Replicas that another ingress has started with the same settings are reused.
 
     Args:
         host: as of :class:`Owner`.
 
     Raises:
-        RayUnusable: replicas with other settings are there, or those that are to start cannot be loaded.
+        RayUnusable: there are replicas with other settings, or new ones cannot be loaded.
     """
     logging.getLogger("ray.serve").setLevel(logging.WARNING)
     serve.start(proxy_location="Disabled")
@@ -112,13 +112,13 @@ def deployed(settings: Settings, host: str | None, least: int, most: int) -> Ser
 
 
 def _digest(settings: Settings, least: int, most: int) -> str:
-    """The same for ingresses that may share replicas."""
+    """A digest that is the same for ingresses that may share replicas."""
     key = None if settings.llm_api_key is None else settings.llm_api_key.get_secret_value()
     known = settings.model_dump(mode="json", exclude={"llm_api_key", "advertise_url"})
-    told = repr((version("aic-vds"), sorted(known.items()), key, least, most))
-    return blake2b(told.encode(), digest_size=6).hexdigest()
+    identity = repr((version("aic-vds"), sorted(known.items()), key, least, most))
+    return blake2b(identity.encode(), digest_size=6).hexdigest()
 
 
 def ended() -> None:
-    """End the replicas: they store what they have, and give their missions up."""
+    """End the replicas: they store their missions and release them."""
     serve.shutdown()  # type: ignore[no-untyped-call]

@@ -15,10 +15,10 @@ _LOOPBACK = "127.0.0.1"
 
 
 def serve_cluster(listener: socket.socket, settings: Settings, ray: str, least: int, most: int) -> Server:
-    """Serve until SIGTERM or Ctrl-C; returns the server, whose ``error`` says why it could not.
+    """Serve until SIGTERM or Ctrl-C; returns the server, whose ``error`` is the reason of a failure.
 
-    There are ``least`` to ``most`` replicas, by load. Those of a Ray that was started here end with it. Those of a
-    cluster go on: other ingresses may use them. A :class:`RayUnusable` in ``error`` says that they cannot start.
+    There are ``least`` to ``most`` replicas, by load. Replicas on a Ray that was started here end with it; those on a
+    cluster continue, because other ingresses may use them. If they cannot start, ``error`` is a :class:`RayUnusable`.
 
     Raises:
         RayUnusable: Ray is not installed, or not at that address.

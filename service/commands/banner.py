@@ -1,4 +1,4 @@
-"""What `aicvds serve` says once it has loaded: where its page is, who decides, what is kept, and what to type next."""
+"""The banner of `aicvds serve` after loading: page, deciding mode, store, keys, and the next command."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def banner(settings: Settings, url: str, missions: int) -> str:
 
     Args:
         url: the edge's address.
-        missions: that the store has.
+        missions: number of missions in the store.
     """
-    # Every interface's address is none that a browser can open.
+    # A browser cannot open the address of all interfaces.
     reached = url.replace("//0.0.0.0", "//127.0.0.1").replace("//[::]", "//[::1]")
     key = "" if settings.keys is None else "AICVDS_API_KEY=… "
     rows = {
@@ -30,7 +30,7 @@ def banner(settings: Settings, url: str, missions: int) -> str:
 
 
 def decides(settings: Settings) -> str:
-    """The mode, and the LLM or why there is none."""
+    """The mode and its LLM, if it has one."""
     if settings.mode not in LLM_MODES:
         return f"mode {settings.mode}, without an LLM"
     if settings.llm_url is not None:

@@ -1,4 +1,4 @@
-"""``aicvds doctor``: what may keep an edge from running here, and what to type about it."""
+"""``aicvds doctor``: problems that may keep an edge from running here, and their remedies."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Doctor:
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding: what was looked at, what was found, and for trouble the remedy."""
+    """One finding: its subject, the result, and the remedy of a problem."""
 
     what: str
     found: str
@@ -197,7 +197,7 @@ def planner(settings: Settings) -> Finding:
 
 
 def _asked(url: str, key: str | None = None) -> Any:
-    """The JSON of a GET, or why there is none, as text."""
+    """The JSON of a GET, or the reason of a failure, as text."""
     import httpx
 
     headers = {"Authorization": f"Bearer {key}"} if key else {}

@@ -29,7 +29,8 @@ def _default_store() -> str:
     return str(home / "aicvds" / "missions.db")
 
 
-# A small model's products are short, and the threads meet after each. More than two threads were not measured.
+# The matrices of a small model are small, and the threads synchronise after each product. More than two threads were
+# not measured.
 _MOST_EMBEDDED_THREADS = 8
 # Variables of earlier versions, and what replaces them.
 _REMOVED = {
@@ -61,17 +62,17 @@ class Settings(BaseSettings):
     llm_model: str | None = None
     # Bearer token for all servers, or one for each.
     llm_api_key: SecretStr | None = None
-    # The order in which several servers are asked: that of their URLs (`preference`), or one that follows from the
-    # mission's ID (`mission`). Missions are then shared out evenly, and each stays with the server whose prefix cache
-    # has its prompts.
+    # The order in which several servers are called: that of their URLs (`preference`), or one derived from the
+    # mission's ID (`mission`), which distributes missions evenly and keeps each at the server whose prefix cache has
+    # its prompts.
     llm_order: Literal["preference", "mission"] = "preference"
-    # Calls of this edge that one of several servers has at once before the next server gets them. 0: any number.
+    # Concurrent calls of this edge to one of several servers before the next server gets them. 0: any number.
     llm_slots: int = Field(0, ge=0, le=10_000)
     # Name of a header with the mission's ID in each call for a decision, for a router that sends requests of one
     # session to one replica. Unset: none.
     llm_session_header: str | None = Field(None, pattern=r"^[A-Za-z0-9-]{1,64}$")
-    # Milliseconds after which a second server, or the only one again, is called beside a server that has not answered.
-    # 0: never. It doubles the work of a slow server, so it pays where there are several.
+    # Milliseconds after which a second server, or the only one again, is called in addition to a server that has not
+    # answered. 0: never. It doubles the work of a slow server, so it pays where there are several.
     hedge_ms: int = Field(0, ge=0, le=60_000)
     # Model file of the embedded llama.cpp. Unset: the one of `aicvds model fetch`.
     llm_gguf: Path | None = None
@@ -102,8 +103,8 @@ class Settings(BaseSettings):
     # Experiences in the prompt before half of them are dropped. An appended experience leaves the LLM's prefix cache
     # valid. Dropping costs a prefill of the others, so it happens rarely.
     experiences: int = Field(8, ge=0, le=200)
-    # The experiences in the prompt: `recent` ones, those `similar` to the present state, or the `best` and a few of the
-    # worst.
+    # The experiences in the prompt: `recent` ones, those `similar` to the present state, the `best` and a few of the
+    # worst, or the newest of each sensor, `failures` first.
     selection: Selection = "recent"
     # Adam's step size for the attention and velocity modules (the paper's table).
     learning_rate: float = Field(5e-4, gt=0, le=1)
@@ -113,16 +114,17 @@ class Settings(BaseSettings):
     price_cached: float = Field(0.0, ge=0)
     price_output: float = Field(0.0, ge=0)
 
-    # Decisions that wait for the LLM at once. The policy decides for any more at once: they would only share its time.
+    # Most decisions that wait for the LLM. The policy makes further ones immediately: they would only share the LLM's
+    # time.
     llm_concurrency: int = Field(64, ge=1, le=10_000)
-    # Requests under way at once; one more gets a 503 with Retry-After. Several times `llm_concurrency`, so that the
+    # Most concurrent requests; a further one gets a 503 with Retry-After. Several times `llm_concurrency`, so that the
     # policy decides before any request is refused.
     max_requests: int = Field(512, ge=1, le=100_000)
     # File of the accepted API keys (`aicvds keys add` makes it). Unset: requests need no key.
     keys: Path | None = None
     # Whether requests to an address other than loopback need no key.
     anonymous: Literal["on", "off"] = "off"
-    # Largest body in bytes, compressed or not, after decompression: 10,000 sensors take 0.4 to 0.8 MB.
+    # Largest body in bytes, compressed or not, after decompression: 2,000 sensors take 0.08 to 0.16 MB.
     max_body_bytes: int = Field(2_000_000, ge=1_000, le=1_000_000_000)
     # Whether an LLM's answer must obey hard rules in mode `llm`: sensor in reach, battery not flat. The policy
     # overrides an answer that breaks one. `off` is the paper's method as published.
@@ -130,15 +132,15 @@ class Settings(BaseSettings):
     # The store of the missions: a SQLite file, or postgresql://user:password@host/database. `none`: missions end with
     # the process.
     store: str = Field(default_factory=_default_store, min_length=1, repr=False)
-    # With several edges on one PostgreSQL: this one's address for clients, which the other edges tell them. Unset: from
-    # --host and --port, with this machine's name for every interface's address.
+    # With several edges on one PostgreSQL: the address to which the other edges redirect clients. Unset: from --host
+    # and --port, with this machine's name in place of 0.0.0.0.
     advertise_url: str | None = None
-    # Seconds that this edge owns a mission of a PostgreSQL store without renewing that. Another edge can go on with the
-    # missions of a killed one after so long.
+    # Seconds for which this edge owns a mission of a PostgreSQL store without renewing the lease. After that, another
+    # edge can take over the missions of a killed one.
     lease_s: float = Field(5.0, ge=1, le=300)
-    # Missions at once, in memory or in the store; one more is refused until another is deleted.
+    # Most missions in memory and in the store; a further one is refused until another is deleted.
     max_missions: int = Field(1000, ge=1, le=1_000_000)
-    # Whether a decision for a mission that does not exist makes it. `off`: mission `default` alone, so that a mistyped
+    # Whether a decision for a mission that does not exist makes it. `off`: only mission `default`, so that a mistyped
     # name is refused; PUT /missions/{id} makes the others.
     create_on_decide: Literal["on", "off"] = "off"
     # Folder of the model file and the token vocabulary.
@@ -200,7 +202,7 @@ class Settings(BaseSettings):
 
     @property
     def embedded_adapter(self) -> Path | None:
-        """The adapter file of the embedded LLM; None where that has none, and where the LLM is a server's."""
+        """The adapter file of the embedded LLM; None without one, and for an LLM server."""
         return self._embedded(None if self.llm_adapter == "served" else self.llm_adapter or SHIPPED_ADAPTER)
 
     @property
@@ -249,9 +251,9 @@ def _for_each(servers: int, name: str, value: str | None) -> list[str | None]:
 
 
 def unknown_variables() -> dict[str, str]:
-    """Environment variables with the prefix of settings that are none, mostly misspelled ones, each with a suggestion.
+    """Environment variables with the settings' prefix that are not settings, mostly misspelled, each with a suggestion.
 
-    A suggestion begins with a semicolon; it is empty where no setting has a similar name.
+    A suggestion begins with a semicolon; it is empty if no setting has a similar name.
     """
     known = {f"AICVDS_{name.upper()}" for name in Settings.model_fields} | _SIMULATORS
     unknown = sorted(name for name in os.environ if name.startswith("AICVDS_") and name not in known)

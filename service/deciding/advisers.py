@@ -22,7 +22,7 @@ from shared.world.channel import FloatArray
 
 # In units of the value regression's target, minus the cost.
 _VALUE_TEMPERATURE = 0.05
-# The probability that an adviser of one action leaves to all actions together, so that its logarithm exists.
+# The probability that an adviser of one action spreads over all actions, so that its logarithm exists.
 SMOOTHING = 0.01
 
 
@@ -31,11 +31,11 @@ class Preference(Protocol):
 
     @property
     def action(self) -> Action:
-        """The sensor and the velocity that the adviser prefers to all others."""
+        """The adviser's preferred sensor and velocity."""
         ...
 
     def probabilities(self, actions: Sequence[Action]) -> FloatArray:
-        """How the adviser would choose among the candidates, ``(n,)``, summing to 1."""
+        """The adviser's probabilities of the candidates, ``(n,)``, summing to 1."""
         ...
 
 
@@ -46,7 +46,7 @@ class OneAction:
     action: Action
 
     def probabilities(self, actions: Sequence[Action]) -> FloatArray:
-        """0.99 for the action, if it is there, and the rest for all alike."""
+        """0.99 for the action, if it is a candidate, and equal shares of the rest."""
         probabilities = np.full(len(actions), SMOOTHING / len(actions))
         if self.action in actions:
             probabilities[actions.index(self.action)] += 1.0 - SMOOTHING
@@ -69,7 +69,7 @@ class LearnedValues:
 
 
 def _by_plan(state: AttendedState) -> Preference | None:
-    """The receding-horizon plan's action, where there is a plan of this step."""
+    """The receding-horizon plan's action, if there is a plan of this step."""
     planner = state.mission.planner
     planned = None if planner is None else planner.action(state.uav_id, state.reserved)
     return None if planned is None else OneAction(planned)

@@ -1,4 +1,4 @@
-"""What the edge knows as one UAV decides: its augmented state, and the sensors that attention keeps."""
+"""A UAV's augmented state at a decision, and the sensors that attention keeps."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class AttendedState:
 
     Attributes:
         reserved: IDs of the sensors that other UAVs have in this step.
-        guidance: what the operator's guidance asks of this step, if it asks for anything.
-        prompt_view: what the prompt shows, which may have orders that are not confirmed yet.
+        guidance: the operator's guidance for this step, if there is any.
+        prompt_view: the prompt's view, which may include orders that are not confirmed yet.
         admissible: rows of the state that may be chosen, n of them.
         features: shape ``(n, d)``, the attention module's input.
         contexts: its output ``z_j`` of some of the n, ``(m, d')``.
@@ -55,7 +55,7 @@ class AttendedState:
 
     @classmethod
     def of(cls, mission: Mission, uav: UavState, step: int, watch: Stopwatch | None = None) -> Self:
-        """Augment a UAV's report with what its mission knows, and keep the mission's top k of the sensors.
+        """Augment a UAV's report with its mission's knowledge, and keep the mission's top k sensors.
 
         Args:
             watch: takes the times of the stages ``augment`` and ``attend``.
@@ -125,7 +125,7 @@ class AttendedState:
         return [self.rows[i] for i in shuffle.permutation(len(self.rows))]
 
     def similar_experiences(self) -> list[str]:
-        """Past decisions most like the rows kept, for the prompt's last block, as the mission's selection has it."""
+        """Past decisions most similar to the rows kept, for the prompt's last block, in selection ``similar``."""
         if not self.rows or self.mission.experiences.selection != "similar":
             return []
         return self.mission.experiences.nearest(self.features[[self.admissible.index(row) for row in self.rows]])
@@ -139,7 +139,7 @@ class AttendedState:
         return Action(int(self.state.ids[row]), level)
 
     def pending(self, decision_id: str, action: Action) -> Pending:
-        """The decision, with what its outcome will be learned from."""
+        """The decision with its training sample, if its sensor is admissible."""
         sensor_id, velocity = action
         rows = np.flatnonzero(self.state.ids == sensor_id)
         row = int(rows[0]) if len(rows) else None

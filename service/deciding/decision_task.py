@@ -1,4 +1,4 @@
-"""One UAV's decision to be made, and the choice that is made for it."""
+"""The task of one UAV's decision, and its choice."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.wire.reasons import Reason
 from shared.wire.schemas import Guided, UavState
 from shared.world.actions import Action
 
-# Kept back of a deadline for the check, the answer and the way through the event loop.
+# The part of a deadline reserved for the check, the answer and the event loop.
 RESERVE_S = 0.02
 
 
@@ -24,11 +24,11 @@ class DecisionTask:
 
     Attributes:
         attempt: the number of this request among the UAV's at this step.
-        deadline_ms: as the response tells it, from the beginning of ``watch``.
-        deadline: for the LLM and the plan; the reserve is kept back.
+        deadline_ms: for the response, from the start of ``watch``.
+        deadline: for the LLM and the plan, less the reserve.
         evaluation_deadline: for the rollout evaluator, which may take time that the other UAVs of a batch can spare.
-        plan: the fleet's plan in the making, if there is one.
-        advice: of the LLM, where it was asked for the whole batch at once.
+        plan: the task that makes the fleet's plan, if there is one.
+        advice: of the LLM, if one query covered the whole batch.
     """
 
     mission: Mission
@@ -45,11 +45,11 @@ class DecisionTask:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """An action, with the reason where the LLM had no part in it.
+    """An action, with the reason if the LLM had no part in it.
 
     Attributes:
         report: of mode ``guided``: the response's part about trust and candidates.
-        advice: of mode ``guided``: what trust learns from.
+        advice: of mode ``guided``: the advice from which trust learns.
         unevaluated: the rollout evaluator was late or failed.
     """
 

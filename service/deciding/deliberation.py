@@ -1,4 +1,4 @@
-"""Mode ``guided``: advisers weighed by learned trust, and a rollout evaluator that sees what a decision would lose.
+"""Mode ``guided``: advisers weighed by learned trust, and a rollout evaluator that estimates a decision's losses.
 
 The candidates are the rows' sensors at a few velocities each, and the advisers' own proposals. Adviser e (the LLM, the
 planner, the learned values, the LLM-free policy) gives them probabilities p_e(a), trust gives it the weight w_e, and
@@ -8,7 +8,7 @@ the rollout evaluator expects a candidate to lose m(a) packets above the best, o
 
 This is Hedge over pairs of an adviser and a candidate, with the evaluation as the prediction of this very decision's
 loss: optimistic Hedge (Rakhlin and Sridharan 2013), whose regret shrinks with the prediction's error. So an adviser is
-overruled where the evaluator sees a disaster, even before trust has learned; and as trust grows, an adviser's
+overruled if the evaluator expects a large loss, even before trust has learned; and as trust grows, an adviser's
 preference counts for more than the evaluator's small differences. The best is taken rather than a draw: losses are
 estimated for every candidate, so that exploring would teach nothing, and cost packets.
 
@@ -84,7 +84,7 @@ class LlmAdvice:
 
 @dataclass(frozen=True, slots=True)
 class Conclusion:
-    """The action to fly, what the response tells of it, and what trust is to learn from it."""
+    """The action to fly, its report for the response, and the advice from which trust learns."""
 
     action: Action
     report: Guided
@@ -95,8 +95,8 @@ class Conclusion:
 class Deliberation:
     """One decision's candidates, n of them, and the LLM-free advisers' probabilities of them ``(n,)`` by name.
 
-    It is taken at once from what the mission knows then, of which ``take_rollout`` has a copy; ``evaluate`` may run in
-    another thread.
+    It is a snapshot of the mission's knowledge, of which ``take_rollout`` has a copy; ``evaluate`` may run in another
+    thread.
     """
 
     candidates: CandidateSet
@@ -132,7 +132,7 @@ class Deliberation:
         )
 
     def evaluate(self) -> Evaluation:
-        """What the rollout evaluator expects of every candidate."""
+        """The rollout evaluator's expectations for every candidate."""
         return evaluate(self.take_rollout(), self.candidates.actions)
 
     def conclude(
@@ -149,14 +149,14 @@ class Deliberation:
         Args:
             llm: the LLM's probabilities of the candidates, ``(n,)``; None where it gave none.
             calibrated: whether the LLM's bias towards labels is known.
-            reserved: sensors that other UAVs have by now.
+            reserved: sensors that other UAVs have reserved meanwhile.
         """
-        heard = dict(self.advised)
+        given = dict(self.advised)
         if llm is not None:
             # An action without a label is as likely as one that the LLM rules out.
-            heard[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
-        weights = trust.among(heard)
-        mixture = np.sum([weights[name] * p for name, p in heard.items()], axis=0)
+            given[LLM] = (1.0 - SMOOTHING) * llm + SMOOTHING / len(llm)
+        weights = trust.among(given)
+        mixture = np.sum([weights[name] * p for name, p in given.items()], axis=0)
         regret = self._regret(evaluation.lost)
         score = np.log(mixture) - RATE * np.minimum(regret, CAP)
         free = ~np.isin([sensor for sensor, _ in self.candidates.actions], list(reserved))
@@ -165,19 +165,19 @@ class Deliberation:
         score = np.where(free, score, -np.inf)
         best = int(score.argmax())
         advice = Advice(
-            regret={name: float(p @ np.minimum(regret, CAP)) for name, p in heard.items()},
-            flown={name: float(p[best]) for name, p in heard.items()},
+            regret={name: float(p @ np.minimum(regret, CAP)) for name, p in given.items()},
+            flown={name: float(p[best]) for name, p in given.items()},
             expected_cost=float(evaluation.cost[best]),
         )
         report = Guided(
             trust={name: round(weight, 4) for name, weight in trust.weights.items()},
             calibrated=calibrated,
-            candidates=self._reported(score, mixture, regret, heard.get(LLM)),
+            candidates=self._reported(score, mixture, regret, given.get(LLM)),
         )
         return Conclusion(self.candidates.actions[best], report, advice)
 
     def _regret(self, lost: FloatArray) -> FloatArray:
-        """Packets lost above the best candidate, or above the plan's unless that is a disaster.
+        """Packets lost above the best candidate, or above the plan's action unless that loses far more.
 
         The plan looks further than the evaluator, which flies look-ahead after the candidates and ends with its
         horizon. Faulted for less than the cap, the planner was overruled in 3 of 46 worlds of scenario `paper`, each

@@ -23,7 +23,7 @@ from shared.world.actions import Action
 
 log = logging.getLogger(__name__)
 
-# Queries about a whole fleet that may be late in a row before the LLM is asked about one UAV at a time.
+# Consecutive late queries about a whole fleet after which the LLM is asked about one UAV at a time.
 _LATE = 2
 
 
@@ -31,7 +31,7 @@ _LATE = 2
 class _Answer:
     """A query's answer: the probabilities of each UAV's labels, or the reason why there are none.
 
-    ``model`` is the LLM that answered, or would have; ``to_calibrate`` says that its bias can be measured and is not.
+    ``model`` is the LLM that was called; ``to_calibrate`` says that its bias can be measured and is not known yet.
     """
 
     completion: Completion | None
@@ -53,11 +53,11 @@ class LlmQueries:
         self._limits = QueryLimits(limit)
 
     def hurry(self) -> None:
-        """The service is closing: a query that waits for the LLM gets a few seconds more."""
+        """Shorten the limits because the service is closing: a waiting query gets a few more seconds."""
         self._limits.hurry()
 
     async def close(self) -> None:
-        """Give up the queries in the background."""
+        """Cancel the queries in the background."""
         await self._labels.close()
 
     async def ask_for_pair(
@@ -68,7 +68,7 @@ class LlmQueries:
         try:
             return await self._limits.within(query, deadline)
         except NoDecision as fault:
-            self._llm.judge(mission.mission_id, fault)
+            self._llm.record_usability(mission.mission_id, fault)
             raise
 
     def read_pair(self, mission: Mission, completion: Completion, sensor_ids: list[int], levels: int) -> Action:
@@ -76,9 +76,9 @@ class LlmQueries:
         try:
             answer = check_answer(completion.text, sensor_ids, levels)
         except NoDecision as fault:
-            self._llm.judge(mission.mission_id, fault)
+            self._llm.record_usability(mission.mission_id, fault)
             raise
-        self._llm.judge(mission.mission_id, None)
+        self._llm.record_usability(mission.mission_id, None)
         return answer
 
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
@@ -97,7 +97,7 @@ class LlmQueries:
         return LlmAdvice(prompt, probabilities, answer.reason, answer.completion, answer.calibrated, answer.model)
 
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
-        """Whether one query can serve so many UAVs: in mode ``guided``, of a server that can, if it holds them."""
+        """Whether one query can serve this many UAVs: mode ``guided``, a capable server, a sufficient context."""
         server = self._llm.serving(mission.mission_id)
         able = server.status.llm == "ready" and uavs <= server.max_uavs_per_call
         return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
@@ -107,8 +107,8 @@ class LlmQueries:
     ) -> dict[int, LlmAdvice]:
         """Mode ``guided``: the LLM's preferences for several UAVs, by UAV, in one query.
 
-        Where the query fails before the deadline, the result is empty, and the LLM is asked about so many UAVs no more
-        until it is probed again; after two timeouts in a row neither.
+        If the query fails before the deadline, the result is empty, and the LLM gets no queries about this many UAVs
+        until it is probed again; the same applies after two timeouts in a row.
         """
         template = template_of(mission)
         asked = {state.uav_id: (state, candidates_of(state, template)) for state in states if state.rows}
@@ -138,7 +138,7 @@ class LlmQueries:
         return advice
 
     def _note_lateness(self, mission: Mission, uavs: int, reason: Reason | None) -> None:
-        """Ask about fewer UAVs at once where the LLM failed, or is late again."""
+        """Ask about fewer UAVs at once if the LLM failed or is late again."""
         self._late = self._late + 1 if reason == "llm_timeout" else 0
         if reason is not None and (self._late == 0 or self._late >= _LATE):
             log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
@@ -153,9 +153,9 @@ class LlmQueries:
             query = partial(self._llm.ask_labels, mission.mission_id, static, user, labels)
             completion = await self._limits.within(query, deadline)
             by_label = self._labels.read(completion, static, labels)
-            self._llm.judge(mission.mission_id, None)
+            self._llm.record_usability(mission.mission_id, None)
         except NoDecision as error:
-            self._llm.judge(mission.mission_id, error)
+            self._llm.record_usability(mission.mission_id, error)
             log.debug("mission %s: %s: %s", mission.mission_id, error.reason, error)
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()

@@ -1,4 +1,4 @@
-"""The limits of queries to the LLM: a late answer is refused, and so is a query where too many wait already."""
+"""The limits of queries to the LLM: late answers are refused, and so are queries when too many are waiting."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class QueryLimits:
     """Bounds the queries to the LLM in number and in time.
 
     Args:
-        most: the queries that may wait at once.
+        most: the largest number of waiting queries.
     """
 
     def __init__(self, most: int) -> None:
@@ -26,7 +26,7 @@ class QueryLimits:
         self._closing = False
 
     def hurry(self) -> None:
-        """The service is closing: a query that waits for the LLM gets a few seconds more."""
+        """Shorten the limits because the service is closing: a waiting query gets a few more seconds."""
         self._closing = True
         ends = asyncio.get_running_loop().time() + _CLOSING_S
         for limit in self._waiting:
@@ -35,7 +35,7 @@ class QueryLimits:
                 limit.reschedule(min(limit.when() or ends, ends))
 
     async def within(self, query: Callable[[], Awaitable[Completion]], deadline: Deadline) -> Completion:
-        """The query's answer; raises ``NoDecision`` after the deadline, and where too many queries wait already."""
+        """The query's answer; raises ``NoDecision`` after the deadline, or if too many queries are waiting."""
         if len(self._waiting) >= self._most:
             raise NoDecision("llm_busy", f"{self._most} decisions wait for it already")
         limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))

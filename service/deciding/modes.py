@@ -1,4 +1,4 @@
-"""The modes of decision: what each asks, and how it chooses. A mission's mode is one of these objects."""
+"""The modes of decision: each one's prompt and choice. A mission's mode is one of these objects."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A prompt, whether an LLM gets it or not.
+    """A prompt, which an LLM may or may not receive.
 
     Attributes:
-        deliberation: of mode ``guided``, which the prompt belongs to.
+        deliberation: of mode ``guided``.
         candidates: of mode ``llm`` with the compact prompt.
     """
 
@@ -53,12 +53,12 @@ class Mode(Protocol):
         ...
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
-        """The mode's choice, or why it has none."""
+        """The mode's choice, or the reason for a fallback."""
         ...
 
 
 class PolicyMode:
-    """No LLM and no learned values: the plan decides, or look-ahead where there is no plan."""
+    """No LLM and no learned values: the plan decides, or look-ahead if there is no plan."""
 
     plan_share: ClassVar[float | None] = 1.0
     plan_first: ClassVar[bool] = False
@@ -70,7 +70,7 @@ class PolicyMode:
         return Question(mission.template.prompt(state.state, state.shown(), mission.experiences.block, similar))
 
     async def choose(self, state: AttendedState, question: Question, task: DecisionTask) -> Choice | Fallback:
-        """Always the LLM-free policy's."""
+        """Always the LLM-free policy."""
         return Fallback("mode_policy")
 
 
@@ -189,7 +189,7 @@ class GuidedMode(PolicyMode):
             advice = advice or await asking
             evaluation = _evaluation_of(result)
         finally:
-            # An evaluation that still waits for a thread does not begin.
+            # Drops an evaluation that waits for a thread.
             for unfinished in waiting:
                 unfinished.cancel()
         task.watch.ended.append(("judge", perf_counter()))
@@ -199,12 +199,12 @@ class GuidedMode(PolicyMode):
         reserved = mission.reservations.of_others(state.step, state.uav_id)
         llm = advice.over(deliberation.candidates.actions)
         trust = mission.trust[advice.model or ""]
-        verdict = deliberation.conclude(trust, evaluation, llm, calibrated=advice.calibrated, reserved=reserved)
-        if verdict is None:
+        conclusion = deliberation.conclude(trust, evaluation, llm, calibrated=advice.calibrated, reserved=reserved)
+        if conclusion is None:
             return Fallback("answer_reserved", advice.completion, advice.model)
-        # Other UAVs may have every sensor that the LLM named by now.
+        # Other UAVs may have reserved every sensor that the LLM named.
         missing = advice.reason or ("answer_reserved" if llm is None else None)
-        return Choice(verdict.action, missing, advice.completion, advice.model, verdict.report, verdict.advice)
+        return Choice(conclusion.action, missing, advice.completion, advice.model, conclusion.report, conclusion.advice)
 
 
 def _evaluation_of(result: asyncio.Future[Evaluation]) -> Evaluation | None:

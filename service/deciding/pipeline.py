@@ -1,4 +1,4 @@
-"""How one decision is made: augment, attend, prompt, choose, enforce, commit."""
+"""The stages of a decision: augment, attend, prompt, choose, enforce, commit."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Pipeline:
     def begin_plan(
         self, mission: Mission, uavs: Sequence[int], step: int, deadline: Deadline
     ) -> asyncio.Task[None] | None:
-        """Begin to plan for UAVs of this step, where their mission's mode may need a plan by this deadline."""
+        """Begin to plan for UAVs of this step, if their mission's mode may need a plan by this deadline."""
         share = self._modes[mission.mode, mission.spec.prompt.format == "compact"].plan_share
         if mission.planner is None or share is None:
             return None
@@ -112,7 +112,7 @@ class Pipeline:
 
 
 async def _await_plan(task: DecisionTask) -> None:
-    """Wait for the plan until the deadline; a later plan serves the fleet's next decisions."""
+    """Wait for the plan until the deadline; a plan that is late serves the fleet's next decisions."""
     if task.plan is not None:
         await asyncio.wait({task.plan}, timeout=task.deadline.left())
     task.watch.ended.append(("plan", perf_counter()))
@@ -127,7 +127,7 @@ def _without_llm(state: AttendedState) -> Action:
         return planned
     sensor, velocity = look_ahead(state.state, state.reach, reserved, state.guidance)
     if sensor in reserved:
-        # Other UAVs have every sensor reported. A sensor that was not reported is worth a try, a reserved one is not.
+        # Other UAVs have reserved every reported sensor. An unreported sensor is worth a try, a reserved one is not.
         sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
     return Action(sensor, velocity)
 

@@ -1,4 +1,4 @@
-"""What a prompt shows of one UAV's state, and the orders that it goes by."""
+"""A prompt's view of one UAV's state, and the orders that it follows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class PromptView:
         state, reach: as the prompt shows them. The compact prompt has the orders in them, as queues; the reach is None
             where it is the state's own.
         offered: the reach that the candidates' velocities are chosen by; None where it is the state's own.
-        guidance: what the candidates' velocities obey in this step.
+        guidance: the guidance for the candidates' velocities in this step.
         added: shape ``(J,)``, packets to add to the worth of each sensor as attention chooses the prompt's rows; None
             where there are no orders.
     """
@@ -38,8 +38,8 @@ class PromptView:
     def of(cls, mission: Mission, state: State, uav_id: int, step: int, confirmed: StepGuidance | None) -> Self:
         """By the confirmed orders, and with the compact prompt by the LLM's own reading of the note before that.
 
-        An order that is not confirmed yet is in the prompt alone: in mode ``guided`` only the LLM's advice follows it,
-        and the candidates are those without it. Orders in force stay until the operator confirms others.
+        An unconfirmed order appears only in the prompt: in mode ``guided`` it affects only the LLM's advice, not the
+        candidates. Orders in force stay until the operator confirms others.
         """
         scenario, visits = mission.scenario, mission.records.visits
         added = None if confirmed is None else confirmed.worth.max(axis=0)

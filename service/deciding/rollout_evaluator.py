@@ -58,7 +58,7 @@ def evaluate(state: RolloutState, candidates: Sequence[Action]) -> Evaluation:
     futures = SampledFutures.of(state, int(np.clip(_MAX_ENTRIES // entries, 1, _FUTURES)))
     world = FlownWorld.of(state)
     index = {int(sensor): row for row, sensor in enumerate(state.sensors)}
-    # A sensor that is not simulated is out of every UAV's reach: its link never holds.
+    # A sensor that is not simulated is out of every UAV's reach.
     first = np.array([(index.get(sensor, -1), velocity) for sensor, velocity in candidates])
     flown = [fly_candidates(world, futures, uavs.index(state.uav), first, plans) for plans in continuations]
     return Evaluation(np.min([lost.mean(axis=1) for lost, _ in flown], axis=0), flown[-1][1].mean(axis=1))

@@ -73,7 +73,7 @@ class FlownWorld(NamedTuple):
             bonus=bonus,
             highest_bonus=np.asarray(bonus.max()),
             weights=weights,
-            every=guidance.every(scenario.sensors)[state.sensors],
+            every=guidance.visit_intervals(scenario.sensors)[state.sensors],
             late=np.asarray(LATE_PACKETS),
             waited=state.step - state.visited[state.sensors],
             reserved=state.reserved,

@@ -1,4 +1,4 @@
-"""What the rollout evaluator starts from: a copy of the belief before one UAV's decision."""
+"""The rollout evaluator's initial state: a copy of the belief before one UAV's decision."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class RolloutState:
     ) -> RolloutState:
         """The state before this UAV's decision at this step; ``plans`` are the fleet's from this step on."""
         horizon = _horizon(scenario, step)
-        # Any subset of UAVs will do, because the UAVs' distances change within the horizon.
+        # Any subset of UAVs serves: their distances change within the horizon.
         others = [other for other in belief.present(step) if other != uav][: _MAX_UAVS - 1]
         flown = np.arange(horizon * scenario.max_velocity + 1) * scenario.step_s
         expected = {i: belief.links(i, flown) for i in (uav, *others)}
@@ -132,7 +132,7 @@ class RolloutState:
 
 def _horizon(scenario: Scenario, step: int) -> int:
     left = scenario.steps - step
-    # A fleet may fly on past the scenario's last step.
+    # A fleet may continue past the scenario's last step.
     return min(_HORIZON, left) if left > 0 else _HORIZON
 
 
@@ -163,7 +163,7 @@ def _most_urgent(
     """The sensors in reach by these links that overflow soonest, after those with a visit interval in the guidance."""
     reached = np.flatnonzero(np.any([(table > 0).any(axis=0) for table in links], axis=0))
     room = (scenario.queue_capacity - belief.queue(step)) / np.maximum(belief.arrivals.rate, 1e-9)
-    room = np.where(np.isfinite(guidance.every(scenario.sensors)), -np.inf, room)
+    room = np.where(np.isfinite(guidance.visit_intervals(scenario.sensors)), -np.inf, room)
     return np.sort(reached[np.argsort(room[reached], kind="stable")[:_MAX_SENSORS]])
 
 

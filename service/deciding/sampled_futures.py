@@ -1,4 +1,4 @@
-"""The futures that the rollout evaluator flies candidates through: queues, arrivals and links drawn from the belief."""
+"""Sampled futures for the rollout evaluator: queues, arrivals and links drawn from the belief."""
 
 from __future__ import annotations
 
@@ -25,11 +25,8 @@ class SampledFutures:
     @classmethod
     def of(cls, state: RolloutState, count: int) -> SampledFutures:
         """Sample futures, each with its own arrival rates, because a rarely heard sensor may fill fast."""
-        scenario, random, shape = (
-            state.scenario,
-            np.random.default_rng(state.seed),
-            (count, len(state.sensors)),
-        )
+        scenario, shape = state.scenario, (count, len(state.sensors))
+        random = np.random.default_rng(state.seed)
         capacity = float(scenario.queue_capacity)
         rates = random.gamma(state.arrived, 1.0 / state.watched, shape)
         drawn = random.uniform(scenario.initial_queue_min * capacity, capacity, shape)

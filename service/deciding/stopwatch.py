@@ -1,4 +1,4 @@
-"""A decision's time: the deadline until which a stage may take, and what each stage took."""
+"""A decision's deadline, and the duration of each of its stages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Stopwatch:
     """When a request arrived, and when the stages of its decision ended; moments of ``time.perf_counter``.
 
     Attributes:
-        ended: each stage, or a further part of it, and its end, in their order. The next one begins there.
+        ended: each stage, or a further part of it, and its end, in order; the next stage begins there.
     """
 
     started: float = field(default_factory=time.perf_counter)

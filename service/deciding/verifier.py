@@ -1,9 +1,8 @@
-"""Hard rules for an LLM's answer, whatever it says and whatever made it say so.
+"""Hard rules for an LLM's answer.
 
-They need no judgement: a sensor that is out of the UAV's reach after the step, or whose battery is known to be flat,
-brings nothing, and one that another UAV has meanwhile fails. An answer that breaks a rule is overridden by the
-LLM-free policy's, with the rule as the reason. In mode ``guided`` no answer decides alone: the rollout evaluator weighs
-it there.
+No packets can be collected from a sensor out of the UAV's reach after the step, or with a flat battery, and a
+transmission from a sensor that another UAV has reserved fails. The LLM-free policy's action replaces an answer that
+breaks a rule, with the rule as the reason. Mode ``guided`` needs no rules: the rollout evaluator weighs each answer.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from shared.world.actions import Action
 
 
 def verify(state: AttendedState, answer: Action) -> None:
-    """Raises :class:`NoDecision` where the answer breaks a rule.
+    """Raises :class:`NoDecision` if the answer breaks a rule.
 
-    A sensor out of reach breaks none while nothing that is admissible is in reach at any velocity.
+    A sensor out of reach is allowed while no admissible sensor is in reach at any velocity.
     """
     mission, (sensor, velocity) = state.mission, answer
     if sensor in mission.reservations.of_others(state.step, state.uav_id):

@@ -14,8 +14,8 @@ from service.deciding.stopwatch import Deadline, Stopwatch
 from service.mission.mission import Mission
 from shared.wire.schemas import BatchRequest
 
-# A query about all UAVs may take at most the first share of the batch's time, and is not worth sending with less than
-# the second. The rest is for the UAVs' own decisions one after another, with a safety factor of two.
+# A query about all UAVs gets at most the first share of the batch's time, and is not sent with less than the second.
+# The rest is for the UAVs' own decisions one after another, with a safety factor of two.
 _MAX_QUERY_SHARE, _MIN_QUERY_SHARE = 0.75, 0.25
 
 
@@ -29,10 +29,10 @@ class BatchDecider:
     async def decide(
         self, mission: Mission, request: BatchRequest, watch: Stopwatch, deadline: Deadline
     ) -> list[RecordedDecision]:
-        """The decisions for every UAV of a request whose outcomes are applied.
+        """The decisions for the UAVs of a request; its outcomes are already applied.
 
-        One plan serves all UAVs until one of them gets another action than the plan's; the rest is planned again. Each
-        UAV has an equal share of the time that is left.
+        One plan serves all UAVs until one of them departs from it; then the remaining UAVs get a new plan. Each UAV has
+        an equal share of the remaining time.
         """
         step, uavs = request.step, [uav.uav_id for uav in request.uavs]
         # Every report is observed before the first decision. Attempts are numbered before the query to the LLM, so that
@@ -72,11 +72,11 @@ class BatchDecider:
             if mission.planner is None or mission.planner.action(uav.uav_id) != decided.choice.action:
                 plan = None
             decisions.append(decided)
-            # Requests of other fleets go on between two UAVs.
+            # Requests of other fleets continue between two UAVs.
             await asyncio.sleep(0)
         return decisions
 
     def _query_s(self, total_s: float, uavs: int) -> float | None:
-        """Seconds for a query about all UAVs at once; None where the batch has too little time."""
+        """Seconds for a query about all UAVs at once; None if the batch has too little time."""
         seconds = min(_MAX_QUERY_SHARE * total_s, total_s - 2 * uavs * self._pipeline.own_s)
         return seconds if seconds >= _MIN_QUERY_SHARE * total_s else None

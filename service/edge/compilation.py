@@ -1,4 +1,4 @@
-"""The functions that numba compiles: a decision waits neither for the compiler nor for what it made before."""
+"""Compiling and loading numba's functions in advance, so that no decision waits for either."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _PAPER = SCENARIOS["paper"]
 
 
 def load_for_event_loop() -> None:
-    """Load what the event loop calls, in half a second; the first time on a machine it takes some seconds to compile.
+    """Load the functions that the event loop calls: half a second, or some seconds to compile them the first time.
 
-    The edge does so before it is ready. Threads load what plans and evaluates when a mission needs it.
+    The edge does so before it is ready. Threads load the planner's and the evaluator's functions on demand.
     """
     one = np.zeros((1, 1), dtype=np.float32)
     softmax_means(one, one, one[0])
@@ -56,7 +56,7 @@ def _heard(step: int) -> SensorColumns:
 
 
 def compile_all() -> None:
-    """Compile every function, or load it, on two cores: installations do so in advance.
+    """Compile or load every function, on two cores; installations call it.
 
     Raises:
         subprocess.CalledProcessError: the functions of the planner cannot be compiled.

@@ -1,4 +1,4 @@
-"""One edge: it resolves a request's mission, has it decided, makes the answer durable, and reports it."""
+"""One edge: it resolves a request's mission, decides, makes the answer durable, and reports it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from shared.wire.schemas import (
     Source,
 )
 
-# The longest that an answer waits for the disk; a later answer goes out and says that it is not stored.
+# The longest wait of an answer for the disk; after that it is sent with `stored` false.
 _STORE_S = 1.0
 # Seconds for the last checkpoints, and for the last commit, when the service ends.
 _LAST_CHECKPOINTS_S, _LAST_COMMIT_S = 2.0, 2.5
@@ -75,15 +75,15 @@ class Engine:
         self.missions = MissionRegistry(settings, metrics, self.journal, store, self.compiler.compile, self.live.forget)
 
     def hurry(self) -> None:
-        """The service is closing: queries to the LLM end within seconds, and pages get no more updates."""
+        """Prepare to close: queries to the LLM end within seconds, and pages get no more updates."""
         self.queries.hurry()
         self.live.close()
 
     async def close(self) -> bool:
-        """Finish what is under way, learn from every outcome, and write the last checkpoints.
+        """Finish the work in progress, learn from every outcome, and write the last checkpoints.
 
         Returns:
-            whether the store may be closed: False while a write that was given up still waits for it.
+            whether the store may be closed: False while an abandoned write still uses it.
         """
         self.live.close()
         await self.compiler.close()
@@ -102,7 +102,7 @@ class Engine:
 
         Args:
             may_make: whether a mission that does not exist yet may be made.
-            key: an idempotency key; a request that comes again under it gets the same answer.
+            key: an idempotency key; a repeated request under it gets the same answer.
 
         Raises:
             Refused: the request does not fit its mission.
@@ -121,7 +121,7 @@ class Engine:
         mission, reports = await self.missions.resolve(request, may_make=may_make, key=key, deadline=deadline)
 
         async def make() -> list[RecordedDecision]:
-            # Every outcome is applied before the first decision: none is lost while the UAVs wait for the LLM.
+            # All outcomes are applied before the first decision, so that none is lost while the UAVs wait for the LLM.
             for outcome in (uav.outcome for uav in reports.uavs if uav.outcome is not None):
                 self._feedback.apply_reported(mission, outcome)
             return await self._batches.decide(mission, reports, watch, deadline)
@@ -149,7 +149,7 @@ class Engine:
         return FeedbackResponse(decision_id=request.decision_id, result=result)
 
     async def read(self, mission_id: str, request: ReadingsRequest) -> ReadingsResponse:
-        """Merge sensors' own readings; what is acknowledged as merged is on disk.
+        """Merge sensors' own readings; acknowledged readings are on disk.
 
         Raises:
             NotFound: there is no such mission.
@@ -183,7 +183,7 @@ class Engine:
         """Wait until every event of the mission so far is on disk.
 
         Raises:
-            Unavailable: that takes too long, or another edge has taken over the mission.
+            Unavailable: the wait times out, or another edge has taken over the mission.
         """
         await self._on_disk(field)
         if self.journal.lost(mission):
@@ -220,7 +220,7 @@ class Engine:
         make: Callable[[], Awaitable[list[RecordedDecision]]],
         deadline: Deadline,
     ) -> list[DecideResponse]:
-        """The answers under the idempotency key, made unless there are some, once they are on disk or late for it."""
+        """The answers, remembered or new, once they are on disk or the wait for it has timed out."""
         decisions: list[RecordedDecision] = []
         answers: list[DecideResponse] = []
         try:
@@ -250,7 +250,7 @@ class Engine:
         key: str,
         make: Callable[[], Awaitable[list[RecordedDecision]]],
     ) -> tuple[list[RecordedDecision], list[DecideResponse]]:
-        """The answers under an idempotency key, and the decisions if they are made now."""
+        """The decisions made now, if any, and the answers under an idempotency key."""
         decisions: list[RecordedDecision] = []
         answers: list[DecideResponse] = []
 
@@ -264,13 +264,13 @@ class Engine:
         return decisions, answers or _ANSWERS.validate_json(text)
 
     def _follow_up(self, mission: Mission, decisions: list[RecordedDecision], answers: list[DecideResponse]) -> None:
-        """What is left to do for a request whose answer is sent: report it, and write a checkpoint where one is due."""
+        """Report a request whose answer is sent, and write a checkpoint if one is due."""
         self._feedback.follow_up(mission)
         for decided, answer in zip(decisions, answers, strict=False):
             self._report(decided, answer)
 
     def _report(self, decided: RecordedDecision, answer: DecideResponse) -> None:
-        """Report an answer to metrics, traces, the log and the mission page; nothing else reports decisions to them."""
+        """Report an answer to metrics, traces, the log and the mission page."""
         task, choice = decided.task, decided.choice
         self._metrics.record_decision(answer)
         if (measured := task.mission.measured.pop(task.uav.uav_id, None)) is not None:
@@ -279,7 +279,7 @@ class Engine:
         if task.mission.mode == "llm" and choice.reason != "no_candidate":
             self._metrics.llm_requests.labels(choice.reason or "ok").inc()
         if choice.unevaluated:
-            self._metrics.critic_timeouts.inc()
+            self._metrics.evaluator_timeouts.inc()
         if choice.report is not None:
             self._metrics.llm_trust.observe(choice.report.trust[LLM])
         self._traces.decided(answer)

@@ -35,8 +35,8 @@ class Feedback:
         self._journal = journal
         self._live = live
         self._training = LearningQueue(metrics)
-        # Applied outcomes that the mission page does not have yet.
-        self._untold: list[tuple[Mission, Outcome]] = []
+        # Applied outcomes that are not on the mission page yet.
+        self._unpublished: list[tuple[Mission, Outcome]] = []
 
     def apply(self, mission: Mission, outcome: Outcome) -> Literal["applied", "duplicate"]:
         """Apply an outcome, unless it is applied already; raises as :meth:`PendingDecisions.find`."""
@@ -55,7 +55,7 @@ class Feedback:
                 outcome = outcome.model_copy(update={"cost": mission.pending.max_step_cost})
             for_training = not self._training.full
             sample = mission.apply(outcome, for_training=for_training)
-            self._untold.append((mission, outcome))
+            self._unpublished.append((mission, outcome))
             if sample is not None and for_training:
                 self._training.add(TrainingTask(mission, sample, outcome.cost))
             elif sample is not None:
@@ -64,9 +64,9 @@ class Feedback:
         return result
 
     def apply_reported(self, mission: Mission, outcome: Outcome) -> None:
-        """Apply an outcome that comes with a report; one that contradicts an applied outcome is dropped.
+        """Apply the outcome in a report; one that contradicts an applied outcome is dropped.
 
-        Any key can read decision IDs and forge an outcome, and the true UAV still needs its next decision.
+        Any key can read decision IDs and forge an outcome, and the real UAV still needs its next decision.
 
         Raises:
             NotFound: the mission does not know the decision.
@@ -75,14 +75,14 @@ class Feedback:
             self.apply(mission, outcome)
 
     def follow_up(self, mission: Mission) -> None:
-        """After an answer: tell the mission page the applied outcomes, and write a checkpoint where one is due."""
-        untold, self._untold = self._untold, []
-        for owner, outcome in untold:
+        """After an answer: publish applied outcomes on the mission page, and write a checkpoint if one is due."""
+        unpublished, self._unpublished = self._unpublished, []
+        for owner, outcome in unpublished:
             self._live.outcome_applied(owner, outcome)
         self.checkpoint(mission)
 
     def checkpoint(self, mission: Mission, least: int | None = None) -> None:
-        """Write a checkpoint of the mission, after all waiting training, where one is due.
+        """Finish the mission's waiting training and write a checkpoint, if one is due.
 
         Args:
             least: events since the last checkpoint that make one due; by default the journal's number.
@@ -121,8 +121,8 @@ class TrainingTask(NamedTuple):
 class LearningQueue:
     """Trains on the event loop, a few tasks in each iteration, in the order of the outcomes.
 
-    A thread would hold the interpreter just as long, and switching to it costs extra. The fixed order makes training
-    reproducible for a fleet that is flown again.
+    A thread would need the interpreter lock just as long, and switching to it costs extra. The fixed order makes
+    training reproducible for a fleet that is flown again.
     """
 
     def __init__(self, metrics: Metrics) -> None:
@@ -145,7 +145,7 @@ class LearningQueue:
     def _train_some(self) -> None:
         """Train on one task and a quarter of the rest: no request waits long, and the queue keeps up with the arrivals.
 
-        In an iteration in which 64 UAVs send requests, 64 outcomes may arrive.
+        One iteration may bring 64 outcomes, from 64 UAVs.
         """
         for _ in range(min(len(self._waiting), 1 + len(self._waiting) // 4)):
             self._train(self._waiting.popleft())

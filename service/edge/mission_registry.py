@@ -67,7 +67,7 @@ class MissionRegistry:
 
     @property
     def intact(self) -> bool:
-        """Whether this edge can have missions: it renews their leases, and its SQLite file is still there."""
+        """Whether this edge can own missions: it can renew leases, and its SQLite file still exists."""
         return self._ownership.intact and not self._journal.replaced
 
     async def get(self, mission_id: str) -> Mission:
@@ -88,7 +88,7 @@ class MissionRegistry:
         """The mission that knows the decision: one in memory, or mission ``default`` from the store.
 
         Raises:
-            NotFound: none does; the decision may be of another mission that is only in the store.
+            NotFound: no mission knows it; the decision may belong to another mission that is only in the store.
             Misdirected, Unavailable, Conflict: as :meth:`get`.
         """
         for mission in self.loaded:
@@ -102,10 +102,10 @@ class MissionRegistry:
     async def resolve(
         self, request: AnyRequest, *, may_make: bool, key: str | None, deadline: Deadline
     ) -> tuple[Mission, AnyRequest]:
-        """The mission of a request that fits it, and the request in full.
+        """The mission of a request, and the complete request.
 
-        Mission ``default`` is made on first use, with scenario ``paper``, where ``may_make`` allows it; any other only
-        where the settings do too, so that a mistyped name is an error.
+        Mission ``default`` is made on first use, with scenario ``paper``, if ``may_make`` allows it; any other only if
+        the settings do too, so that a mistyped name is an error.
 
         Args:
             key: the idempotency key; a request whose answer is remembered or in progress is returned unchanged.
@@ -188,7 +188,7 @@ class MissionRegistry:
             self._store.close()
 
     async def release(self) -> None:
-        """Let other edges have the missions."""
+        """Release the leases of the missions."""
         await asyncio.to_thread(self._ownership.close)
 
     @property
@@ -204,9 +204,9 @@ class MissionRegistry:
         return self._missions.get(mission_id)
 
     async def _claim(self, mission_id: str, within_s: float) -> Mission | None:
-        """Take the lease of a mission that is to be made; returns the mission that was made meanwhile, if there is one.
+        """Take the lease of a new mission; returns the mission if another request has made it meanwhile.
 
-        There is no await after the look-up, so no other can have its ID until the caller adds it.
+        There is no await after the look-up, so no other request can make it before the caller adds it.
         """
         self._refuse_if_full()
         if self._store is not None:
@@ -214,7 +214,7 @@ class MissionRegistry:
         return self._missions.get(mission_id)
 
     def _add(self, mission: Mission) -> None:
-        """Add a mission. There is no await since the look-up, so no other can have its ID."""
+        """Add a mission. There is no await since the look-up, so its ID is still free."""
         self._refuse_if_full()
         self._missions[mission.mission_id] = mission
         self._journal.begin(mission, self._ownership.epoch(mission.mission_id))
@@ -240,7 +240,7 @@ class MissionRegistry:
 
 
 def _complete(mission: Mission, request: AnyRequest) -> AnyRequest:
-    """The request with what the mission holds; raises as :meth:`Reports.complete`."""
+    """The request, completed from the mission's reference reports; raises as :meth:`Reports.complete`."""
     if isinstance(request, DecideRequest):
         return mission.reports.complete(request, request.step)
     uavs = [mission.reports.complete(u, request.step, f"uavs[{index}].") for index, u in enumerate(request.uavs)]

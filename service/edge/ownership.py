@@ -1,4 +1,4 @@
-"""Which missions of the store this edge may decide for: all of a store of its own, or those whose leases it has."""
+"""Ownership of stored missions: all of an exclusive store, or those whose leases this edge has."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ROUNDS, _ROUNDS_FAILING = 3, 10
 
 
 class SoleOwnership:
-    """The store is this edge's alone, or there is none: it owns every mission."""
+    """The store is exclusive to this edge, or there is none: the edge owns every mission."""
 
     shared = False
     intact = True
@@ -53,7 +53,7 @@ class SoleOwnership:
 
 @dataclass(slots=True)
 class _Lease:
-    """A lease of this edge: its epoch, and until when it is surely valid, by this machine's clock."""
+    """A lease of this edge: its epoch, and the time until which it is valid for certain, by this machine's clock."""
 
     epoch: int
     until: float
@@ -73,7 +73,7 @@ class LeasedOwnership:
             with the IDs of all stored missions that no other edge owns.
 
     Attributes:
-        shared: other edges may have missions of the store.
+        shared: whether other edges may own missions of the store.
     """
 
     shared = True
@@ -110,7 +110,7 @@ class LeasedOwnership:
         return lease is not None and time.monotonic() < lease.until
 
     def epoch(self, mission_id: str) -> int:
-        """The epoch of a lease of this edge, also if it has ended; 0 if it had none."""
+        """The epoch of this edge's lease, even if it has ended; 0 without one."""
         lease = self._leased.get(mission_id)
         return 0 if lease is None else lease.epoch
 
@@ -139,7 +139,7 @@ class LeasedOwnership:
             raise _misdirected(mission_id, owner)
 
     def forget(self, mission_id: str) -> None:
-        """Own a mission no longer that is deleted or taken over."""
+        """Drop the lease of a mission that is deleted or taken over."""
         self._leased.pop(mission_id, None)
 
     def close(self) -> None:
@@ -167,7 +167,7 @@ class LeasedOwnership:
         leases, asked_at = dict(self._leased), time.monotonic()
         renewed = self._leases.renew(self._term_s)
         for mission_id, lease in leases.items():
-            # A lease that has ended is taken again by the next request for its mission, if nobody else has it by then.
+            # The next request for the mission of an ended lease takes it again, unless another edge has it by then.
             valid = renewed.get(mission_id) == lease.epoch
             lease.until = asked_at + self._term_s if valid else 0.0
         ended = [mission_id for mission_id, lease in leases.items() if not lease.until]

@@ -56,8 +56,8 @@ class StoredMissions:
         self._on_load = on_load
         self._on_drop = on_drop
         self._under_way: dict[str, asyncio.Task[None]] = {}
-        # A single thread of its own, so that a store that hangs delays no decision, and because torch draws initial
-        # weights from one generator.
+        # A separate thread, so that a hanging store delays no decision; a single one, because torch has one generator
+        # for initial weights.
         self._reading = ThreadPoolExecutor(max_workers=1, thread_name_prefix="reader")
         self.ownership: LeasedOwnership | SoleOwnership = SoleOwnership()
         if store.leases is None:
@@ -69,7 +69,7 @@ class StoredMissions:
         journal.on_lost = self.drop
 
     async def load(self, mission_id: str, within_s: float) -> None:
-        """Load a mission, if it is in the store, while decisions for others continue.
+        """Load a mission, if it is in the store; decisions for other missions continue.
 
         Raises:
             Misdirected: another edge has it.
@@ -80,7 +80,7 @@ class StoredMissions:
             await self._share(mission_id, self._load, within_s)
 
     async def claim(self, mission_id: str, within_s: float) -> None:
-        """Take the lease of a mission that is to be made; load the mission, if another edge has made it meanwhile.
+        """Take the lease of a new mission; load the mission if another edge has made it meanwhile.
 
         Raises: as :meth:`load`.
         """
@@ -104,7 +104,7 @@ class StoredMissions:
         self._reading.shutdown(wait=False, cancel_futures=True)
 
     async def _share(self, mission_id: str, work: Callable[[str], Coroutine[Any, Any, None]], within_s: float) -> None:
-        """Wait for what is under way for a mission, or begin it; requests that come together share its result."""
+        """Start work on a mission, or join the work in progress; concurrent requests share its result."""
         task = self._under_way.get(mission_id)
         if task is None:
             task = self._under_way[mission_id] = asyncio.create_task(work(mission_id), name="load-mission")
@@ -112,7 +112,7 @@ class StoredMissions:
         await asyncio.wait({task}, timeout=max(0.0, within_s))
         if not task.done():
             raise Unavailable("mission_id", f"mission {mission_id} is being loaded from the store")
-        # Raises the errors of loading. The mission may be deleted since.
+        # Raises the errors of loading. The mission may have been deleted since.
         task.result()
 
     async def _load(self, mission_id: str) -> None:
@@ -135,24 +135,24 @@ class StoredMissions:
         return True
 
     async def _claim(self, mission_id: str) -> None:
-        """Take a mission's lease, if it is free. The mission stays in memory only if nobody else has had it since."""
+        """Take a mission's lease, if it is free. The mission stays in memory only if no other edge has had it since."""
         epoch = await self._unless_misdirected(self.ownership.claim, mission_id)
         if mission_id in self._missions and self._journal.epoch(mission_id) != epoch:
             self._unload(mission_id)
 
     async def _unless_misdirected(self, function: Callable[[str], T], mission_id: str) -> T:
-        """Run a function of the ownership; forget the mission where another edge has it."""
+        """Run a function of the ownership; drop the mission if another edge has it."""
         try:
             return await self._read(function, mission_id)
         except Misdirected as other:
             self.drop(mission_id)
             if other.owner is not None and other.owner == self._settings.advertise_url:
-                # One that has ended. A client that is sent to its address would come back here.
+                # The owner has ended: a client redirected to its address would come back here.
                 raise Unavailable("mission_id", "its owner at this address has ended: send it again") from None
             raise
 
     async def _restore(self, mission_id: str) -> None:
-        """Make the mission from what is in the store, in the reader's thread, unless it is in memory."""
+        """Load the mission from the store in the reader's thread, unless it is in memory."""
         if mission_id in self._missions:
             return
         epoch = self.ownership.epoch(mission_id)
@@ -194,7 +194,7 @@ class StoredMissions:
             raise Unavailable("mission_id", "the store cannot be read; the log has the details") from None
 
     def _reconcile(self, taken: set[str], unowned: list[str]) -> None:
-        """The leases were renewed: drop what other edges have taken over, and list what nobody else has."""
+        """After a renewal: drop the missions that other edges have taken over, and list those that none owns."""
         for mission_id in taken:
             self.drop(mission_id)
         self.listed = set(unowned) - self._missions.keys()

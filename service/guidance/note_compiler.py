@@ -3,7 +3,7 @@
 The prompt is a conversation with worked examples that resemble the note. Where the server can constrain its answer, it
 is constrained to the orders that the note's numbers allow. The answer is parsed strictly in any case; an answer that
 does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
-LLM no note is compiled. An embedded LLM with the orders' adapter reads the note otherwise: see
+LLM no note is compiled. An embedded LLM with the orders' adapter reads the note differently: see
 :mod:`service.guidance.note_readings`.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
@@ -53,7 +53,7 @@ class NoteOwner(Protocol):
         ...
 
     def fail_guidance(self, reason: str, model: str | None) -> None:
-        """Note that the note was not compiled."""
+        """Record that the note was not compiled."""
         ...
 
 
@@ -87,12 +87,12 @@ class NoteCompiler:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _compile(self, mission: NoteOwner) -> None:
-        # Meanwhile the operator may give another note.
+        # The operator may give another note meanwhile.
         while mission.guidance.status == "compiling" and (note := mission.guidance.note) is not None:
             await self._compile_once(mission, note)
 
     async def _compile_once(self, mission: NoteOwner, note: str) -> None:
-        """Compile this note; what comes of it is dropped where the mission has another note by then."""
+        """Compile this note; the result is dropped if the mission has another note by then."""
         try:
             async with asyncio.timeout(_TIMEOUT_S), self._lock:
                 await self._wait_for_llm()
@@ -115,7 +115,7 @@ class NoteCompiler:
             self._on_change(mission.mission_id)
 
     async def _wait_for_llm(self) -> None:
-        """Wait while the LLM loads or recovers; raises ``NoDecision`` where it does neither and is not ready."""
+        """Wait while the LLM loads or recovers; raises ``NoDecision`` if it does neither and is not ready."""
         while self._llm.status != "ready" and self._llm.recovering:
             await asyncio.sleep(_POLL_S)
         if self._llm.status != "ready":
@@ -135,13 +135,13 @@ async def compile_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteRe
         Impossible: no answer passes, and the first one orders something that the fleet cannot do.
         NoDecision: the LLM gave no answer.
     """
-    begun = time.monotonic()
+    started = time.monotonic()
     if llm.reads_letters:
         async with asyncio.timeout(_ANSWER_S):
             reading = await read_note(note, scenario, llm)
     else:
         reading = await _rewrite_note(note, scenario, llm)
-    log.info("note compiled in %.1f s", time.monotonic() - begun)
+    log.info("note compiled in %.1f s", time.monotonic() - started)
     return reading
 
 

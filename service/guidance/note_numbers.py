@@ -1,7 +1,7 @@
 """The numbers of an operator's note, each replaced by a letter: the note as the orders' adapter reads it.
 
 ``Visit sensor 4 every third step`` becomes ``visit sensor K every Bth step``. The adapter answers in letters, so it
-cannot invent a number, and code alone reads values and units.
+cannot invent a number; only code reads values and units.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TENS = [
     "twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety",
 ]
 # fmt: on
-# These words stay beside their letter, as they say more than a number.
+# These words stay next to their letter: they carry more meaning than a number.
 _FACTORS = {"twice": 2.0, "double": 2.0, "doubly": 2.0, "triple": 3.0, "thrice": 3.0, "half": 0.5}
 _TELLING = {"zero": 0.0, "one": 1.0, "first": 1.0, "second": 2.0, "other": 2.0, "alternate": 2.0, **_FACTORS}
 

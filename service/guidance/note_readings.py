@@ -1,7 +1,7 @@
 """Reading a note with the orders' adapter: three times, each time with other letters for its numbers.
 
-The letters are drawn anew for each reading, so that an answer that hangs on a letter does not come twice. The reading
-that comes most often is the note's, and it has doubts where another one differs or a token of its answers was unlikely.
+The letters are drawn anew for each reading, so that an answer caused by a letter does not recur. The most frequent
+reading is the note's. It has doubts if another one differs or a token of an answer was unlikely.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from shared.planning.orders import Impossible
 from shared.world.scenario import Scenario
 
 _READINGS = 3
-# An answer is sure where its tokens together are as likely as this. Of 160 made-up notes of held-out phrasings the
-# adapter that ships read 20 with this certainty, all correctly; at 0.98 it read 25, 2 of them wrongly, at 0.8 64 and 8.
+# An answer is certain if the joint probability of its tokens is at least this. Of 160 made-up notes of held-out
+# phrasings the adapter that ships read 20 with this certainty, all correctly; at 0.98 it read 25, 2 of them wrongly, at
+# 0.8 64 and 8.
 _SURE = 0.99
 _MOST_TOKENS = 96
 _LIKELIEST = 5
@@ -66,17 +67,17 @@ def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading
 
 
 def _probability(answer: Completion) -> float:
-    """The probability of the answer's tokens together; 0 where the server does not say it."""
+    """The joint probability of the answer's tokens; 0 if the server gives none."""
     if not answer.positions:
         return 0.0
     return math.prod(position.likeliest.get(position.token.strip(), 0.0) for position in answer.positions)
 
 
 def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]]) -> NoteReading:
-    """The reading that comes most often, the likelier of two; raises the error that comes so."""
-    said = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
-    often = Counter(said)
-    best = max(range(len(found)), key=lambda i: (often[said[i]], found[i][1]))
+    """The most frequent reading, the likelier of equal ones; raises the most frequent error."""
+    texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
+    often = Counter(texts)
+    best = max(range(len(found)), key=lambda i: (often[texts[i]], found[i][1]))
     reading = found[best][0]
     if isinstance(reading, Exception):
         raise reading

@@ -37,13 +37,13 @@ class OperatorGuidance:
         self._doubts: list[str] = []
 
     def propose(self, guidance: Guidance, model: str | None, doubts: Sequence[str] = ()) -> None:
-        """Propose the guidance that an LLM made of the note; until the operator confirms it, a prompt alone has it."""
+        """Propose the guidance that an LLM made of the note; until the operator confirms it, only a prompt shows it."""
         if self.status == "compiling":
             self.status, self._proposed, self._origin, self._model = "proposed", guidance, "llm", model
             self._doubts = list(doubts)
 
     def fail(self, reason: str, model: str | None) -> None:
-        """Note that the note was not compiled."""
+        """Record that the note was not compiled."""
         if self.status == "compiling":
             self.status, self._failure, self._model = "failed", reason, model
 
@@ -101,15 +101,15 @@ class OperatorGuidance:
 
     @property
     def version(self) -> str:
-        """A digest of the whole state, so that it outlives a restart and names no other state after one."""
+        """A digest of the whole state, which a restart does not change."""
         return hashlib.sha256(repr(self.state_dict()).encode()).hexdigest()[:16]
 
     @property
     def read(self) -> Guidance | None:
-        """The orders that a prompt shows: ``orders``, and beside them a reading that nobody has answered yet."""
+        """The orders that a prompt shows: ``orders``, merged with a reading that awaits an answer."""
         if self.status != "proposed" or not self._proposed:
             return self.orders
-        return self._proposed.beside(self.confirmed, self._scenario.max_velocity + 1)
+        return self._proposed.merged_with(self.confirmed, self._scenario.max_velocity + 1)
 
     def report(self, mission_id: str) -> GuidanceStatus:
         """The body of ``GET /missions/{id}/guidance``."""

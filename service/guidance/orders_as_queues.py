@@ -1,4 +1,4 @@
-"""Orders as the compact prompt shows them: a visit's deadline is a queue that overflows then."""
+"""Orders in the compact prompt: a visit's deadline appears as a queue that overflows at that time."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def as_queues(
         return state, reach
     capacity = float(scenario.queue_capacity)
     weights = orders.weights(scenario.sensors)[state.ids]
-    every = orders.every(scenario.sensors)[state.ids]
-    waited = np.minimum((step - visits[state.ids]) / every, 1.0)
+    interval = orders.visit_intervals(scenario.sensors)[state.ids]
+    waited = np.minimum((step - visits[state.ids]) / interval, 1.0)
     queue = np.maximum(np.minimum(weights * state.queue, capacity), capacity * waited)
-    rate = np.maximum(weights * state.rate, capacity / every)
+    rate = np.maximum(weights * state.rate, capacity / interval)
     overflow = overflow_probability(queue, rate, scenario)
     urgency = urgency_of(queue, overflow, scenario)
     shown = Reach.of(reach.links, np.where(state.able, queue, 0.0), urgency)

@@ -49,7 +49,7 @@ class StepGuidance:
         """The allowed level nearest to the given one, for the sensor in that row.
 
         Where the sensor is due, only levels that bring it in reach count. The nearest level is taken, not the best one:
-        the values of levels were learned with all levels, and the best of the slow ones alone makes a UAV hover.
+        the values of levels were learned with all levels, and the best of only the slow ones makes a UAV hover.
         """
         choices = np.flatnonzero(self.due[:, row] if self.due[:, row].any() else self.allowed)
         return int(choices[np.abs(choices - level).argmin()])

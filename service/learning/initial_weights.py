@@ -12,7 +12,7 @@ from torch import Tensor
 from service.learning.modules import Modules, Weights
 from shared.wire.schemas import Features, Init
 
-# The weights that preset `paper` has for each velocity level; preset `reach` has none.
+# The weights of preset `paper` by velocity level; preset `reach` has none.
 _LEVEL_TENSORS = ("velocity.out.weight", "velocity.out.bias")
 
 
@@ -52,6 +52,6 @@ def _packaged(preset: Features) -> dict[str, Tensor]:
     with files("service").joinpath("checkpoints", f"{preset}.pt").open("rb") as file:
         checkpoint = torch.load(file, weights_only=True)
     if checkpoint["features"] != preset:
-        raise ValueError(f"checkpoints/{preset}.pt holds modules of the feature preset {checkpoint['features']}")
+        raise ValueError(f"checkpoints/{preset}.pt has modules of the feature preset {checkpoint['features']}")
     weights: dict[str, Tensor] = checkpoint["weights"]
     return weights

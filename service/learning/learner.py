@@ -40,7 +40,7 @@ class Learner:
         """Take one step of Adam on one outcome; returns the loss before it.
 
         Raises:
-            FloatingPointError: the gradient is not finite. The weights, which would be lost for good, do not change.
+            FloatingPointError: the gradient is not finite; the weights do not change.
         """
         weights = self.weights
         gradient, into = _gradient_of(weights.layout)
@@ -49,7 +49,7 @@ class Learner:
         if self._moments is None:
             self._moments = Moments(np.zeros_like(gradient), np.zeros_like(gradient))
         self.weights = Weights(weights.layout, adam_step(weights.flat, self._moments, gradient, self._learning_rate))
-        # The loss comes first: a reader that sees the new count also sees the new loss.
+        # The loss is set first, so that a reader of the new count also sees the new loss.
         self.last_loss = loss
         self.updates += 1
         return loss
@@ -85,7 +85,7 @@ class Learner:
 def _gradient_of(layout: Layout) -> tuple[Array, Parameters]:
     """This thread's flat gradient of the layout's size, and its views by parameter.
 
-    A new one for each training sample would fragment the heap.
+    Allocating one for each training sample would fragment the heap.
     """
     buffers: dict[tuple[str, int], tuple[Array, Parameters]] = _gradients.__dict__.setdefault("by_layout", {})
     kind = layout.preset, layout.size

@@ -82,9 +82,10 @@ def attend(weights: AttentionTensors, x: Tensor, admissible: Tensor | None = Non
     """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
 
     Args:
-        admissible: ``(..., n)`` booleans; the results of the other sensors mean nothing. Default: all are admissible.
+        admissible: ``(..., n)`` booleans; the results of the other sensors are meaningless. Default: all are
+            admissible.
     """
-    # Only with four axes (batch, head, n, d') does torch take the kernel that makes no n x n tensor.
+    # Only for four axes (batch, head, n, d') torch selects the kernel without an n x n tensor.
     n, d = x.shape[-2:]
     wide = x.reshape(-1, 1, n, d)
     q = functional.linear(wide, weights.query)
@@ -108,7 +109,7 @@ def top_k(scores: Array, k: int) -> list[int]:
     if len(scores) <= max(_MANY, k):
         best: list[int] = losses.argsort(kind="stable")[:k].tolist()
         return best
-    # Of many, those alone are sorted that are not behind the k-th.
+    # Of many, only those not behind the k-th are sorted.
     ahead = np.flatnonzero(~(losses > np.partition(losses, k - 1)[k - 1]))
     best = ahead[losses[ahead].argsort(kind="stable")[:k]].tolist()
     return best
@@ -131,7 +132,7 @@ def _values(weights: VelocityTensors, x: Tensor) -> Tensor:
 
 
 class Weights:
-    """The parameters that decisions compute with: a finished copy that nothing changes.
+    """The parameters for decisions: an immutable copy.
 
     Attributes:
         layout: positions of the parameters in ``flat``.
@@ -172,7 +173,7 @@ class Weights:
     def _contexts(self, features: Array, queries: Array, rows: list[int]) -> Array:
         """The contexts of some rows ``(m, d')``, from all features and queries ``(n, d)``."""
         contexts = np.empty((len(rows), len(self.parameters.value)), dtype=np.float32)
-        # One after another, as in `velocities`.
+        # One at a time, as in `velocities`.
         for place, row in enumerate(rows):
             weights = softmax((features @ queries[row])[None])
             contexts[place] = self.parameters.value @ (weights @ features)[0]
@@ -182,7 +183,7 @@ class Weights:
         """Values ``(levels,)`` of the velocities for each of n sensors, from their contexts ``(n, d')``."""
         own = self.parameters
         found = []
-        # One after another: the last bits of a product depend on its size. No value may depend on the other sensors.
+        # One at a time: the last bits of a product depend on its size, and no value may depend on the other sensors.
         for z, approach in zip(contexts, approaches, strict=True):
             if self.layout.preset == "paper":
                 hidden = np.maximum(own.hidden @ np.concatenate((z, approach)) + own.hidden_bias, 0)

@@ -1,6 +1,6 @@
 """Means of many values, weighted by the softmax of products, compiled by numba: one head of attention over sensors.
 
-``mean_i = sum_j w_ij v_j / sum_j w_ij`` with ``w_ij = exp(q_i k_j)``. No array has a number for each pair.
+``mean_i = sum_j w_ij v_j / sum_j w_ij`` with ``w_ij = exp(q_i k_j)``, without an array of all pairs.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from shared.kit.compiled import compiled, inlined
 
 Array = NDArray[np.float32]
 
-# Queries that are computed at a time: what they need stays in a core's nearest cache.
+# Queries per block, so that their data stays in a core's first-level cache.
 _SHARE = 256
-# Keys whose products with a query are computed at a time, and dimensions that are added at a time.
+# Keys multiplied with a query at a time, and dimensions added at a time.
 _KEYS, _DIMENSIONS = 4, 4
-# The largest product of a query with some keys, about so many, stands for its largest product. Where it is so far below
-# that the sum of the weights exceeds this, the largest one of all is looked for.
+# A query's largest product is estimated from about this many keys. If the sum of the weights then exceeds the limit,
+# all keys are searched.
 _SOME_KEYS, _MOST_WEIGHT = 64, np.float32(2.0**100)
-# Exponents of 2. Weights below are as good as zero, and not so small that the processor computes them slowly; weights
-# above are more than a number can be.
+# Exponents of 2. Weights below the least are practically zero, yet above the slow denormal numbers; weights above the
+# largest overflow.
 _LEAST, _MOST = np.float32(-100.0), np.float32(126.0)
-# Added before an exponent is cut to a whole number, and subtracted after it: it is rounded.
+# Added before an exponent is truncated and subtracted afterwards, which rounds it.
 _ROUNDS, _BACK = np.float32(126.5), np.float32(126.0)
 # The bits of a number's exponent, and the exponent of 1 after _ROUNDS.
 _EXPONENT, _ONE = np.int32(23), np.int32(1)
-# 2^f for f from -1/2 to 1/2 is sum_n c_n f^n but for 2.3e-7 of it, with rounding: fitted by the largest relative error.
+# 2^f = sum_n c_n f^n for -1/2 <= f <= 1/2, fitted to the least maximum relative error: 2.3e-7 with rounding.
 _C0, _C1, _C2 = np.float32(1.0000001192), np.float32(0.693146944), np.float32(0.2402212024)
 _C3, _C4, _C5 = np.float32(0.0555071309), np.float32(0.0096755410), np.float32(0.0013276471)
 
@@ -58,7 +58,7 @@ class _Work(NamedTuple):
 
 def softmax(logits: Array) -> Array:
     """The softmax of each row ``(m, n)``; the logits are overwritten."""
-    # For a few numbers their own methods take twice as long.
+    # For a few numbers the array methods take twice as long.
     logits -= np.maximum.reduce(logits, axis=1, keepdims=True)
     np.exp(logits, out=logits)
     logits /= np.add.reduce(logits, axis=1, keepdims=True)
@@ -73,14 +73,14 @@ def softmax_means(queries: Array, keys: Array, values: Array) -> Array:
         keys: shape ``(n, d)``, at least one.
         values: shape ``(n,)``.
     """
-    # Zeros fill up the dimensions, and the first key the keys, where it counts 0 times.
+    # Dimensions are padded with zeros, and keys with the first key at weight 0.
     n, d = keys.shape
     rows, columns = -(-n // _KEYS) * _KEYS, -(-d // _DIMENSIONS) * _DIMENSIONS
     filled = np.zeros((rows, columns), dtype=np.float32)
     filled[:n, :d], filled[n:, :d] = keys, keys[0]
     counted = np.zeros((rows, 2), dtype=np.float32)
     counted[:n, 0], counted[:n, 1] = 1.0, values
-    # Powers of 2 are easier to compute than those of e.
+    # Powers of 2 are faster to compute than powers of e.
     wide = np.zeros((columns, len(queries)), dtype=np.float32)
     wide[:d] = queries.T * np.float32(math.log2(math.e))
 
@@ -103,7 +103,7 @@ def _means(queries: Array, keys: Array, counted: Array) -> Array:
 def _sum_up(queries: Array, keys: Array, counted: Array, stride: int, work: _Work) -> None:
     """Write the sums of the weights and of the weighted values.
 
-    The largest product is looked for in four keys of every ``stride``.
+    The largest product is searched in four keys of each ``stride``.
     """
     largest, product, part = work.largest, work.product, work.part
     for i in range(len(largest)):
@@ -131,8 +131,8 @@ def _multiply(
 ) -> None:
     """The products of four keys with the queries, less the largest ones.
 
-    Four keys share what is read of the queries; their arrays are arguments, because an index into them would keep numba
-    from vector instructions.
+    Four keys share the reads of the queries. Their arrays are separate arguments, because indexing them would prevent
+    vector instructions.
     """
     for c in range(0, queries.shape[0], _DIMENSIONS):
         a0, a1, a2, a3 = keys[j, c], keys[j, c + 1], keys[j, c + 2], keys[j, c + 3]

@@ -1,6 +1,6 @@
 """One step of online value regression: its gradient, written out, and Adam, compiled by numba.
 
-Of about thirty products of small arrays each takes longer to call than to compute, so they are one function.
+The step has about thirty products of small arrays; each takes longer to call than to compute, so one function has all.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def adam_step(weights: Array, moments: Moments, gradient: Array, learning_rate: 
     """The weights ``(n,)`` after one more step of Adam (Kingma and Ba 2015) down the gradient ``(n,)``.
 
     The result equals that of ``torch.optim.Adam`` but for the last bits. That class imports torch's compiler at its
-    first use, during which nothing else of the process runs for seconds, and takes its steps parameter by parameter.
-    This function changes the moments.
+    first use, which blocks the process for seconds, and updates parameter by parameter. This function changes the
+    moments.
 
     Raises:
         FloatingPointError: the gradient is not finite; the moments do not change.
@@ -47,8 +47,8 @@ def adam_step(weights: Array, moments: Moments, gradient: Array, learning_rate: 
 def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters) -> float:
     """The loss ``(s_j - r)^2 + (u_v - r)^2`` of :meth:`Modules.loss`, and its gradient.
 
-    Of all sensors' scores the loss reads one, that of the chosen sensor. So the work grows with the number of sensors,
-    whereas the backward pass of the whole attention grows with its square.
+    The loss depends on the chosen sensor's score only. So the work grows with the number of sensors, whereas the
+    backward pass of the whole attention grows with its square.
 
     Args:
         into: the gradient is written here; zeros before.

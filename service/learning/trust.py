@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 from shared.kit.bounded import BoundedDict
 
-# Share of the weight at each decision: an adviser that improves after a bad time is back in some ten decisions.
+# The fixed share at each decision: an adviser that improves recovers within some ten decisions.
 _SHARE = 0.01
 # Log-odds for a packet of regret.
 RATE = 0.6
@@ -44,13 +44,13 @@ RATE = 0.6
 CAP = 8.0
 # Packets that one failed transmission more than predicted counts as.
 _SCALE = 4.0
-# The least q(b): no adviser's surprise counts more than four times.
+# The least q(b), which limits the factor of a surprise to four.
 _LEAST_PROBABILITY = 0.25
 # Decisions that the mean surprise is averaged over.
 _MEMORY = 20
 
 LLM, PLANNER = "llm", "planner"
-# The initial weights. The planner looks further ahead than the others, and its quality is known.
+# The initial weights. The planner looks further ahead than the other advisers, and its quality is known.
 PRIOR = {LLM: 0.2, PLANNER: 0.6, "value": 0.1, "policy": 0.1}
 # The initial weights without a planner. A bad LLM loses its weight within a few decisions, in which the evaluator
 # prevents its worst advice. An LLM that answers as the planner would lost 17.4 packets with a prior of 0.8, 19.1 with

@@ -33,7 +33,7 @@ _MOST_FRAMES, _MOST_BYTES = 30, 1_000_000
 # Decisions in a snapshot.
 _SHOWN = 300
 _HEARTBEAT_S = 5.0
-# A listener that accepts nothing for so long has stopped reading. The limit is shorter while the service closes.
+# A listener that accepts nothing for this long has stopped reading. The limit is shorter while the service closes.
 _STALLED_S, _LAST_S = 20.0, 0.5
 
 
@@ -58,7 +58,7 @@ class MissionStream:
         self._ticking = asyncio.create_task(self._tick(), name="live-updates")
 
     def change(self) -> None:
-        """Note that the page's content has changed."""
+        """Record that the page's content has changed."""
         self._changed.set()
 
     def notify(self) -> None:
@@ -146,13 +146,13 @@ class Broadcaster:
         self._closing = False
 
     def decided(self, mission: Mission, uav: UavState, prompt: Prompt, answer: DecideResponse) -> None:
-        """Show an answered decision with its prompt, whether an LLM received the prompt or not."""
+        """Show an answered decision with its prompt, even if no LLM received it."""
         self._watch.decided(mission, uav, answer.step)
         self.history.decided((uav.position[0], uav.position[1]), prompt, answer)
         self.changed(answer.mission_id)
 
     def changed(self, mission_id: str) -> None:
-        """Note that the content of the mission's page has changed."""
+        """Record that the content of the mission's page has changed."""
         if (stream := self._streams.get(mission_id)) is not None:
             stream.change()
 
@@ -171,7 +171,7 @@ class Broadcaster:
             stream.notify()
 
     def close(self) -> None:
-        """End every stream: at once where its listener reads, else after a moment."""
+        """End every stream: immediately if its listener reads, otherwise after half a second."""
         self._closing = True
         for stream in self._streams.values():
             stream.notify()

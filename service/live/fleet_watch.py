@@ -1,4 +1,4 @@
-"""What the reports of a fleet say about its troubles: overflows by step, and silent sensors."""
+"""A fleet's problems in its reports: overflows by step, and silent sensors."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from shared.world.channel import FloatArray
 from shared.world.scenario import Scenario
 from shared.world.urgency import overflow_probability
 
-# Missions that are watched, and the steps that are remembered of each.
+# Most missions watched, and most steps remembered of each.
 _MOST_MISSIONS = 1000
 _MOST_STEPS = 1000
 
 
 @dataclass(slots=True)
 class Watched:
-    """What was seen of one mission since the edge started.
+    """Observations of one mission since the edge started.
 
     Attributes:
         full: by step, the expected number of sensors that overflowed into it, as the fleet believed at its first
@@ -52,7 +52,7 @@ class FleetWatch:
         self._missions = BoundedDict[str, Watched](_MOST_MISSIONS)
 
     def decided(self, mission: Mission, uav: UavState, step: int) -> None:
-        """Take a report that was answered, and the belief after it."""
+        """Record an answered report, and the belief after it."""
         watched = self.of(mission.mission_id)
         watched.decided_at = time.monotonic()
         if step not in watched.full:
@@ -60,7 +60,7 @@ class FleetWatch:
         self._hear(watched, mission, uav, step)
 
     def of(self, mission_id: str) -> Watched:
-        """What was seen of the mission."""
+        """The mission's observations."""
         found = self._missions.get(mission_id)
         if found is None:
             found = self._missions[mission_id] = Watched()
@@ -88,6 +88,6 @@ def _overflowed(belief: FleetBelief, step: int, scenario: Scenario) -> FloatArra
     """The probability that each queue is full at a step's start, ``P(base + Poisson(rate x steps since) >= W)``."""
     # The arrivals of the steps since, in terms of the function's own horizon.
     arrived = belief.arrivals.rate * np.maximum(step - belief.since, 0) / scenario.overflow_horizon_steps
-    # One packet more than there is: at least full, not more than full.
+    # One more packet turns "more than full" into "at least full".
     reached = overflow_probability(belief.base + 1, arrived, scenario)
     return np.where(belief.base >= scenario.queue_capacity, 1.0, reached)

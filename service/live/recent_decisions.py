@@ -51,10 +51,10 @@ class RecentDecision:
 
 
 class RecentDecisions:
-    """Decisions by ID, oldest first. An entry only refers to objects that exist anyway.
+    """Decisions by ID, oldest first. An entry refers to existing objects.
 
     Attributes:
-        decided_at: when the newest was added, seconds of the machine's monotonic clock; 0 before the first.
+        decided_at: time of the newest, seconds of the machine's monotonic clock; 0 before the first.
     """
 
     def __init__(self) -> None:

@@ -14,7 +14,7 @@ from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 from shared.world.urgency import urgency
 
-# Steps until a queue is full, of a sensor that gets hardly any packets.
+# The most steps until a queue is full, for a sensor with hardly any arrivals.
 _NEVER = 10_000
 # Points of a trajectory. The error for a circle of 300 m is less than half a metre.
 _POINTS = 97
@@ -24,7 +24,7 @@ def snapshot(mission: Mission, decisions: list[RecentDecision], watched: Watched
     """The complete state of the page, with these decisions.
 
     Args:
-        watched: what the reports say of the fleet's troubles.
+        watched: the fleet's problems in its reports.
         edge: an ID of this process: after a restart the earlier decisions are unknown.
     """
     scenario = mission.scenario
@@ -74,7 +74,7 @@ def located_sensors(mission: Mission) -> int:
 _SHOWN = {"name", "sensors", "uavs", "steps", "area_m", "step_s", "queue_capacity", "radio_radius_m", "max_velocity"}
 
 
-# The page has an alarm for a sensor whose links lose this much more than modelled, dB: a tenth of the power arrives.
+# The excess loss from which the page shows an alarm, dB: a tenth of the power arrives.
 _WORSE_DB = 10.0
 # Steps whose numbers an update repeats, so that none is missed.
 _NEWEST_STEPS = 20
@@ -111,14 +111,10 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
 
 
 def _guidance(mission: Mission) -> dict[str, Any]:
-    """The operator's note, what was understood of it, and each order for a sensor with its deadline."""
-    told, orders, visits = (
-        mission.guidance.report(mission.mission_id),
-        mission.guidance.confirmed,
-        mission.records.visits,
-    )
+    """The operator's note, the guidance from it, and each order for a sensor with its deadline."""
+    visits = mission.records.visits
     return {
-        **told.model_dump(exclude={"mission_id"}),
+        **mission.guidance.report(mission.mission_id).model_dump(exclude={"mission_id"}),
         "orders": [
             {
                 "sensor_id": wish.sensor_id,
@@ -126,7 +122,7 @@ def _guidance(mission: Mission) -> dict[str, Any]:
                 "weight": wish.weight,
                 "due": None if wish.visit_every is None else int(visits[wish.sensor_id]) + wish.visit_every,
             }
-            for wish in orders.sensors
+            for wish in mission.guidance.confirmed.sensors
         ],
     }
 
@@ -142,5 +138,5 @@ def _curves(scenario: Scenario) -> list[Any]:
 
 
 def _json(value: dict[str, Any]) -> bytes:
-    # The position of a sensor is NaN until a report names it.
+    # A sensor's position is NaN until a report names it.
     return to_json(value, inf_nan_mode="null")

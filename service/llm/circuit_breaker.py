@@ -1,7 +1,7 @@
-"""The circuit breaker: an LLM that fails again and again gets no calls for a while, so that no decision waits for it.
+"""The circuit breaker: an LLM that fails repeatedly gets no calls for a while, so that no decision waits for it.
 
 Closed, the breaker lets calls through. Three failures in a row open it, and no call goes through. After a pause the LLM
-is probed beside the decisions, so that no UAV pays for the attempt. An answered probe makes the breaker half open:
+is probed in the background, so that no decision waits for the attempt. An answered probe makes the breaker half open:
 calls go through again, the first failure opens it for twice as long, and the first answer closes it.
 :mod:`service.llm.server` decides what counts as a failure.
 """
@@ -48,11 +48,10 @@ class CircuitBreaker:
 
 
 class SilenceCounter:
-    """Adds up the time in which calls waited in vain; so much of it, without an answer between, is one failure.
+    """Adds up the time that calls waited without an answer; enough of it without an answer in between is one failure.
 
-    A call that was cancelled early, by a short deadline or in a fleet that shares one, counts for the time that it
-    waited. Calls that waited side by side count once. A call during which another was answered does not count: it
-    waited in the server's queue.
+    A call cancelled early by a short deadline counts for the time that it waited. Time in which several calls waited
+    counts once. A call during which another was answered does not count: it waited in the server's queue.
 
     Args:
         failure_s: seconds of silence that are one failure.
@@ -67,7 +66,7 @@ class SilenceCounter:
         self.answered_at = self._counted_until = -math.inf
 
     def cancelled(self, begun: float, now: float) -> bool:
-        """Count a call that was cancelled while it waited; returns whether the silence is a failure now."""
+        """Count a call that was cancelled while it waited; returns whether this completes a failure."""
         if self.answered_at > begun:
             return False
         if self.answered_at > self._counted_until:

@@ -1,6 +1,6 @@
 """The HTTP client for every OpenAI-compatible server: OpenAI, vLLM, llama.cpp, Ollama, and the embedded one.
 
-The bytes that one call may bring are bounded: aiohttp by itself reads response heads without end, on the event loop.
+The bytes of one response are bounded: aiohttp itself reads response heads without limit, on the event loop.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from yarl import URL
 from service.llm.answers import Completion, NoDecision, NotUnderstood, TokenPosition, Unreachable
 from service.llm.request_bodies import TOP_LOGPROBS
 
-# No honest chat completion of two integers comes near this; an endless body must not fill the memory.
+# Far above any regular completion of two integers; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_TOKEN = 256 * 1024, 8 * 1024
-# Bytes beside the body: heads, of which there may be several, the frames of chunks, trailers.
+# Bytes in addition to the body: heads (possibly several), chunk framing and trailers.
 _MAX_HEAD_BYTES = 64 * 1024
 _MAX_TOKENS, _MAX_POSITIONS = 10**9, 256
 # Each decision's answer, log line and trace has the model's name; the longest real names are paths.
@@ -60,7 +60,7 @@ class LLMClient:
         self._session_header = session_header
         # Parsed once: aiohttp would parse a string at each call.
         self._models, self._completions = (URL(f"{base_url}/{path}") for path in ("models", "chat/completions"))
-        # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before it is counted.
+        # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before its size is checked.
         headers = {"Accept-Encoding": "identity", "Content-Type": "application/json"}
         if api_key:
             headers["Authorization"] = f"Bearer {api_key}"
@@ -98,8 +98,7 @@ class LLMClient:
         """The chat completion of a request body; raises :class:`NoDecision`.
 
         Args:
-            session: what completions that share a prefix have in common: requests of one session may be routed to one
-                server.
+            session: an ID shared by completions with a common prefix, which a router may send to the same server.
         """
         # Each token may come with the likeliest tokens of its position.
         most = max(_MAX_RESPONSE_BYTES, _BYTES_A_TOKEN * body.get("max_tokens", 1))
@@ -159,7 +158,7 @@ class LLMClient:
 
 
 def _positions(choice: Any) -> tuple[TokenPosition, ...]:
-    """The positions of an answer that are readable: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
+    """The readable positions of an answer: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
     found: list[TokenPosition] = []
     try:
         for position in choice["logprobs"]["content"][:_MAX_POSITIONS]:
@@ -205,7 +204,7 @@ def _proxy_to(url: str) -> dict[str, Any]:
 
 
 class _TooMuch(aiohttp.ClientConnectionError):
-    """The server sent more bytes than an answer can have."""
+    """The server sent more bytes than an answer may have."""
 
 
 class _BoundedConnector(aiohttp.TCPConnector):

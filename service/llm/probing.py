@@ -1,8 +1,8 @@
 """Probes of an LLM server's abilities: a server may ignore an unknown field silently, or refuse it by any status.
 
-LiteLLM's proxy before llama.cpp answers ``post_sampling_probs`` by 500 (BerriAI/litellm 21932), Xinference
-``logprobs`` (xorbitsai/inference 1911), vLLM and SGLang what they know no grammar for (vllm 13260, sglang 11401). So a
-probe that fails means that the ability is absent, and only a plain completion says whether the LLM can be used.
+LiteLLM's proxy before llama.cpp answers ``post_sampling_probs`` by 500 (BerriAI/litellm 21932), Xinference ``logprobs``
+(xorbitsai/inference 1911), vLLM and SGLang constraints that they cannot compile (vllm 13260, sglang 11401). So a probe
+that fails means that the ability is absent, and only a plain completion says whether the LLM can be used.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from service.llm.client import LLMClient
 
 _TOGETHER_TIMEOUT_S = 15.0
-# More UAVs than any fleet has.
+# More than the UAVs of any fleet.
 _ANY_NUMBER = 1000
 # No model names this sensor by itself, so a server that answers it obeys the constraint.
 _PROBE_TEXT = "Say hello."
@@ -45,7 +45,7 @@ class Abilities:
 
 
 async def probe(client: LLMClient, model: str | None) -> Abilities:
-    """Find out a server's abilities by a few short requests.
+    """Determine a server's abilities by a few short requests.
 
     Raises:
         NoDecision: the server does not answer a plain one, or is gone.
@@ -85,7 +85,7 @@ async def _gives_probabilities(client: LLMClient, model: str | None, constraint:
 
 
 async def _answers_lists(client: LLMClient, model: str | None, constraint: Constraint, logprobs: bool) -> bool:
-    """Whether the server names a label of each of two lists, which only one that obeys a constraint does."""
+    """Whether the server names a label of each of two lists, as only a constrained server does."""
     lists = [["A", "B"], ["C", "D"]]
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, lists, logprobs)
     try:

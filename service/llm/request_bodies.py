@@ -33,7 +33,7 @@ class Rewriting:
 
 @dataclass(frozen=True, slots=True)
 class WarmUp:
-    """A first request: the server reads the static block before a decision has to wait for that.
+    """The first request: the server processes the static block before a decision has to wait for it.
 
     Attributes:
         labels: labels of the answer; None where the answer is a sensor and a velocity.

@@ -15,8 +15,8 @@ from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
+from service.llm.decision_priority import DecisionPriority
 from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
-from service.llm.giving_way import GivingWay
 from service.llm.model_file import ModelMissing
 from service.llm.probing import probe, probe_body
 from service.llm.request_bodies import (
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _RETRY_S = 5.0
-# Message to a call that is cancelled because an earlier call was answered: that is no failure of this server.
+# Message to a call that is cancelled because an earlier call was answered, which is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
 _PROBE_TIMEOUT_S = 60.0
 
@@ -63,7 +63,7 @@ class LlmServer:
     Args:
         warm_up: the first request to a server.
         on_open: called when the circuit breaker opens.
-        embed: gets the embedded LLM, by default by loading it.
+        embed: returns the embedded LLM; by default it loads one.
 
     Attributes:
         status: replaced as a whole when the state changes.
@@ -71,7 +71,7 @@ class LlmServer:
         url: the server's address; empty for the embedded LLM.
         model, bare_model: name of the model, once it is known, with its adapter and without.
         notes_model: name of the model that reads notes.
-        reads_letters: whether that has the orders' adapter, which reads notes whose numbers are letters.
+        reads_letters: whether that model has the orders' adapter, which reads notes whose numbers are letters.
         constraint: the kind of constraint that the server obeys.
         logprobs: whether the server gives the probabilities of tokens.
         max_uavs_per_call: number of UAVs that one call may decide for.
@@ -102,11 +102,11 @@ class LlmServer:
         self.usability = Usability()
         self._breaker = CircuitBreaker()
         self._silence = SilenceCounter(settings.deadline_ms / 2e3)
-        self._giving_way = GivingWay()
+        self._priority = DecisionPriority()
 
     @property
     def recovering(self) -> bool:
-        """Whether an LLM that is not ready may become ready by itself."""
+        """Whether an LLM that is not ready may become ready without a restart."""
         return self._task is not None and not self._task.done()
 
     def readiness(self) -> Readiness:
@@ -162,7 +162,7 @@ class LlmServer:
     async def rewrite(self, wanted: Rewriting, *, temperature: float, seed: int) -> Completion:
         """Call for a rewritten text.
 
-        The embedded model has one slot: a few times, the call is given up for a decision and begins again.
+        The embedded model has one slot: decisions cancel the call up to three times, and it starts again.
 
         Raises:
             ValueError: ``wanted.constrain`` finds nothing to rewrite.
@@ -170,13 +170,13 @@ class LlmServer:
         """
         body = rewriting_body(self.model, wanted, wanted.constrain(self.constraint), temperature, seed)
         ask = partial(self._ask_about_note, body)
-        return await ask() if self._embedded is None else await self._giving_way.answer(ask)
+        return await ask() if self._embedded is None else await self._priority.answer(ask)
 
     async def _decide(self, mission_id: str, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
         """Call for a decision, and count its result; ``silence`` counts the wait of a cancelled call."""
         begun = time.monotonic()
         try:
-            with self._giving_way.decision():
+            with self._priority.decision():
                 answer = await self._ask(body, mission_id)
         except NotUnderstood:
             # The fault is the request's, not the server's.
@@ -292,7 +292,7 @@ class LlmServer:
 
 
 def _http_client() -> type[LLMClient]:
-    """The client's class: importing aiohttp takes a fifth of a second, in which the edge decides already."""
+    """The client's class, imported in a thread: importing aiohttp takes a fifth of a second."""
     from service.llm.client import LLMClient
 
     return LLMClient

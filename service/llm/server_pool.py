@@ -1,9 +1,9 @@
 """Several LLM servers in order: the first that is ready is called, and the next one where that fails.
 
-The order is that of the settings, or each mission's own, so that missions are shared out evenly, and a mission's calls
-go to the server whose prefix cache has its prompts. A server with as many calls as it may have comes after the others.
-Each server has its own health and circuit breaker. Optionally a second server is called beside a slow first one (a
-hedged request: Dean and Barroso 2013, "The Tail at Scale"). The first answer counts, and the other call is cancelled.
+The order is that of the settings, or each mission's own, so that missions are distributed evenly, and a mission's calls
+go to the server whose prefix cache has its prompts. A server with the most calls allowed comes after the others. Each
+server has its own health and circuit breaker. Optionally a second server is called if the first is slow (a hedged
+request: Dean and Barroso 2013, "The Tail at Scale"). The first answer counts, and the other call is cancelled.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class ServerPool:
 
     @property
     def recovering(self) -> bool:
-        """Whether a server that is not ready may become ready by itself."""
+        """Whether a server that is not ready may become ready without a restart."""
         return any(server.recovering for server in self._each)
 
     @property
@@ -96,8 +96,8 @@ class ServerPool:
         others = sum(server.status.llm == "ready" for server in self._each if server is not active)
         return active.readiness().model_copy(update={"standing_by": others})
 
-    def judge(self, mission_id: str, fault: NoDecision | None) -> None:
-        """Take whether the answer to a decision's call could be used; ``fault`` says why not."""
+    def record_usability(self, mission_id: str, fault: NoDecision | None) -> None:
+        """Record whether the answer to a decision's call could be used; ``fault`` is the reason why not."""
         usability = self.serving(mission_id).usability
         if fault is None:
             usability.usable()
@@ -140,10 +140,10 @@ class ServerPool:
         return call(waiting[0]) if len(waiting) == 1 else self._of_several(call, waiting)
 
     async def _of_several(self, call: Call, waiting: deque[LlmServer]) -> Completion:
-        """The first answer of servers that are called one after another; without an answer the first failure."""
+        """The first answer of servers called one after another; raises the first failure if there is none."""
         running: dict[asyncio.Task[Completion], LlmServer] = {}
         failure: NoDecision | None = None
-        # Once a call is answered: the calls that began after it. Their silence is no failure of their servers.
+        # The calls that began after the answered one: their silence is no failure of their servers.
         later: list[asyncio.Task[Completion]] = []
         try:
             while waiting or running:

@@ -1,4 +1,4 @@
-"""Whether the answers of an LLM server can be used: a server that answers may decide nothing all the same."""
+"""Whether the answers of an LLM server can be used; a healthy server may give only unusable ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Usability:
     """Counts the decisions in a row for which a server's answer could not be used.
 
     Attributes:
-        degraded: why the LLM decides nothing, with the beginning of its last answer; None while it decides.
+        degraded: why the LLM's answers are unusable, with the beginning of the last one; None if they are usable.
     """
 
     def __init__(self) -> None:
@@ -25,14 +25,14 @@ class Usability:
         self.degraded: str | None = None
 
     def usable(self) -> None:
-        """Take an answer that passed every check."""
+        """Count an answer that passed every check."""
         self._unusable = 0
         if self.degraded is not None:
             self.degraded = None
             log.info("the LLM's answers can be used again")
 
     def unusable(self, why: NoDecision) -> None:
-        """Take a refusal, or an answer that failed a check; its text has the answer's beginning."""
+        """Count a refusal, or an answer that failed a check; the error's text has the answer's beginning."""
         self._unusable += 1
         if self._unusable < _DEGRADED:
             return

@@ -1,4 +1,4 @@
-"""A fleet's decisions: the sensors that they reserve, the outcomes that are still to come, and those applied."""
+"""A fleet's decisions: their reservations, pending outcomes and applied outcomes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shared.kit.bounded import BoundedDict
 from shared.wire.schemas import Outcome
 from shared.world.scenario import Scenario
 
-# UAVs of one fleet may be this many steps apart.
+# The largest difference between the steps of two UAVs of a fleet.
 MAX_STEPS_APART = 64
 # An outcome comes with the UAV's next request, so a few steps of a fleet suffice. Older entries are forgotten.
 PENDING_PER_UAV = 8
@@ -21,7 +21,7 @@ _APPLIED_PER_UAV = 64
 
 
 class Pending(NamedTuple):
-    """A decision whose outcome is still to come.
+    """A decision whose outcome is pending.
 
     Attributes:
         seen: the chosen sensor's row at the decision.
@@ -139,7 +139,7 @@ class PendingDecisions:
             )
 
     def add(self, decision: Pending) -> list[Pending]:
-        """Wait for a decision's outcome; returns the UAV's oldest decisions, which are forgotten for it."""
+        """Add a decision; returns the UAV's oldest decisions, which are forgotten in exchange."""
         self._decisions[decision.decision_id] = decision
         own = [pending for pending in self._decisions.values() if pending.uav_id == decision.uav_id]
         forgotten = own[:-PENDING_PER_UAV]
@@ -188,7 +188,7 @@ class Reservations:
         return frozenset(other.sensor_id for other in self._by_step.get(step, ()) if other.uav_id != uav_id)
 
     def attempt(self, step: int, uav_id: int) -> int:
-        """The number of a new request of a UAV at a step; of two attempts the later one's answer counts."""
+        """The number of a new request of a UAV at a step; of two attempts, the later one's answer counts."""
         answered = self.of(step, uav_id)
         attempts = self._attempts.setdefault(step, {})
         number = 1 + max(attempts.get(uav_id, 0), 0 if answered is None else answered.attempt)

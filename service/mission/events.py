@@ -1,4 +1,4 @@
-"""The events that change a mission: the journal writes them, and a restart applies them again."""
+"""The events that change a mission: the journal writes them, and recovery replays them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shared.wire.schemas import Outcome, UavState
 
 @dataclass(frozen=True, slots=True)
 class AdviserReport:
-    """The advice of all advisers on a decision, of which this LLM is one."""
+    """The advice of all advisers on a decision; the LLM among them is ``model``."""
 
     model: str
     advice: Advice
@@ -54,7 +54,7 @@ class GuidanceChanged:
 
 @dataclass(frozen=True, slots=True)
 class ReadingsMerged:
-    """Readings of sensors, each with the step that it was placed in, changed the belief."""
+    """Sensor readings, each with its step, changed the belief."""
 
     readings: list[PlacedReading]
 

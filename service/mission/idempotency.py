@@ -1,4 +1,4 @@
-"""Idempotency keys: a request that comes again under its key gets the same answer, even after a restart."""
+"""Idempotency keys: a request repeated under its key gets the same answer, even after a restart."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class IdempotentAnswers:
         try:
             body = await make()
         except BaseException as error:
-            # Requests that wait for this answer fail alike. There may be none, so the exception is marked as retrieved.
+            # Requests that wait for this answer fail too. There may be none, so the exception is marked as retrieved.
             cancelled = Unavailable("Idempotency-Key", "the request under this key was cancelled: send it again")
             answer.set_exception(error if isinstance(error, Exception) else cancelled)
             answer.exception()

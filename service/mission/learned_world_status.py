@@ -1,12 +1,12 @@
-"""What a mission's fleet has learned of its world, as the mission's status tells it."""
+"""The part of a mission's status about what its fleet has learned of the world."""
 
 from __future__ import annotations
 
 from shared.belief.fleet_belief import FleetBelief
 from shared.wire.missions import LearnedWorld
 
-# A sensor whose measurements are on the mean within this of the formula is not named, dB.
-_TOLD_DB = 1.0
+# The least mean excess loss of a reported sensor, dB.
+_REPORTED_DB = 1.0
 
 
 def learned_world(belief: FleetBelief) -> LearnedWorld | None:
@@ -23,5 +23,5 @@ def learned_world(belief: FleetBelief) -> LearnedWorld | None:
         wind=[east, north],
         dispersion=dispersion,
         failed_radios=channel.failures.dead,
-        excess_db={sensor: excess for sensor, excess in measured.items() if abs(excess) > _TOLD_DB},
+        excess_db={sensor: excess for sensor, excess in measured.items() if abs(excess) > _REPORTED_DB},
     )

@@ -57,7 +57,7 @@ class Mission:
     Attributes:
         requested_spec: the spec of the request; ``spec`` is the resolved one.
         prompt_fits: whether the LLM's context is large enough for every prompt; True in a mode without an LLM.
-        measured: by UAV, what the gains of its newest report show, until it is told.
+        measured: by UAV, the measurements of its newest report, until exported to metrics.
         trust: in mode ``guided``, the trust in the advisers, by the name of the LLM that is one of them; "" where that
             is unknown.
 
@@ -126,7 +126,7 @@ class Mission:
         self._guidance_changed()
 
     def fail_guidance(self, reason: str, model: str | None) -> None:
-        """Note that the operator's note was not compiled."""
+        """Record that the operator's note was not compiled."""
         self.guidance.fail(reason, model)
         self._guidance_changed()
 
@@ -184,7 +184,7 @@ class Mission:
         self.records.presume(decision.sensor_id, decision.decision_id, decision.step)
         for old in forgotten:
             self.records.confirm(old.sensor_id, old.decision_id, old.step)
-        self.belief.tell(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
+        self.belief.record_decision(decision.uav_id, decision.step, decision.sensor_id, decision.velocity)
         self.decisions += 1
         if advice is not None:
             self.trust[advice.model].open[decision.decision_id] = advice.advice
@@ -266,6 +266,6 @@ class Mission:
             self.planner.follow(self.guidance.confirmed)
 
     def deadlines(self) -> list[VisitDeadline]:
-        """How the operator's visit orders were kept in the steps that are over."""
+        """The deadlines of the operator's visit orders, met and missed, in the completed steps."""
         last = self.visit_orders.last
         return self.visit_orders.counts(last - 1 if self.pending.waits_for(last) else last)

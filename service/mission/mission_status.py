@@ -1,4 +1,4 @@
-"""What ``GET /missions/{id}`` tells of a mission."""
+"""The answer of ``GET /missions/{id}``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shared.wire.missions import MissionStatus
 
 
 def status_of(mission: Mission) -> MissionStatus:
-    """Where a mission stands, and how it is set up."""
+    """A mission's setup and progress."""
     visits = mission.records.visits
     return MissionStatus(
         mission_id=mission.mission_id,

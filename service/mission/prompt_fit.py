@@ -59,12 +59,12 @@ class PromptFit:
     adapted: bool
 
     def fits(self, uavs: int = 1) -> bool:
-        """Whether the LLM understands the prompt, and its context is large enough for one about so many UAVs."""
-        understood = self.adapted if self._compact else True
+        """Whether the LLM understands the prompt, and its context is large enough for one about this many UAVs."""
+        understood = self.adapted or not self._compact
         return understood and self._needed(uavs) <= self.context and (uavs == 1 or not self._compact)
 
     def check(self) -> None:
-        """Raises ``Refused`` where the LLM has no use for a prompt about one UAV."""
+        """Raises ``Refused`` if the LLM cannot use a prompt about one UAV."""
         style = self.spec.prompt
         if self._compact and not self.adapted:
             raise Refused(
@@ -87,7 +87,7 @@ class PromptFit:
         )
 
     def warning(self) -> str | None:
-        """Why the LLM decides worse by these prompts than it could; None where it does not."""
+        """Why these prompts make the LLM's decisions worse; None if they do not."""
         if not self._compact or self._rows <= TRAINED_ROWS:
             return None
         return (

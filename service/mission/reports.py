@@ -52,7 +52,7 @@ class Reports:
         self._references: dict[int, ReferenceReport] = {}
 
     def complete(self, report: AnyReport, step: int, at: str = "") -> AnyReport:
-        """The report with everything that it leaves out, once it fits the mission's world.
+        """The complete report, checked against the mission's world.
 
         Args:
             at: the path of the UAV in the request's body, such as ``uavs[1].``.
@@ -147,7 +147,7 @@ class Reports:
 
 
 def _array(sensors: SensorColumns) -> FloatArray:
-    # numpy makes NaN of None.
+    # numpy converts None to NaN.
     return np.array([getattr(sensors, name) for name in _COLUMNS], dtype=np.float64)
 
 

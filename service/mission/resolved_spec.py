@@ -1,4 +1,4 @@
-"""A mission's spec in full: the service's settings and the mission's mode decide what the request leaves open."""
+"""A mission's complete spec: the service's settings and the mission's mode give the defaults."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shared.wire.schemas import LLM_MODES, Belief, Features, MissionSpec, Mode, 
 
 
 class ResolvedPromptStyle(PromptStyle):
-    """A prompt's style in which nothing is left open."""
+    """A prompt's style with all defaults filled in."""
 
     format: PromptFormat
     experiences: int = Field(ge=0)
@@ -19,7 +19,7 @@ class ResolvedPromptStyle(PromptStyle):
 
 
 class ResolvedSpec(MissionSpec):
-    """A spec in which nothing is left open. The store writes it, so its fields are a file format."""
+    """A spec with all defaults filled in. The store writes it, so its fields are a file format."""
 
     mode: Mode
     top_k: int = Field(ge=1)
@@ -31,13 +31,13 @@ class ResolvedSpec(MissionSpec):
 
     @classmethod
     def of(cls, spec: MissionSpec, settings: Settings) -> Self:
-        """The spec, with the service's settings and the defaults of its mode for what it leaves open."""
+        """The spec, completed by the service's settings and the defaults of its mode."""
         mode = spec.mode or settings.mode
         adapted = settings.adapted and mode in LLM_MODES
         # The compact prompt has no demonstrations.
         row_format = spec.prompt.format or ("compact" if adapted and not spec.prompt.demonstrations else "csv")
         compact = row_format == "compact"
-        # Mode `llm` is the paper's method as the paper has it, unless the spec or the adapter says otherwise.
+        # Mode `llm` is the paper's method, unless the spec or the adapter differs.
         as_published = mode == "llm" and not compact
         experiences = spec.prompt.experiences
         if experiences is None:
@@ -61,7 +61,7 @@ class ResolvedSpec(MissionSpec):
 
     @property
     def uses_llm(self) -> bool:
-        """Whether an LLM has a part in the decisions."""
+        """Whether the mode asks an LLM."""
         return self.mode in LLM_MODES
 
     @property

@@ -31,8 +31,8 @@ class Readings:
 
     Attributes:
         merged: the number of readings that changed the belief.
-        began: the newest step that a UAV has reported, and when it first did, a time of ``time.monotonic``. An age
-            counts back from then.
+        began: the newest step that a UAV has reported, and the time of its first report by ``time.monotonic``. Ages
+            count back from then.
     """
 
     def __init__(self, scenario: Scenario, belief: FleetBelief, records: Records) -> None:
@@ -40,7 +40,7 @@ class Readings:
         self._belief = belief
         self._records = records
         self.merged = 0
-        # A duplicate is of the newest message of its sensor, or outdated.
+        # By sensor: an older message would be outdated anyway.
         self._messages: dict[int, str] = {}
         self.began = -1, 0.0
 
@@ -89,14 +89,14 @@ class Readings:
         return newest + min(0, math.floor((since_began_s - reading.age_s) / self._scenario.step_s))
 
     def take(self, readings: Sequence[PlacedReading]) -> list[ReadingResult]:
-        """Merge the readings into records and belief; returns what became of each."""
+        """Merge the readings into records and belief; returns the result of each."""
         fresh = [r.message_id is None or self._messages.get(r.sensor_id) != r.message_id for r in readings]
         unknown = [reading for reading, new in zip(readings, fresh, strict=True) if new]
         news = take_readings(
             np.array([r.sensor_id for r in unknown], dtype=np.int64),
             np.array([r.step for r in unknown], dtype=np.int64),
             np.array([r.queue for r in unknown], dtype=np.float64),
-            # numpy makes NaN of None.
+            # numpy converts None to NaN.
             np.array([r.battery for r in unknown], dtype=np.float64),
             self._records,
             self._belief,

@@ -1,4 +1,4 @@
-"""The operator's orders to visit sensors, and how a fleet keeps them."""
+"""The operator's orders to visit sensors, and their deadlines met and missed."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from shared.planning.orders import Guidance
-from shared.planning.visit_deadlines import judged
+from shared.planning.visit_deadlines import count_deadlines
 from shared.wire.missions import VisitDeadline
 
-# Ended orders that are remembered.
+# Most ended orders in memory.
 _MOST_ENDED = 100
 # Steps after which no outcome changes a count: more than a fleet's UAVs may be apart.
 _FINAL_AFTER = 128
@@ -37,7 +37,7 @@ class _Order:
     def count(self, through: int) -> tuple[int, int]:
         """Deadlines met and missed up to a step."""
         last = through if self.until is None else min(through, self.until - 1)
-        met, missed = judged(self.every, self.open_since, last, self.visits)
+        met, missed = count_deadlines(self.every, self.open_since, last, self.visits)
         return self.met + met, self.missed + missed
 
     def close(self, through: int) -> None:
@@ -62,10 +62,10 @@ class VisitOrders:
         self._ended: deque[_Order] = deque(maxlen=_MOST_ENDED)
 
     def follow(self, guidance: Guidance, step: int) -> None:
-        """Take the orders that are in force when a decision of a step is made, before its visit."""
+        """Follow the orders in force at a decision of a step; call it before :meth:`visit`."""
         if guidance is not self._followed:
             self._followed = guidance
-            # A step of which some UAV has decided already counts for the orders before.
+            # A step with an earlier decision counts for the previous orders.
             self._change(guidance, step if step > self.last else self.last + 1)
         self.last = max(self.last, step)
         if self.last - self._final > 2 * _FINAL_AFTER:
@@ -79,18 +79,18 @@ class VisitOrders:
             if wanted.get(sensor) != order.every:
                 order.until = since
                 self._ended.append(self._open.pop(sensor))
-        for sensor, every in wanted.items():
+        for sensor, interval in wanted.items():
             if sensor not in self._open:
-                self._open[sensor] = _Order(sensor, every, since, open_since=since)
+                self._open[sensor] = _Order(sensor, interval, since, open_since=since)
 
     def visit(self, sensor_id: int, step: int) -> None:
-        """Count a visit, until its outcome says that it failed."""
+        """Count a visit; :meth:`withdraw` takes it back if it fails."""
         for order in self._of(sensor_id):
             if step >= order.open_since:
                 order.visits[step] = order.visits.get(step, 0) + 1
 
     def withdraw(self, sensor_id: int, step: int) -> None:
-        """Take a visit back: it failed, or another decision took its place."""
+        """Take a visit back: it failed, or another decision replaced it."""
         for order in self._of(sensor_id):
             if (visits := order.visits.pop(step, 0)) > 1:
                 order.visits[step] = visits - 1

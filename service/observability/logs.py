@@ -34,7 +34,7 @@ class _ThreadedHandler(logging.handlers.QueueHandler):
     queue: queue.Queue[str | None]
 
     def start(self) -> None:
-        """Start the thread, which writes until the process ends, and the queued lines for a moment longer."""
+        """Start the thread, which writes until the process ends, and then the queued lines for up to a second."""
         self._dropped = 0
         self._ends = 0.0
         self._writer = threading.Thread(target=self._write, name="logs", daemon=True)
@@ -56,12 +56,12 @@ class _ThreadedHandler(logging.handlers.QueueHandler):
             time.sleep(0.002)
 
     def hurry(self) -> None:
-        """The process may end at any moment: from now on a line waits until it is written, a second in all."""
+        """Let each further line wait until it is written, a second in all: the process may end at any moment."""
         self._ends = time.monotonic() + _LAST_LINES_S
 
     def _write(self) -> None:
         while (line := self.queue.get()) is not None:
-            # A full disk, for example, may have room again later.
+            # The fault may be temporary, such as a full disk.
             with suppress(OSError, ValueError):
                 print(line, file=sys.stderr, flush=True)
             self.queue.task_done()
@@ -98,7 +98,7 @@ def configure(level: str, form: Literal["text", "json"]) -> None:
     # At level info httpx logs every request with its address.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     if level != "debug":
-        # At level info it logs each of its plugins, also where no table changes.
+        # At level info alembic logs each of its plugins, even without a migration.
         logging.getLogger("alembic").setLevel(logging.WARNING)
 
 
@@ -109,7 +109,7 @@ def _without_colours(_: object, __: str, event: MutableMapping[str, Any]) -> Mut
 
 
 def hurry() -> None:
-    """The process may end at any moment, by a signal: from now on a line waits until it is written."""
+    """Let each further line wait until it is written: a signal may end the process at any moment."""
     for handler in logging.getLogger().handlers:
         if isinstance(handler, _ThreadedHandler):
             handler.hurry()

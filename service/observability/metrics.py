@@ -30,7 +30,7 @@ class Metrics:
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
         r = self.registry
-        Info("aicvds_build", "Which version this is", registry=r).info({"version": version("aic-vds")})
+        Info("aicvds_build", "The version of this edge", registry=r).info({"version": version("aic-vds")})
         self.decisions = Counter("aicvds_decisions", "Decisions answered", ["source", "reason"], registry=r)
         self.decision_seconds = Histogram(
             "aicvds_decision_seconds", "Time of a decision by stage", ["stage"], registry=r, buckets=_DECISION_BUCKETS
@@ -64,7 +64,7 @@ class Metrics:
 
     def _add_llm(self) -> None:
         r = self.registry
-        self.llm_requests = Counter("aicvds_llm_requests", "Queries of mode llm by outcome", ["outcome"], registry=r)
+        self.llm_requests = Counter("aicvds_llm_requests", "Queries to the LLM by outcome", ["outcome"], registry=r)
         self.llm_breaker_opened = Counter(
             "aicvds_llm_breaker_opened", "Times that a circuit breaker of an LLM server opened", registry=r
         )
@@ -76,18 +76,18 @@ class Metrics:
         self.llm_trust = Histogram(
             "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
         )
-        self.critic_timeouts = Counter(
+        self.evaluator_timeouts = Counter(
             "aicvds_critic_timeouts",
             "Decisions of mode guided whose rollout evaluator was late or failed",
             registry=r,
         )
 
     def _add_outcomes(self) -> None:
-        """What outcomes and reports show."""
+        """The metrics of outcomes and reports."""
         r = self.registry
         self.feedback = Counter("aicvds_feedback", "Outcomes received", ["result"], registry=r)
         self.costs_clipped = Counter(
-            "aicvds_costs_clipped", "Outcomes whose cost exceeded the most that a step can cost", registry=r
+            "aicvds_costs_clipped", "Outcomes whose cost exceeded the largest possible cost of a step", registry=r
         )
         self.learner_loss = Gauge("aicvds_learner_loss", "Latest value-regression loss of any mission", registry=r)
         self.learner_update_loss = Summary(
@@ -101,19 +101,15 @@ class Metrics:
         )
         self.link_excess_db = ArrayHistogram(
             "aicvds_link_excess_db",
-            "Excess of the path losses that beacons show over the formula's, dB",
+            "Path loss measured by beacons minus the formula's, dB",
             registry=r,
             buckets=_EXCESS_BUCKETS_DB,
         )
-        self.radio_failures = Counter(
-            "aicvds_radio_failures", "Transmissions that failed although their links held", registry=r
-        )
-        self.readings = Counter(
-            "aicvds_readings", "Sensors' own readings by what became of them", ["result"], registry=r
-        )
+        self.radio_failures = Counter("aicvds_radio_failures", "Transmissions that failed over a good link", registry=r)
+        self.readings = Counter("aicvds_readings", "Sensors' own readings by result", ["result"], registry=r)
 
     def record_readings(self, results: Collection[ReadingResult]) -> None:
-        """Count what became of sensors' own readings."""
+        """Count sensors' own readings by result."""
         for result in results:
             self.readings.labels(result).inc()
 
@@ -129,7 +125,7 @@ class Metrics:
         self.llm_breaker_open.set(breakers_open)
 
     def record_measured(self, measured: Measured) -> None:
-        """Count what the gains of one report show."""
+        """Count the measurements of one report."""
         self.link_excess_db.observe(measured.excess_db)
         self.radio_failures.inc(measured.radio_failed)
 

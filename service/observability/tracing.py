@@ -63,24 +63,24 @@ class Traces:
         from opentelemetry.trace import SpanKind, Status, StatusCode
 
         ended = time.time_ns()
-        begun = ended - _ns(answer.latency_ms["total"])
+        started = ended - _ns(answer.latency_ms["total"])
         attributes = _attributes(answer)
-        whole = self._tracer.start_span("decide", kind=SpanKind.SERVER, start_time=begun, attributes=attributes)
+        whole = self._tracer.start_span("decide", kind=SpanKind.SERVER, start_time=started, attributes=attributes)
         inside = trace.set_span_in_context(whole)
         for stage, milliseconds in answer.latency_ms.items():
             if stage == "total":
                 continue
-            until = begun + _ns(milliseconds)
+            until = started + _ns(milliseconds)
             if stage == "llm":
                 attributes = self._llm_attributes(answer)
                 name, kind = f"chat {answer.model or 'unknown'}", SpanKind.CLIENT
             else:
                 attributes, name, kind = {}, stage, SpanKind.INTERNAL
-            span = self._tracer.start_span(name, inside, kind, attributes, start_time=begun)
+            span = self._tracer.start_span(name, inside, kind, attributes, start_time=started)
             if "error.type" in attributes:
                 span.set_status(Status(StatusCode.ERROR))
             span.end(until)
-            begun = until
+            started = until
         whole.end(ended)
 
     def _llm_attributes(self, answer: DecideResponse) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class Traced:
 
 
 def _address(url: str | None) -> dict[str, Any]:
-    """The address of a single LLM server; of several, the called one is not known."""
+    """The address of a single LLM server; of several, the called one is unknown."""
     if url is None or "," in url:
         return {}
     # Already imported: the settings check the URL with it.

@@ -60,7 +60,7 @@ class Viewpoint:
     """The UAV that a prompt is for, the step, and its fleet's belief.
 
     Attributes:
-        learned: whether links follow what the fleet has learned of its channel; else they follow the formula.
+        learned: whether links follow the fleet's learned channel; otherwise they follow the formula.
     """
 
     belief: FleetBelief
@@ -98,7 +98,7 @@ class CandidateSet:
 
     @classmethod
     def of(cls, state: State, reach: Reach, shown: Sequence[int], letters: Letters, write: RowsWriter) -> Self:
-        """The candidates for these rows of a state, in this order, as far as there are letters for them."""
+        """The candidates for these rows of a state, in this order, up to the number of letters."""
         actions: dict[Action, int] = {}
         labels: dict[str, int] = {}
         rows = shown[: letters.rows]
@@ -135,8 +135,8 @@ class CandidateSet:
 def velocity_options(reach: Reach, row: int, count: int) -> list[int]:
     """``count`` velocity options for a sensor, slowest first; options may repeat.
 
-    They are evenly spaced over the velocities that move nearly the most packets, both ends included, because this
-    sensor does not determine where its UAV should be for the next ones. A single option is the velocity of most worth.
+    They are evenly spaced over the velocities that move nearly the most packets, both ends included, because the best
+    position for the next sensors is open. A single option is the velocity of most worth.
     """
     if count == 1:
         return [int(reach.best[row])]

@@ -7,8 +7,8 @@ The user message is one line of letters and digits, which the embedded model rea
 First the experiences, which end with ``X`` or ``Y``: see :meth:`CompactTemplate.experience`. ``U`` ends the UAV's own
 six digits, and a row's first choice letter its sensor's eight: a causal model has read a row where it reads the row's
 letter. :func:`fleet_digits` and :func:`row_digits` define the digits. The second place of an experience and of a row is
-its sensor's sign, by which the model finds what came of the sensor. An adapter names the version of this prompt that it
-was trained on: :data:`service.llm.adapter_version.PROMPT_VERSION` changes whenever a text here does.
+its sensor's sign, by which the model finds the sensor's earlier outcomes. An adapter names the version of this prompt
+that it was trained on: :data:`service.llm.adapter_version.PROMPT_VERSION` changes whenever a text here does.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _NINE = 9
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """What the fleet's next steps bring at a steady pace, J sensors.
+    """The fleet's reach in its next steps at a steady pace, for J sensors.
 
     Attributes:
         own: shape ``(J,)``, the steps of the next nine in which the UAV is likely to reach each sensor.

@@ -33,7 +33,7 @@ from shared.wire.schemas import Selection
 
 # Experiences to select from: three missions of the paper's length.
 _REMEMBERED = 270
-# Experiences in the last block with `similar`. More would cost more new tokens a decision than `recent` does.
+# Experiences in the last block with `similar`. More would cost more uncached tokens a decision than `recent` does.
 NEAREST = 1
 
 

@@ -31,8 +31,8 @@ Rules:
 {apart}
 {note}{experiences}Answer with {answer} and nothing else."""
 
-_ALONE = {"each": "", "listed": "", "number": "", "apart": "", "answer": "one letter"}
-_TOGETHER = {
+_ONE_UAV = {"each": "", "listed": "", "number": "", "apart": "", "answer": "one letter"}
+_FLEET = {
     "each": " for every UAV",
     "listed": "Each UAV has rows of its own, under its number. ",
     "number": "sensor,",
@@ -84,8 +84,8 @@ class GuidedTemplate(Template):
             "note": note_block(note),
             "experiences": _EXPERIENCES if experiences else "",
         }
-        self.static = _STATIC.format(**fields, **_ALONE)
-        self.fleet_static = _STATIC.format(**fields, **_TOGETHER)
+        self.static = _STATIC.format(**fields, **_ONE_UAV)
+        self.fleet_static = _STATIC.format(**fields, **_FLEET)
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
         """A line such as ``52,3>7:0``, with the cost in tenths."""

@@ -86,7 +86,7 @@ class Template:
         )
 
     def experience(self, seen: Cells, action: Action, cost: float, failed: bool) -> str:
-        """One line of the experiences: the chosen sensor's row, the decision, and its cost, which has the failure."""
+        """A line of the experiences: the chosen sensor's row, the decision and its cost, which includes a failure."""
         return experience(seen, f"{action.sensor_id} {action.velocity}", f"{cost:.1f}")
 
     def unreported_row(self, sensor_id: int) -> Cells:
@@ -101,7 +101,7 @@ class Template:
         Args:
             kept_rows: the rows of the state to show, in this order.
             experiences: the lines of the block of experiences.
-            nearest: lines of experiences for this prompt alone.
+            nearest: lines of experiences for this prompt only.
         """
         last = "".join(nearest)
         return Prompt(

@@ -1,8 +1,7 @@
 """The prompt, in three blocks ordered for prefix caching: static, experiences, current task.
 
 The static block is byte-identical for a mission's life, and the experiences only grow between compactions. So an LLM
-server with a prefix cache processes only the last block anew, and no volatile text precedes that block. The column
-names are part of the static block: they never change, and cost nothing after the first decision.
+server with a prefix cache processes only the last block anew. The column names are part of the static block.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ class Prompt:
     """One prompt.
 
     Attributes:
-        state: the last block. It includes experiences that are retrieved for this decision alone, which are not cached.
+        state: the last block. It includes experiences retrieved for this decision only, which are not cached.
         uncompressed: the last block without pruning by attention and without masks, with the same experiences.
     """
 

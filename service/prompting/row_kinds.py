@@ -1,4 +1,4 @@
-"""What the tokens of many rows depend on, compiled by numba as :mod:`shared.belief.kriging` is."""
+"""The kinds of rows that determine their tokens, compiled as :mod:`shared.belief.kriging` is."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def count_kinds(
 ) -> tuple[int, int]:
     """Count the kinds of J rows of C whole numbers, and the tokens of their digits.
 
-    A row's kind is a number to the base 3 with a digit for each column: 1 for a negative number, 2 for one that is
-    unknown for want of a beacon, 0 for any other.
+    A row's kind is a number to the base 3 with a digit for each column: 1 for a negative number, 2 for one unknown
+    without a beacon, 0 for any other.
 
     Args:
         columns: shape ``(C, J)``; rounded to whole numbers.
         needs_beacon, place_values: shape ``(C,)``.
         heard: shape ``(J,)``.
         most: a token has fewer digits than this power of 10.
-        kinds, counts: shape ``(J,)``, are written: the kinds that there are, and the number of rows of each.
+        kinds, counts: shape ``(J,)``, are written: the kinds found, and the number of rows of each.
 
     Returns:
         the number of kinds, and the tokens of all known digits.

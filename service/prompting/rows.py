@@ -78,10 +78,7 @@ def _columns_of(state: State) -> dict[str, NDArray[Any]]:
 
 
 def introduction(names: tuple[str, ...], order: str) -> str:
-    """The static block's description of a row, with the names of its numbers.
-
-    The names are part of the static block, where they cost nothing after the first time.
-    """
+    """The static block's description of a row, with the names of its numbers, which the prefix cache then has."""
     return f"Each row is one sensor, {order}, with {_NUMERALS[len(names)]} numbers:\n{','.join(names)}"
 
 

@@ -55,7 +55,7 @@ def encoding(cache_dir: Path) -> tiktoken.Encoding:
 
         parts = o200k_base()
         content: bytes = msgpack.packb(parts)
-        # A read-only folder only costs time at the next start.
+        # A read-only folder costs time at the next start, nothing else.
         with suppress(OSError):
             _write(packed, hashlib.sha256(content).digest() + content)
     return tiktoken.Encoding(**parts)

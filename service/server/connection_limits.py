@@ -1,4 +1,4 @@
-"""Limits of connections, in number, of request heads, in bytes and time, and of answers, in time; uvicorn has none."""
+"""Limits that uvicorn lacks: the number of connections, the size and time of request heads, the time of answers."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from shared.wire.problem import Problem
 
 log = logging.getLogger(__name__)
 
-# Open connections at most, and files that are reserved for others: the store, and the LLM servers.
+# Most open connections, and the files reserved for the store and the LLM servers.
 _MOST_CONNECTIONS, _OTHER_FILES = 4096, 256
-# Seconds between two warnings of one cause, which any client may give.
+# Seconds between two warnings of one cause, which any client may trigger.
 _WARNING_S = 60.0
-# Bytes of request line and headers; the longest of an honest client are an Idempotency-Key and a trace's state.
+# Bytes of request line and headers; a regular client's longest are an Idempotency-Key and a trace's state.
 _MOST_BYTES = 64 * 1024
-# Seconds to the end of a head, from the connection's beginning or the first byte of a further request.
+# Seconds to the end of a head, from the start of the connection or the first byte of a further request.
 _MOST_S = 30.0
-# Of an answer a client has to take so many bytes, or all that is left, in so many seconds. That is 0.5 KB a second,
-# less than a decision in time needs; a page's stream has a limit of its own, which is reached before.
+# The least bytes of an answer that a client has to read in this time: 0.5 KB a second, less than a timely decision
+# needs. A page's stream has its own, shorter limit.
 _TAKEN_BYTES, _TAKEN_S = 16 * 1024, 30.0
-# Requests that wait in one connection for the answer before theirs. One read of the socket could bring 14,000.
+# Pipelined requests that wait in one connection. One read of the socket could bring 14,000.
 _MOST_WAITING = 16
 _PROBLEM = Problem(
     title="Request Header Fields Too Large", status=431, detail=f"the headers are larger than {_MOST_BYTES} bytes"
@@ -34,7 +34,7 @@ _PROBLEM = Problem(
 
 
 class _OncePerMinute(logging.Filter):
-    """Drops a warning whose like was logged within the last minute; errors with a traceback pass."""
+    """Drops a warning that was logged within the last minute; errors with a traceback pass."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,15 +62,14 @@ class _Refused(Exception):
 class BoundedHttpProtocol(HttpToolsProtocol):
     """uvicorn's protocol with limits: it answers 431 to a head past 64 KB, and closes after 30 s without a whole head.
 
-    A connection past the limit is closed at once, so that files are left for the open connections, the store and the
-    LLM. Bytes after a body count as a head too: trailers, and the bytes of chunks beside their data. A connection whose
-    client does not take its answer is aborted, also where it has been closed and only the answer's rest is left. So is
-    one with more than 16 requests that wait.
+    A connection past the limit is closed immediately, which leaves files for the open connections, the store and the
+    LLM. Bytes after a body count as a head: trailers and chunk framing. A connection is aborted if its client does not
+    read the answer, even while it is closing, and if more than 16 requests wait.
     """
 
-    # Bytes since the last part that was complete: a head, a piece of a body, a request.
+    # Bytes since the last complete part: a head, a piece of a body, a request.
     _unfinished = 0
-    # Whether the bytes at hand completed a part.
+    # Whether the current bytes completed a part.
     _completed = False
     _refused = False
     # Closes the connection while it waits for a head.
@@ -121,7 +120,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         self._completed = True
-        # A head that comes as one chunk is complete before its bytes are counted.
+        # A head in one chunk is complete before its bytes are counted.
         too_large = len(self.url) + sum(len(name) + len(value) for name, value in self.headers) > _MOST_BYTES
         if too_large or len(self.pipeline) >= _MOST_WAITING:
             self._refused = True
@@ -148,7 +147,7 @@ class BoundedHttpProtocol(HttpToolsProtocol):
             super().send_400_response(msg)
 
     def _refuse(self) -> None:
-        # While another answer is due or has begun, the connection is closed without a 431.
+        # While another answer is pending or has begun, the connection is closed without a 431.
         if self.cycle is None or self.cycle.response_complete:
             self.transport.write(_refusal(self.server_state.default_headers))
         self.transport.close()

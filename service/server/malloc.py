@@ -1,4 +1,4 @@
-"""glibc's malloc: how soon freed memory returns to the system."""
+"""Settings of glibc's malloc, so that freed memory returns to the system early."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ _BYTES = 128 * 1024
 def hand_back_memory() -> None:
     """Make glibc's malloc return freed memory early; call it before the first thread starts. Elsewhere it does nothing.
 
-    By default malloc gives every thread an arena. It also raises the size from which a freed block returns at once to
-    that of the largest block ever freed: the LLM's states have megabytes each. So memory that threads freed stayed in
-    all the arenas: after a quarter of an hour with 200 missions 117 MB, and more each minute; with one arena and fixed
-    sizes 12 MB.
+    By default malloc gives each thread an arena. It also raises its threshold for returning a freed block immediately
+    to the size of the largest block freed, and the LLM's states have megabytes each. So freed memory stayed in all
+    arenas: after a quarter of an hour with 200 missions 117 MB, and growing; with one arena and fixed thresholds 12 MB.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is None:

@@ -1,6 +1,6 @@
-"""What the server puts around the application: security headers, and the wait while the edge loads.
+"""The server's wrappers of the application: security headers, and the gate while the edge loads.
 
-It imports nothing that takes long, torch above all.
+This module imports nothing slow such as torch.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class SecurityHeaders:
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
-    # A plain function that returns the application's coroutine: a request resumes one coroutine less.
+    # A plain function that returns the application's coroutine saves a coroutine per request.
     def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -43,7 +43,7 @@ class SecurityHeaders:
         return self.app(scope, receive, send_with_headers if scope["type"] == "http" else send)
 
 
-# The same answer as that of service.api.routes: the process lives.
+# As in service.api.routes.
 _ALIVE = SecurityHeaders(JSONResponse({"status": "ok"}))
 _PROBLEM = Problem(title="Service Unavailable", status=503, detail="the edge ends before it has started", errors=[])
 _REFUSED = SecurityHeaders(
@@ -80,7 +80,7 @@ class StartupGate:
             return self._live(receive, send)
         if self.app is None or not self._opened.is_set():
             return self._before_loading(scope, receive, send)
-        # The application's own coroutine: a request resumes one coroutine less.
+        # The application's own coroutine saves a coroutine per request.
         return self.app({**scope, "state": dict(self._state)}, receive, send)
 
     async def _before_loading(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -95,15 +95,15 @@ class StartupGate:
         await self.app({**scope, "state": dict(self._state)}, receive, send)
 
     async def opened(self) -> None:
-        """Wait until requests need not wait any more."""
+        """Wait until the gate is open."""
         await self._opened.wait()
 
     def open(self) -> None:
-        """Let the requests wait no longer: the server ends."""
+        """Release the waiting requests because the server ends."""
         self._opened.set()
 
     async def _live(self, receive: Receive, send: Send) -> None:
-        """The lifespan: starts at once, and ends after the application, or at once where that is not loaded yet."""
+        """The lifespan: starts immediately, and ends after the application, or immediately if that is not loaded."""
         await receive()
         await send({"type": "lifespan.startup.complete"})
         running = asyncio.create_task(self._run(), name="application")
@@ -120,12 +120,12 @@ class StartupGate:
             app = await asyncio.to_thread(self._load)
             async with app.router.lifespan_context(app) as state:
                 self.app, self._state = app, state or {}
-                # A million objects of torch and other libraries live as long as the process. Frozen, they cost no
-                # collection time, which is a tenth of a second in the midst of a decision.
+                # A million objects of torch and other libraries live as long as the process. Freezing them saves a
+                # tenth of a second in each full collection.
                 gc.freeze()
                 gc.enable()
-                # Python runs a full collection once the new objects are a quarter of those that the last one found:
-                # few from now on.
+                # Python runs a full collection when new objects exceed a quarter of those in the last one: few from now
+                # on.
                 gc.collect()
                 self._opened.set()
                 await self._ending.wait()

@@ -21,14 +21,14 @@ _SHUTDOWN_S = 5
 
 
 class Server(uvicorn.Server):
-    """Serves the edge, also while it loads, until every client that connected before SIGTERM is answered.
+    """Serves the edge, even while it loads, until every client that connected before SIGTERM is answered.
 
     Args:
         load: imports and makes the edge's application, in a thread.
         log_level: of uvicorn; at ``debug`` requests are logged too.
 
     Attributes:
-        gate: the application as it is served, also while it loads.
+        gate: the served application, even while it loads.
     """
 
     def __init__(self, load: Callable[[], Starlette], log_level: str) -> None:
@@ -49,7 +49,7 @@ class Server(uvicorn.Server):
 
     @property
     def error(self) -> Exception | None:
-        """Why the edge could not be loaded, if so; the server ends then."""
+        """The error if the edge could not be loaded; the server ends then."""
         return self.gate.error
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

@@ -1,10 +1,10 @@
-"""Group commit: all changes that wait are written in one transaction, so that one fsync serves many of them.
+"""Group commit: all waiting changes are written in one transaction, so that one fsync serves many of them.
 
 A transaction begins as soon as a request waits for its changes; without one, a quarter of a second after the first
 change. Changes that arrive while a transaction runs form the next one, so that under load a commit serves many answers.
 A failed transaction loses nothing: its changes stay in the queue and are tried again after a pause. Meanwhile decisions
-go on, and a request whose changes must be durable is refused. Only the changes of a mission that another edge has taken
-over are dropped.
+continue, and requests whose changes must be durable are refused. Only the changes of missions that other edges have
+taken over are dropped.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from service.storage.writer import Writer
 
 log = logging.getLogger(__name__)
 
-# Changes in a transaction, and bytes of checkpoints: networks of 10,000 sensors have megabytes each.
+# Changes in a transaction, and bytes of checkpoints: those of large networks have megabytes.
 _MOST_CHANGES, _MOST_BYTES = 1000, 16_000_000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 5.0
-# The longest that a change waits for others if no request waits for it.
+# The longest wait of a change for others if no request waits for it.
 _LINGER_S = 0.25
 
 
 class _CommitState(Enum):
-    """What happens to the queue now, and what comes next."""
+    """The states of the queue."""
 
     # The queue is empty. The next change begins LINGERING.
     IDLE = "idle"
-    # A timer, or the first request that waits, begins a transaction.
+    # A timer, or the first waiting request, begins a transaction.
     LINGERING = "lingering"
     # A transaction runs.
     WRITING = "writing"
@@ -58,8 +58,8 @@ class GroupCommit:
     Every change has a ticket, a number that grows. All changes up to the ticket ``_written`` are durable or dropped.
 
     Args:
-        on_lost: called with the ID of a mission that another edge has taken over, and with the epoch that it lost,
-            before any request is answered that waits for its changes.
+        on_lost: called with the ID and lost epoch of a mission that another edge has taken over, before any request
+            that waits for its changes is answered.
     """
 
     def __init__(self, writer: Writer, metrics: Metrics, on_lost: Callable[[str, int], None]) -> None:
@@ -171,7 +171,7 @@ class GroupCommit:
             self._loop.call_soon(self._written_or_failed, error)
 
     def _written_or_failed(self, error: Exception | None) -> None:
-        """The transaction has ended: answer the requests that waited for it, and begin what comes next."""
+        """After a transaction: answer the requests that waited for it, and go to the next state."""
         if error is None:
             self._succeed()
         elif isinstance(error, LeaseLost):
@@ -227,7 +227,7 @@ class GroupCommit:
         """Take the durable changes from the queue."""
         self._metrics.store_seconds.observe(time.perf_counter() - self._begun)
         last = self._batch[-1][0]
-        # Meanwhile `supersede` may have put a checkpoint between them, which is not durable yet.
+        # `supersede` may have inserted a checkpoint among them, which is not durable yet.
         durable = {id(change) for _, change in self._batch}
         while self._queue and id(self._queue[0][1]) in durable:
             self._queue.popleft()
@@ -253,14 +253,14 @@ class GroupCommit:
     def _fail(self, error: Exception) -> None:
         self._metrics.store_failures.inc()
         failure = cause(error)
-        # Each cause is logged once in a row: a database may be away first, and then locked by another edge.
+        # Consecutive failures of one cause are logged once.
         if failure != self._failure:
             log.error("the store fails, queued changes are tried again: %s", failure)
         self._failure = failure
 
 
 def _answer_late(reached: asyncio.Future[bool]) -> None:
-    """Tell a request that waits no longer that its changes are not durable yet."""
+    """End a request's wait: its changes are not durable yet."""
     if not reached.done():
         reached.set_result(False)
 

@@ -31,7 +31,7 @@ _EVENTS = 512
 _SENSORS = 100
 # From so many sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
-# Lost leases that are remembered, for requests that are under way.
+# Lost leases that are remembered for requests in progress.
 _MOST_LOST = 10_000
 
 
@@ -41,7 +41,7 @@ class MissionLog:
     Attributes:
         seq: number of the newest event.
         since_checkpoint: weight of the events since the last checkpoint, in events of a small network.
-        epoch: of the mission's lease; 0 in a store that is this edge's alone.
+        epoch: of the mission's lease; 0 in a store that is exclusive to this edge.
         ended: the mission was deleted, or another edge has taken it over. Its late events are dropped: another mission
             may have its ID.
     """
@@ -114,7 +114,7 @@ class Journal:
     def begin(self, mission: Mission, epoch: int = 0) -> None:
         """Record a new mission, and every event of it from now on."""
         self._commits.add(Made(mission.mission_id, mission.requested_spec, mission.spec, epoch))
-        # Missions that begin together and fly alike must not all need a checkpoint at the same time.
+        # Similar missions that start together must not all need a checkpoint at the same time.
         self._record(MissionLog(mission, 0, crc32(mission.mission_id.encode()) % _EVENTS, epoch))
 
     def resume(self, mission: Mission, seq: int, replayed: Sequence[Event], epoch: int = 0) -> None:
@@ -153,7 +153,7 @@ class Journal:
             self._lost[mission_id, mission_log.epoch] = True
 
     def lost(self, mission: Mission) -> bool:
-        """Whether another edge has taken over the mission: what was not durable before then never will be."""
+        """Whether another edge has taken over the mission: changes that were not durable by then are lost."""
         return (mission.mission_id, self._epochs.get(mission, 0)) in self._lost
 
     def lost_epoch(self, mission_id: str, epoch: int) -> bool:
@@ -161,7 +161,7 @@ class Journal:
         return (mission_id, epoch) in self._lost
 
     def epoch(self, mission_id: str) -> int | None:
-        """The epoch under which the events of a mission are recorded; None where none are."""
+        """The epoch under which a mission's events are recorded; None if they are not."""
         mission_log = self._logs.get(mission_id)
         return None if mission_log is None else mission_log.epoch
 
@@ -180,7 +180,7 @@ class Journal:
             self.on_lost(mission_id)
 
     def due(self, mission: Mission, least: int = _EVENTS) -> MissionLog | None:
-        """The log of a mission that has at least so many events since its last checkpoint, whose count begins anew."""
+        """The log of a mission with at least this many events since its last checkpoint; resets the count."""
         mission_log = self._logs.get(mission.mission_id)
         if mission_log is None or mission_log.mission is not mission or mission_log.since_checkpoint < least:
             return None
@@ -188,15 +188,16 @@ class Journal:
         return mission_log
 
     def checkpoint(self, mission_log: MissionLog, state: dict[str, Any]) -> None:
-        """Replace a mission's events until now by its state; those still in the queue are not written any more."""
+        """Replace a mission's events so far by its state; those still in the queue are not written."""
         if mission_log.mission.scenario.sensors >= _LARGE:
-            # A thread packs one checkpoint after the other, so that no decision waits. Until then the journal has the
+            # A thread packs checkpoints one at a time, so that no decision waits. Until then the journal keeps the
             # events that the checkpoint replaces.
             packing = self._loop.run_in_executor(self._packing, pack, state)
             self._packed.add(packing)
             packing.add_done_callback(partial(self._take_packed, mission_log, mission_log.seq))
         else:
-            # Packed at once: until it is written, the state would take the memory of a thousand small objects.
+            # Packed immediately: until it is written, the unpacked state would take the memory of a thousand small
+            # objects.
             self._take(mission_log, mission_log.seq, pack(state))
 
     async def close(self, within_s: float) -> bool:

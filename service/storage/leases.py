@@ -1,9 +1,9 @@
-"""Leases: which edge owns a mission of a PostgreSQL store that several edges share.
+"""Leases: ownership of the missions in a PostgreSQL store that several edges share.
 
-A lease has an owner, an epoch and an end. The owner is one process's life. The epoch grows when another owner takes the
-lease, and never shrinks. Only the database's clock counts. The transaction that writes the journal locks the leases of
-its missions and compares their epochs (:meth:`Leases.fence`): an owner that was paused or cut off writes nothing into
-what its successor wrote, whatever its own clock says. No transaction that locks a lease waits for its edge.
+A lease has an owner, an epoch and an end. The owner is one run of an edge's process. The epoch grows when another owner
+takes the lease, and never shrinks. Only the database's clock counts. The transaction that writes the journal locks the
+leases of its missions and compares their epochs (:meth:`Leases.fence`): an owner that was paused or disconnected cannot
+write after its successor, whatever its own clock says. No transaction that locks a lease waits for its edge.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     # The driver is of the extra `postgres`.
     from psycopg import Connection
 
-# A lease's end is reckoned where its row is locked, not where the statement began, which may have waited for the lock.
+# clock_timestamp() gives the time after the row is locked; the statement may have waited for the lock.
 _ACQUIRE = sa.text("""
     INSERT INTO leases AS held (mission_id, owner, address, epoch, expires_at)
     VALUES (:mission_id, :owner, :address, 1, clock_timestamp() + :term_s * interval '1 second')
@@ -59,7 +59,7 @@ _UNOWNED = sa.text("""
         WHERE leases.mission_id = missions.mission_id AND owner <> :owner AND expires_at > clock_timestamp()
     )
 """)
-# Fails by a division by zero unless every lease is there: the statements sent after it then have no effect.
+# Fails by a division by zero unless every lease exists; the statements sent after it then have no effect.
 _FENCE = """
     SELECT 1 / (count(*) = %s)::int FROM (
         SELECT FROM leases
@@ -101,16 +101,16 @@ class Leases:
         self._owner = str(uuid.uuid4())
 
     def acquire(self, mission_id: str, address: str, term_s: float) -> int | LeaseHolder:
-        """Take a lease that is free, or has ended; returns its epoch, or who has it.
+        """Take a lease that is free or has ended; returns its epoch, or its holder.
 
-        An owner whose own lease has ended gets it again with the same epoch as long as nobody else has had it.
+        An owner whose lease has ended gets it again with the same epoch, unless another owner has had it.
 
         Args:
             address: where clients reach this edge.
             term_s: seconds until the lease ends.
         """
         new = {"mission_id": mission_id, "owner": self._owner, "address": address, "term_s": term_s}
-        with self._alone() as db:
+        with self._autocommit() as db:
             epoch = db.scalar(_ACQUIRE, new)
             if epoch is not None:
                 return int(epoch)
@@ -118,8 +118,8 @@ class Leases:
         return LeaseHolder(row.address, max(0.0, row.left_s))
 
     def owner(self, mission_id: str) -> LeaseHolder | None:
-        """Who else has the mission's lease, whether the mission is stored or not; None where nobody has."""
-        with self._alone() as db:
+        """The other edge that has the mission's lease, whether the mission is stored or not; None if there is none."""
+        with self._autocommit() as db:
             row = db.execute(_OWNER, {"mission_id": mission_id}).first()
         if row is None or row.owner == self._owner or row.left_s <= 0:
             return None
@@ -127,31 +127,31 @@ class Leases:
 
     def renew(self, term_s: float) -> dict[str, int]:
         """Prolong every lease of this owner that has not ended; returns their missions with their epochs."""
-        with self._alone() as db:
+        with self._autocommit() as db:
             rows = db.execute(_RENEW, {"owner": self._owner, "term_s": term_s}).all()
         return {row.mission_id: row.epoch for row in rows}
 
     def release(self) -> None:
         """End every lease of this owner now; the epochs stay."""
-        with self._alone() as db:
+        with self._autocommit() as db:
             db.execute(_RELEASE, {"owner": self._owner})
 
     def taken(self, mission_ids: Collection[str]) -> set[str]:
-        """Those of the missions that other owners have taken over."""
-        with self._alone() as db:
+        """The missions that other owners have taken over."""
+        with self._autocommit() as db:
             return set(db.scalars(_FOREIGN, {"mission_ids": list(mission_ids), "owner": self._owner}))
 
     def unowned(self) -> list[str]:
         """The IDs of all stored missions that no other edge owns."""
-        with self._alone() as db:
+        with self._autocommit() as db:
             return list(db.scalars(_UNOWNED, {"owner": self._owner}))
 
     def fence(self, db: Connection[tuple[Any, ...]], missions: Collection[tuple[str, int]]) -> None:
         """Keep the missions' leases from being taken over until the transaction ends.
 
-        A lease that has ended is no obstacle as long as nobody else has taken it. Where another owner has one of them,
-        or has had it since that epoch, the statement fails by a division by zero, and with it the transaction. In a
-        pipeline nothing waits for its answer.
+        An ended lease is no obstacle unless another owner has taken it. If another owner has one of them, or has had it
+        since that epoch, the statement and the transaction fail by a division by zero. In a pipeline nothing waits for
+        its answer.
 
         Args:
             missions: IDs and epochs.
@@ -160,14 +160,14 @@ class Leases:
         db.execute(_FENCE, (len(missions), list(names), list(epochs), self._owner))
 
     def lost(self, missions: Collection[tuple[str, int]]) -> set[tuple[str, int]]:
-        """Those of the missions and epochs whose lease another owner has taken over."""
+        """The missions and epochs whose lease another owner has taken over."""
         names = [mission_id for mission_id, _ in missions]
-        with self._alone() as db:
+        with self._autocommit() as db:
             rows = db.execute(_OWN, {"mission_ids": names, "owner": self._owner}).all()
         return set(missions) - {(row.mission_id, row.epoch) for row in rows}
 
     @contextmanager
-    def _alone(self) -> Iterator[sa.Connection]:
+    def _autocommit(self) -> Iterator[sa.Connection]:
         """A connection on which each statement is a transaction.
 
         An edge that is paused between a statement and its commit would keep the rows locked from its successors.

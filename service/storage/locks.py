@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import IO
 
-# How long a lock that another process has is tried, and how often.
+# How long to retry a lock that another process has, and the interval.
 _LAST_COMMIT_S, _RETRY_S = 1.0, 0.02
 
 
@@ -32,7 +32,7 @@ class FileLock:
         self.file = os.path.realpath(file)
         self._lock: IO[str] = open(f"{self.file}.lock", "w")  # noqa: SIM115
         self.descriptors = (self._lock.fileno(),)
-        # The writer of a killed edge may still have its last commit to end.
+        # The writer of a killed edge may still be finishing its last commit.
         ends = time.monotonic() + _LAST_COMMIT_S
         while True:
             try:
@@ -50,7 +50,7 @@ class FileLock:
 
 
 def sqlite_file(store: str) -> str | None:
-    """The file of a store whose setting names one; None for PostgreSQL, for none, and for an address that is wrong."""
+    """The file that a store setting names; None for PostgreSQL, `none` and malformed addresses."""
     if store == "none":
         return None
     if "://" not in store:

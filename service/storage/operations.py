@@ -1,6 +1,6 @@
-"""The changes that a store can be asked to make.
+"""The changes to a store.
 
-Each has the epoch of the lease under which it was made; 0 in a store that is one edge's alone.
+Each has the epoch of the lease under which it was made; 0 in a store that is exclusive to one edge.
 """
 
 from __future__ import annotations

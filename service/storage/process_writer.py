@@ -1,4 +1,4 @@
-"""The writer of a SQLite store: a process of its own, at the other end of a socket."""
+"""The writer of a SQLite store: a separate process, connected by a socket."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.storage.writer import Done, WriteFailed
 
 log = logging.getLogger(__name__)
 
-# The longest wait for a process that has nothing left to write.
+# The longest wait for an idle process to exit.
 _EXIT_S = 1.0
 _READ_BYTES = 65_536
 
@@ -28,8 +28,8 @@ _READ_BYTES = 65_536
 class ProcessWriter:
     """Starts a process that writes a SQLite file, and another one when that process ends.
 
-    The event loop itself sends and receives. A thread would wait for the interpreter at every step of a commit, while
-    decisions run, and the decisions would wait for the thread.
+    The event loop itself sends and receives. A thread and the decisions would wait for each other's interpreter lock at
+    every step of a commit.
 
     Args:
         statements: SQL for SQLite.
@@ -48,9 +48,9 @@ class ProcessWriter:
         self._socket: socket.socket | None = None
         # Set while the event loop reads the socket.
         self._loop: asyncio.AbstractEventLoop | None = None
-        # Called when the transaction at hand has ended; None where there is none.
+        # Called when the current transaction has ended; None without one.
         self._done: Done | None = None
-        # The transaction at hand, whether a second process already writes it, and the rest of it that is not sent.
+        # The current transaction, whether a second process is already writing it, and its unsent rest.
         self._frame = b""
         self._repeated = False
         self._outgoing = memoryview(b"")
@@ -113,7 +113,7 @@ class ProcessWriter:
                     # With the edge's own stderr, a reader of the edge's log would wait for a killed edge's last commit.
                     stderr=subprocess.PIPE,
                     pass_fds=(theirs.fileno(), *self._locks),
-                    # Signals of a terminal are for the edge, not for this process.
+                    # A terminal's signals are for the edge, not for this process.
                     start_new_session=True,
                 )
             except OSError:
@@ -167,7 +167,7 @@ class ProcessWriter:
             return
         failure: Exception = WriteFailed(f"the process that writes it has ended ({message})")
         if not self._repeated:
-            # The transaction may be committed already: to carry it out again does no harm.
+            # The transaction may be committed already: repeating it does no harm.
             self._repeated = True
             try:
                 self._submit()

@@ -27,8 +27,7 @@ from shared.wire.schemas import Outcome, SensorColumns, UavState
 PACK_BYTES = 4096
 # The extension type of an array.
 _ARRAY = 1
-# A request also carries an outcome, which is an event of its own, and its encoding, which is of no use later. `encode`
-# adds the sensors.
+# A request's outcome is a separate event, and its encoding is not stored. `encode` adds the sensors.
 _REPORT = set(UavState.model_fields) - {"outcome", "base", "uplink", "sensors"}
 # The fields of an outcome that change a mission's state.
 _OUTCOME = set(Outcome.model_fields) - {"round_trip_ms"}

@@ -32,12 +32,12 @@ journal = sa.Table(
     sa.Column("body", sa.LargeBinary, nullable=False),
     sqlite_with_rowid=False,
 )
-# In PostgreSQL only: which edge owns a mission. A row outlives its mission, so that its epoch never shrinks.
+# In PostgreSQL only: the owners of missions. A row outlives its mission, so that its epoch never shrinks.
 leases = sa.Table(
     "leases",
     metadata,
     sa.Column("mission_id", sa.String(64), primary_key=True),
-    # One process's life.
+    # One run of an edge's process.
     sa.Column("owner", sa.String(36), nullable=False, index=True),
     # Where clients reach the owner.
     sa.Column("address", sa.Text, nullable=False),

@@ -1,11 +1,11 @@
 """The process that writes a SQLite store, so that commits and decisions do not wait for the same interpreter.
 
-:class:`service.storage.process_writer.ProcessWriter` runs it, at the other end of a socket. Each message is MessagePack
-after its length in four bytes. A request is a transaction, a list of [SQL, rows], which is committed as a whole or not
-at all. Its answer is nil, or the reason of the failure.
+:class:`service.storage.process_writer.ProcessWriter` runs it and is connected by a socket. Each message is MessagePack
+after its length in four bytes. A request is a transaction, a list of [SQL, rows]. Its answer is nil, or the reason of
+the failure.
 
-The process ends when the other end is closed, after its last commit, even if the edge was killed. It imports very
-little, so that it takes 17 MB and starts in a twentieth of a second.
+The process ends when the socket is closed, after its last commit, even if the edge was killed. It imports very little,
+so that it takes 17 MB and starts in a twentieth of a second.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def serve(edge: socket.socket, path: str, known: Mapping[str, str]) -> None:
 class Database:
     """A connection that opens at its first transaction, and again after each failure.
 
-    A commit to a file that has no name any more is lost when the edge ends. So each commit fails whose file, whose
-    lock's file or whose write-ahead log is another one, or none, after it.
+    A commit to a deleted file would be lost when the edge ends. So a commit fails if the file, its lock file or its
+    write-ahead log was deleted or replaced.
 
     Args:
         path: of the SQLite file, which must exist.
@@ -74,7 +74,7 @@ class Database:
         self._path = path
         self._known = known
         self._db: sqlite3.Connection | None = None
-        # The identity of the write-ahead log of this connection, which lasts as long.
+        # The identity of this connection's write-ahead log.
         self._log = ""
 
     def commit(self, transaction: list[tuple[str, list[Any]]]) -> str | None:
@@ -100,7 +100,7 @@ class Database:
         self._log = ""
 
     def _check(self, db: sqlite3.Connection) -> None:
-        """Raises ``OSError`` where what was committed is in no file that the next edge opens."""
+        """Raises ``OSError`` if the commit is in a file that the next edge will not open."""
         self._check_known()
         log = identity(f"{self._path}-wal")
         self._log = self._log or log

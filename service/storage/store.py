@@ -25,8 +25,8 @@ from service.storage.thread_writer import ThreadWriter
 from service.storage.writer import Writer
 from shared.wire.schemas import MissionSpec
 
-# Time limits of PostgreSQL: to connect; for a statement, and for a network without an answer; for an edge that is
-# paused, or cut off, in the midst of a transaction, which keeps its leases from other edges.
+# Time limits of PostgreSQL: to connect; for a statement or a silent network; for an edge that is paused or disconnected
+# during a transaction, which blocks its leases.
 _CONNECT_S = 5
 _STATEMENT_MS = 5000
 _IDLE_MS = 1500
@@ -65,7 +65,7 @@ class Store:
         StoreUnusable: the store cannot be reached, is damaged or of a newer version, or another edge uses the file.
 
     Attributes:
-        leases: of the missions in PostgreSQL; None for a SQLite file, which is this edge's alone.
+        leases: of the missions in PostgreSQL; None for a SQLite file, which is exclusive to this edge.
     """
 
     def __init__(self, url: str) -> None:
@@ -127,7 +127,7 @@ class Store:
         )
 
     def writer(self) -> Writer:
-        """A writer of this store, which works beside the event loop; to be closed before the store."""
+        """A writer of this store, outside the event loop; close it before the store."""
         statements = Statements(self._engine.dialect)
         if self.leases is not None:
             return ThreadWriter(statements, self.leases, self._engine)
@@ -147,14 +147,14 @@ class Store:
         config.set_main_option("path_separator", "os")
         with self._engine.begin() as db:
             if self.leases is not None:
-                self._migrate_alone(db)
-            # Another edge may have done it meanwhile.
+                self._lock_migration(db)
+            # Another edge may have migrated meanwhile.
             if _version(db) != SCHEMA:
                 config.attributes["connection"] = db
                 command.upgrade(config, "head")
 
-    def _migrate_alone(self, db: sa.Connection) -> None:
-        """Wait for an edge that migrates the database too; raises ``StoreUnusable`` where that takes too long."""
+    def _lock_migration(self, db: sa.Connection) -> None:
+        """Lock the migration; raises ``StoreUnusable`` if another edge migrates for too long."""
         try:
             db.execute(sa.select(sa.func.pg_advisory_xact_lock(_MIGRATING)))
         except sa.exc.OperationalError as error:

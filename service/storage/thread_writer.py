@@ -1,4 +1,4 @@
-"""The writer of a PostgreSQL store: a thread beside the event loop."""
+"""The writer of a PostgreSQL store: a separate thread."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 
 class ThreadWriter:
-    """Writes from a thread: the database is another process already.
+    """Writes from a thread: the database is already another process.
 
     A transaction of a mission that another edge has taken over ends with :class:`LeaseLost`.
 
     Args:
         statements: SQL for the database.
         leases: the missions' leases.
-        engine: makes the connection; it is made again after it broke.
+        engine: makes the connection, again after a failure.
     """
 
     def __init__(self, statements: Statements, leases: Leases, engine: sa.Engine) -> None:
@@ -78,7 +78,7 @@ class ThreadWriter:
             loop.call_soon_threadsafe(done, failure)
 
     def _transact(self, missions: set[tuple[str, int]], transaction: Sequence[Statement]) -> None:
-        """One transaction in one round trip: the database waits for nothing while it has rows locked."""
+        """Send one transaction in one round trip: the database never waits while rows are locked."""
         from psycopg.errors import DivisionByZero
 
         # A connection of its own: one from the pool would be tried before each transaction.

@@ -1,4 +1,4 @@
-"""The interface of a store's writer, beside the event loop: a process writes SQLite, a thread PostgreSQL."""
+"""The interface of a store's writer: a process for SQLite, a thread for PostgreSQL."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class WriteFailed(Exception):
 
 
 class Writer(Protocol):
-    """Writes one transaction after the other; called from the event loop."""
+    """Writes one transaction at a time; called from the event loop."""
 
     def write(self, changes: Sequence[Change], done: Done) -> None:
         """Begin a transaction of all the changes, in their order; the transaction before must have ended.

@@ -1,4 +1,4 @@
-"""The arrivals at the sensors as a fleet has seen them: rates, their uncertainty, and bursts."""
+"""A fleet's estimate of the arrivals at the sensors: rates, their uncertainty, and bursts."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from shared.belief.expected_queues import GOES_ON, bursts_to_come
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 
-# A rate in packets a step that gives less than one packet in the longest mission, and the weight of its prior in steps.
+# A rate in packets a step that yields less than one packet in the longest mission, and the weight of its prior in
+# steps.
 _ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
-# The weight of the assumption that arrivals are Poisson's, in intervals between beacons, and the least dispersion that
-# is no chance.
+# The weight of the assumption that arrivals are Poisson, in intervals between beacons, and the least significant
+# dispersion.
 _POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
 _POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
 _ARRAYS = ("arrived", "watched", "recent", "recent_at")
@@ -25,8 +26,9 @@ class Arrivals:
     """Each sensor's arrivals.
 
     The rate of each sensor has a Gamma prior with the mean and variance of the scenario's range (uniform). The packets
-    that come between successive beacons of queues that are not full update it. If those vary more than a Poisson's
-    with these rates, arrivals come in bursts: a sensor that has just had more than its rate expects some more.
+    that come between successive beacons of queues that are not full update it. If they vary more than Poisson arrivals
+    with these rates, arrivals come in bursts, and a sensor with recent arrivals above its rate is expected to receive
+    more.
 
     Attributes:
         arrived, watched: shape ``(J,)``, the Gamma's shape and rate: packets, and the steps of their arrival.
@@ -49,7 +51,7 @@ class Arrivals:
         self.dispersion = 1.0
 
     def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
-        """Take the packets ``(n,)`` that came to sensors ``(n,)``, each once, in so many steps, until these steps."""
+        """Add arrivals ``(n,)``, packets, at sensors ``(n,)``, each once, over ``steps`` steps up to step ``at``."""
         from shared.belief.beacon_updates import take_arrivals
 
         surprises = np.empty(len(ids))
@@ -74,14 +76,14 @@ class Arrivals:
         return self.rate, self.recent, self.recent_at, _POWERS
 
     def burst(self, step: int, ids: IntArray | None = None) -> FloatArray:
-        """Packets above the rate that are still to come of the bursts seen, from this step on, ``(J,)`` or ``(n,)``."""
+        """Expected further packets above the rate from the observed bursts, from this step on, ``(J,)`` or ``(n,)``."""
         which = np.arange(len(self.rate)) if ids is None else np.array(ids)
         packets = np.empty(len(which))
         bursts_to_come(*self.burst_arrays, self.in_bursts, which, step, packets)
         return packets
 
     def coming(self, step: int, horizon: float, ids: IntArray) -> FloatArray:
-        """Packets a step that sensors ``(n,)`` are expected to get in the steps from this one to the horizon."""
+        """Expected arrivals of sensors ``(n,)`` from this step to the horizon, packets a step."""
         rate = self.rate[ids]
         if not self.in_bursts:
             return rate
@@ -89,7 +91,7 @@ class Arrivals:
 
     @staticmethod
     def burst_over(steps: ArrayLike) -> FloatArray:
-        """The share of a burst's coming packets that come in the next steps ``(n,)``."""
+        """The share of a burst's further packets that arrive in the next steps ``(n,)``."""
         return np.asarray(1.0 - GOES_ON ** np.asarray(steps, dtype=np.float64))
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""What beacons change in a fleet's belief, compiled by numba; without numba it is plain Python.
+"""Updates of a fleet's belief by beacons, compiled by numba; without numba it is plain Python.
 
 Arrays ``(J,)`` are by sensor, those of :class:`~shared.belief.fleet_belief.FleetBelief` and
-:class:`~shared.belief.arrivals.Arrivals` of the same names. They are arguments of their own, because making and
-passing a tuple of them takes five times as long.
+:class:`~shared.belief.arrivals.Arrivals` of the same names. They are separate arguments, because building and passing a
+tuple of them takes five times as long.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def take_beacons(
         passed = step - since[sensor]
         if heard[sensor] >= 0 and passed > 0 and queue < capacity:
             more, expected = queue - base[sensor], rate[sensor] * passed
-            # After a visit that moved less than believed, the packets that stayed are no arrivals.
+            # After a visit that moved less than believed, the remaining packets are not arrivals.
             stayed = visited[sensor] == since[sensor] and more > expected + 4.0 * math.sqrt(expected) + 2.0
             if not stayed:
                 interval_ids[count], came[count], steps[count], at[count] = sensor, max(more, 0.0), passed, step
@@ -97,12 +97,12 @@ def take_arrivals(
     """Take the arrivals of n intervals, each of another sensor, as :meth:`Arrivals.take` does.
 
     Args:
-        surprises: shape ``(n,)``, is written: the squares of what came above the expected, over their variances.
+        surprises: shape ``(n,)``, is written: the squared deviations from the expected arrivals, over their variances.
     """
     for n in range(ids.shape[0]):
         sensor = ids[n]
         expected = rate[sensor] * steps[n]
-        # At least a packet's: where next to nothing is expected, one packet is no burst.
+        # At least one packet's: with next to no expected arrivals, one packet is no burst.
         variance = max(expected + steps[n] * steps[n] * rate[sensor] / watched[sensor], 1.0)
         surprises[n] = (came[n] - expected) * (came[n] - expected) / variance
         recent[sensor], recent_at[sensor] = came[n] / steps[n], at[n]

@@ -1,4 +1,4 @@
-"""The drift of a fleet: the metres that its UAVs really fly, learned from their reported progress."""
+"""The drift of a fleet: the true distances flown, learned from the UAVs' reported progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from shared.world.channel import FloatArray
 from shared.world.trajectory import Trajectory
 
-# A share of the way that is no drift, the weight of the prior (no drift) in steps, and the weight older steps keep.
+# The largest insignificant drift, as a share of the way; the weight of the prior (no drift) in steps; and the factor by
+# which older steps' weight decays.
 _NOTHING = 1e-6
 _PRIOR_STEPS = 1.0
 _KEPT = 0.97
@@ -35,7 +36,7 @@ class Drift:
         return np.asarray(np.linalg.solve(self._normal, self._moment))
 
     def learn(self, path: Trajectory, start_m: float, still_m: float, end_m: float) -> None:
-        """Take one step of a UAV.
+        """Learn from one step of a UAV.
 
         Args:
             start_m: progress at its start, metres.
@@ -44,7 +45,7 @@ class Drift:
         """
         if still_m <= 0:
             return
-        # A progress may begin anew with every lap.
+        # Progress may restart with every lap.
         flown_m = end_m - start_m + (path.length_m if end_m < start_m else 0.0)
         share = min(max(flown_m / still_m, 0.0), _FASTEST) - 1.0
         if self.none and abs(share) <= _NOTHING:
@@ -55,7 +56,7 @@ class Drift:
         self._moment = _KEPT * self._moment + heading * share
 
     def flown_step(self, path: Trajectory, start_m: float, still_m: float) -> float:
-        """The metres flown for one commanded way."""
+        """The metres flown for one commanded distance."""
         return float(self.flown(path, start_m, np.array([still_m]))[0])
 
     def flown(self, path: Trajectory, start_m: float, still_m: FloatArray) -> FloatArray:
@@ -74,7 +75,7 @@ class Drift:
         return {"normal": self._normal.copy(), "moment": self._moment.copy(), "none": self.none}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore it."""
+        """Restore a ``state_dict``."""
         self._normal, self._moment, self.none = state["normal"], state["moment"], state["none"]
 
 

@@ -17,7 +17,7 @@ GOES_ON = 0.7
 def _still_to_come(
     rate: FloatArray, recent: FloatArray, recent_at: IntArray, powers: FloatArray, sensor: int, step: int
 ) -> float:
-    """Packets above the rate that are still to come of a sensor's burst, from this step on."""
+    """Expected further packets above the rate from a sensor's burst, from this step on."""
     at = recent_at[sensor]
     if at < 0:
         return 0.0
@@ -36,7 +36,7 @@ def bursts_to_come(
     step: int,
     packets: FloatArray,
 ) -> None:
-    """Write the packets above the rate that are still to come of n sensors' bursts, from this step on.
+    """Write the expected further packets above the rate from n sensors' bursts, from this step on.
 
     Args:
         bursts: whether arrivals come in bursts.

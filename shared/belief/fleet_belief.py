@@ -19,9 +19,9 @@ from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory, progress_of, trajectories
 
-# A distance out of every reach.
+# A distance out of reach of every UAV.
 FAR_M = 1e9
-# A position further off the reported progress has an error, and the place on the trajectory counts, metres.
+# A position farther than this from the reported progress has an error; then the place on the trajectory counts, metres.
 _POSITION_ERROR_M = 0.01
 # The arrays of a belief.
 _ARRAYS = ("base", "since", "heard", "battery", "places", "visited")
@@ -38,7 +38,7 @@ class FleetBelief:
         since: shape ``(J,)``, steps; negative for a queue that was read before the mission's first step.
         heard: shape ``(J,)``, the step of the newest beacon, -1 for none.
         battery: shape ``(J,)``, joules.
-        visited: shape ``(J,)``, the step of the last visit, if UAVs flew their decisions; -1 for none.
+        visited: shape ``(J,)``, the step of the last visit, assuming that UAVs fly their decisions; -1 for none.
         uavs: by index, the UAVs that were ever located.
         arrivals, channel, drift: learned from queues, from gains and outcomes, and from the UAVs' progress.
     """
@@ -70,7 +70,7 @@ class FleetBelief:
         return np.where((self.heard < 0) & (self.since >= 0), self._drawn_variance, 0.0)
 
     def hear(self, ids: IntArray, places: FloatArray, beacon: IntArray, queue: FloatArray, battery: FloatArray) -> None:
-        """Take the beacons that are newer than the known ones.
+        """Add the beacons that are newer than the known ones.
 
         Args:
             ids: shape ``(n,)``, the reported sensors, each once.
@@ -81,23 +81,23 @@ class FleetBelief:
         """
         from shared.belief.beacon_updates import take_beacons
 
-        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        # numpy raises an error for an unknown sensor ID; compiled code would not.
         self.places[ids] = places
         if not len(ids) == len(beacon) == len(queue) == len(battery):
             raise ValueError(
                 f"{len(ids)} sensors with {len(beacon)} beacons, {len(queue)} queues, {len(battery)} batteries"
             )
-        # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
+        # Copies, because numba would recompile the function for other types and for read-only arrays.
         heard = np.array(ids, dtype=np.int64), np.array(beacon, dtype=np.int64)
-        told = np.array(queue, dtype=np.float64), np.array(battery, dtype=np.float64)
+        values = np.array(queue, dtype=np.float64), np.array(battery, dtype=np.float64)
         (which, steps, at), came = np.empty((3, len(ids)), dtype=np.int64), np.empty(len(ids))
         known = self.base, self.since, self.heard, self.battery, self.visited, self.arrivals.rate
-        count = take_beacons(*known, float(self._scenario.queue_capacity), *heard, *told, which, came, steps, at)
+        count = take_beacons(*known, float(self._scenario.queue_capacity), *heard, *values, which, came, steps, at)
         if count:
             self.arrivals.take(which[:count], came[:count], steps[:count], at[:count])
 
     def begin(self, ids: IntArray, step: IntArray, queue: FloatArray, battery: FloatArray) -> None:
-        """Take the queues ``(n,)`` that sensors ``(n,)`` had in steps ``(n,)`` before the mission's first one."""
+        """Set the queues ``(n,)`` of sensors ``(n,)`` in steps ``(n,)`` before the mission's first one."""
         self.base[ids], self.since[ids], self.battery[ids] = queue, step, battery
 
     def locate(self, uav: int, step: int, position: Sequence[float], reported_m: float | None = None) -> None:
@@ -116,10 +116,10 @@ class FleetBelief:
         self.uavs[uav] = Whereabouts(step, here, progress, visit=visit, taught=taught)
 
     def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:
-        """Take the gains ``(n,)`` of the beacons that a UAV hears where it was located.
+        """Learn from the gains ``(n,)`` of the beacons that a UAV hears at its position.
 
-        A transmission of the UAV's last step was over the same link as the beacon now. If it failed although that link
-        is good, the sensor's radio failed.
+        The transmission of the UAV's last step was over the same link as the beacon now. If it failed although that
+        link is good, the sensor's radio failed.
         """
         from shared.belief.beacon_updates import in_range
 
@@ -138,33 +138,33 @@ class FleetBelief:
         row = np.flatnonzero(near == visit.sensor)
         others = (other.visit for index, other in self.uavs.items() if index != uav)
         contested = any(o is not None and (o.sensor, o.step) == (visit.sensor, visit.step) for o in others)
-        # A sensor serves one UAV in a step, whatever its radio does.
+        # A sensor serves one UAV in a step, even with a working radio.
         if not len(row) or contested:
             return Measured(excess_db)
         return Measured(excess_db, radio_failed=self._learn_of_visit(visit, -float(gain_db[row[0]])))
 
     def _learn_of_visit(self, visit: Visit, loss_db: float) -> bool:
-        """Learn from the outcome of a UAV's last visit, over a link of this loss; whether the sensor's radio failed."""
+        """Learn from a UAV's last visit over a link of this loss; returns whether the sensor's radio failed."""
         packet_j, packets = self.channel.transfer(loss_db)
         if self.battery[visit.sensor] < packet_j:
             return False
         failed = bool(visit.failed)
         radio_failed = self.channel.transmitted(visit.sensor, failed, loss_db)
         if not failed and visit.since == visit.step and self.since[visit.sensor] == visit.step + 1:
-            # The queue was known before and after: it tells what the link moved.
+            # The queue was known before and after, which gives the packets moved.
             rate = float(self.arrivals.coming(visit.step, 1, np.array([visit.sensor]))[0])
             moved = visit.base + rate - float(self.base[visit.sensor])
             slack = 3.0 * math.sqrt(rate * self.arrivals.dispersion) + 1.0
             self.channel.moved(moved, visit.base, packets, slack)
         return radio_failed
 
-    def tell(self, uav: int, step: int, sensor: int, velocity: int) -> None:
-        """Note a UAV's decision for the step in which it was located; a decision for another step does not count."""
+    def record_decision(self, uav: int, step: int, sensor: int, velocity: int) -> None:
+        """Record a UAV's decision for the step in which it was located; a decision for another step is ignored."""
         if uav in self.uavs and self.uavs[uav].step == step:
             self.uavs[uav].action, self.uavs[uav].failed = (sensor, velocity), None
 
     def settle(self, uav: int, step: int, failed: bool) -> None:
-        """Take the outcome of a UAV's decision of a step; only that of its last one counts."""
+        """Apply the outcome of a UAV's decision of a step; only that of its last decision counts."""
         if uav not in self.uavs:
             return
         last = self.uavs[uav]
@@ -215,7 +215,7 @@ class FleetBelief:
         last.step, last.action, last.failed = last.step + 1, None, None
 
     def collect(self, sensor: int, packets: int, step: int) -> None:
-        """Subtract the packets that a UAV collects in a step, unless something newer is known of the queue."""
+        """Subtract the packets that a UAV collects in a step, unless the queue is known at a later step."""
         self.visited[sensor] = max(int(self.visited[sensor]), step)
         if self.since[sensor] > step:
             return
@@ -223,7 +223,7 @@ class FleetBelief:
         self.since[sensor] = step
 
     def copy(self) -> Self:
-        """The belief as it is now, for another thread: nothing that this one learns later changes the copy."""
+        """A copy for another thread, which later changes of this belief do not affect."""
         constant = (self._scenario, self._paths)
         return deepcopy(self, {id(one): one for one in constant})
 
@@ -239,7 +239,7 @@ class FleetBelief:
         for name in _ARRAYS:
             setattr(self, name, state[name])
         self.arrivals.load_state_dict(state)
-        self.uavs = {uav: Whereabouts.of(told) for uav, told in state["uavs"].items()}
+        self.uavs = {uav: Whereabouts.of(known) for uav, known in state["uavs"].items()}
         self.channel.load_state_dict(state["channel"])
         self.drift.load_state_dict(state["drift"])
 
@@ -249,7 +249,7 @@ class FleetBelief:
 
         which = np.arange(len(self.base)) if ids is None else np.array(ids)
         queue, capacity, bursts = np.empty(len(which)), float(self._scenario.queue_capacity), self.arrivals.in_bursts
-        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        # numpy raises an error for an unknown sensor ID; compiled code would not.
         base, since = self.base[which], self.since[which]
         expected_queues(*self.arrivals.burst_arrays, bursts, base, since, which, capacity, step, queue)
         return queue

@@ -1,4 +1,4 @@
-"""What the gains of one report have shown."""
+"""The measurements of one report's gains."""
 
 from __future__ import annotations
 

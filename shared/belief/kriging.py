@@ -24,7 +24,7 @@ from shared.belief.shadowing import OFFSET_WEIGHT, PRIOR_DB, PRIOR_WEIGHT
 from shared.kit.compiled import compiled, inlined
 from shared.world.channel import FloatArray, IntArray
 
-# A measurement this many standard deviations off its prediction counts less, as in Huber's estimator.
+# A measurement this many standard deviations from its prediction counts less, as in Huber's estimator.
 _HUBER = 3.0
 _HUBER_LEAST_DB = 1.0
 # Measurements of a sensor within this distance are of the same place, metres; so many of one place are kept.
@@ -66,8 +66,8 @@ def take_measurements(
 def _slot(kept: FloatArray, many: int, east: float, north: float, heard: int) -> tuple[int, bool]:
     """The slot that takes a sensor's new measurement, and whether another is dropped for it.
 
-    Two measurements of the same place are kept. A third drops the oldest, so that no wrong one stays. A full record
-    without any of the place drops the nearest one, which tells the most of what the new one tells.
+    Two measurements of the same place are kept. A third replaces the oldest, so that a wrong one does not stay. A full
+    record without any of the place drops the nearest one, whose information is closest to the new one's.
     """
     same, oldest, nearest = 0, 0, 0
     first, least = float(heard), math.inf
@@ -262,9 +262,9 @@ def estimated(kept: FloatArray, counts: IntArray) -> tuple[float, float]:
 
     The offset is shrunk towards 0, and the variance towards its prior.
     """
-    measured, ones, squares, every = 0.0, 0.0, 0.0, 0
+    measured, ones, squares, number = 0.0, 0.0, 0.0, 0
     for sensor in range(kept.shape[0]):
-        every += counts[sensor]
+        number += counts[sensor]
         for n in range(counts[sensor]):
             measured += kept[sensor, n, MEASURED]
             ones += kept[sensor, n, ONES]
@@ -273,4 +273,4 @@ def estimated(kept: FloatArray, counts: IntArray) -> tuple[float, float]:
         for n in range(counts[sensor]):
             off = kept[sensor, n, EXCESS] - offset
             squares += off * (kept[sensor, n, MEASURED] - offset * kept[sensor, n, ONES])
-    return offset, math.sqrt((PRIOR_WEIGHT * PRIOR_DB**2 + max(squares, 0.0)) / (PRIOR_WEIGHT + every))
+    return offset, math.sqrt((PRIOR_WEIGHT * PRIOR_DB**2 + max(squares, 0.0)) / (PRIOR_WEIGHT + number))

@@ -1,4 +1,4 @@
-"""The channel as a fleet has learned it: the formula, the radio map, failing radios, and the rate that is seen."""
+"""A fleet's learned channel: the formula, the radio map, failing radios, and the observed rate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shared.world.scenario import Point, Scenario
 _RINGS = 1024
 # A link that holds with at least this probability counts as one.
 LIKELY = 0.5
-# The rate share is the median of this many visits that show it: one visit proves nothing where arrivals come in bursts.
+# The rate share is the median of this many informative visits: with bursty arrivals, one visit proves nothing.
 _SHARE_VISITS = 5
 # A share above this is no loss, and the least that counts.
 _WHOLE_SHARE, _LEAST_SHARE = 0.93, 0.05
@@ -26,10 +26,10 @@ _WHOLE_SHARE, _LEAST_SHARE = 0.93, 0.05
 _PRIOR = math.log(0.01 / 0.99)
 _FAILED = math.log(0.99 / 0.05)
 _SENT = math.log(0.01 / 0.95)
-# A dead radio is tried again as its odds fall back to the prior, by this much a step: after some 60 steps.
+# The odds fall back to the prior by this much a step, so that a dead radio is tried again after some 60 steps.
 _FORGET = 0.05
 _MOST = 4.0
-# The loss has to be this far below the threshold for a failure to be the radio's, dB.
+# A failure is attributed to the radio if the loss is at least this far below the threshold, dB.
 GOOD_LINK_DB = 0.5
 
 
@@ -84,7 +84,7 @@ class RadioFailures:
         self.none = True
 
     def settle(self, sensor: int, failed: bool) -> None:
-        """Take the outcome of a transmission whose link held."""
+        """Learn from the outcome of a transmission over a working link."""
         if self.none and not failed:
             return
         self.none = False
@@ -92,7 +92,7 @@ class RadioFailures:
         self._odds[sensor] = min(max(odds, _PRIOR), _MOST)
 
     def advance(self, step: int) -> None:
-        """Go to a later step: the evidence of earlier ones counts less."""
+        """Go to a later step: earlier evidence counts less."""
         if not self.none:
             self._odds = np.maximum(self._odds - _FORGET * (step - self.step), _PRIOR)
             self.none = bool((self._odds <= _PRIOR).all())
@@ -122,7 +122,7 @@ class LearnedChannel:
 
     Attributes:
         radio_map: the excess loss over the formula.
-        failures: the radios that fail although their links hold.
+        failures: the radios that fail over good links.
         share: the rate that transfers get, as a share of the formula's, 0.05..1: the median of the last visits.
     """
 
@@ -135,11 +135,11 @@ class LearnedChannel:
 
     @property
     def by_formula(self) -> bool:
-        """Whether all that was seen agrees with the formula."""
+        """Whether all observations agree with the formula."""
         return self.radio_map.exact and self.failures.none and self.share == 1.0
 
     def measure(self, ids: IntArray, place: ArrayLike, distance: FloatArray, gain_db: FloatArray) -> FloatArray:
-        """Take the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``.
+        """Learn from the gains ``(n,)`` that a UAV at its place ``(2,)`` measured of sensors at distances ``(n,)``.
 
         Returns:
             their excess losses over the formula, dB.
@@ -197,14 +197,14 @@ class LearnedChannel:
         return np.asarray(-(loss + self.radio_map.predict(place[None], ids)[0][0]))
 
     def transmitted(self, sensor: int, failed: bool, loss_db: float) -> bool:
-        """Take the outcome of a transmission over a link; returns whether the sensor's radio failed."""
+        """Learn from the outcome of a transmission; returns whether the sensor's radio failed."""
         good = loss_db < self._scenario.path_loss_limit_db - GOOD_LINK_DB
         if good:
             self.failures.settle(sensor, failed)
         return good and failed
 
     def transfer(self, loss_db: float) -> tuple[float, int]:
-        """What a packet costs a sensor's battery, joules, and the packets that a step moves, over a link of this loss.
+        """A packet's energy, joules, and the packets that a step moves, over a link of this loss.
 
         The link is in radio range; no packets move where the loss is not below the threshold.
         """
@@ -223,7 +223,7 @@ class LearnedChannel:
             slack: the estimate's error, packets.
         """
         if link <= 0 or (packets >= before - slack and before < self.share * link):
-            # The queue was emptied: the link may move more.
+            # The visit emptied the queue: the link may be able to move more.
             return
         self._see([*self._shares[1:], min(max(packets / link, _LEAST_SHARE), 1.0)])
 
@@ -240,7 +240,7 @@ class LearnedChannel:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore it."""
+        """Restore a ``state_dict``."""
         self.radio_map.load_state_dict(state["map"])
         self.failures.load_state_dict(state["failures"])
         self._see(list(state["shares"]))

@@ -1,4 +1,4 @@
-"""What a UAV expects of its links, by the formula and a radio map, compiled as :mod:`shared.belief.kriging` is."""
+"""Expected links of a UAV by the formula and a radio map, compiled as :mod:`shared.belief.kriging` is."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def formula_transfers(
 
 @compiled
 def transfer(world: LinkBudget, loss_db: float) -> tuple[float, int]:
-    """What a packet costs the sensor's battery, joules, and the packets that a step moves, over a link that holds."""
+    """A packet's energy, joules, and the packets that a step moves, over a working link."""
     rate = _whole_rate_bps(loss_db, world)
     return world.transmit_power_w * (world.packet_bits / max(rate, 1e-12)), _packets(rate, world)
 
@@ -136,6 +136,6 @@ def expected_transfers(
             elif spare != 0.0:
                 margin[p, n] = math.copysign(math.inf, spare)
             if margin[p, n] > _LEAST_MARGIN:
-                # If a link holds that is expected to fail, its loss is just below the threshold.
+                # A link that works against expectation has a loss just below the threshold.
                 rate = _rate_bps(min(loss, world.path_loss_limit_db - 1e-9), capped_db, world)
                 packets[p, n] = int(math.floor(_packets(rate, world) * share + 1e-9))

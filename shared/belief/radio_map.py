@@ -27,11 +27,11 @@ _MOST_KEPT, _MOST_OF_ONE = 4096, 36
 LARGEST_EXCESS_DB = 40.0
 # Measurements that agree with the formula this closely are no sign of an excess loss, dB.
 _EXACT_DB = 0.05
-# The map compares its kinds of shadowing again when this factor more measurements came.
+# The map compares the kinds of shadowing again when the measurements have grown by this factor.
 _COMPARE_GROWTH = 1.3
 _COMPARE_FIRST = 8
-# After so many measurements of all sensors, those of the sensors at hand are inverted anew. After 10,000 without that,
-# predictions were off by 3e-9 dB.
+# After this many measurements of all sensors, the matrices of the measured sensors are inverted anew. After 10,000
+# measurements without that, predictions were off by 3e-9 dB.
 _REFRESH = 5000
 # The numbers of a measurement's place.
 _PLACE = slice(EAST, EXCESS)
@@ -47,8 +47,8 @@ class RadioMap:
 
     Prediction at the place x, with the n measurements r of the sensor, their covariance K and their covariances k(x)
     with the place: mean ``mu + k K^-1 (r - mu)``, variance ``sigma^2 (1 - k K^-1 k)``. A measurement changes one row of
-    K, and its inverse by that row (the inverse of a partitioned matrix). Another kind of shadowing inverts K anew, and
-    so does every so many measurements, before rounding errors add up.
+    K, and its inverse by that row (the inverse of a partitioned matrix). K is inverted anew for another kind of
+    shadowing, and at intervals, before rounding errors add up.
 
     Args:
         sensors: J. A map of many sensors keeps fewer measurements of each.
@@ -98,7 +98,7 @@ class RadioMap:
         return {int(sensor): float(means[sensor]) for sensor in np.flatnonzero(self.count)}
 
     def measure(self, ids: IntArray, place: ArrayLike, excess_db: FloatArray) -> FloatArray:
-        """Take one UAV's measurements of n sensors at its place.
+        """Add one UAV's measurements of n sensors at its place.
 
         Args:
             ids: shape ``(n,)``, each sensor once.
@@ -106,7 +106,7 @@ class RadioMap:
             excess_db: shape ``(n,)``, measured path loss less the formula's, dB.
 
         Returns:
-            the measurements as they count: within the largest excess loss.
+            the measurements, limited to the largest excess loss.
         """
         # For a few numbers np.clip takes several times as long.
         excess = np.minimum(np.maximum(excess_db, -LARGEST_EXCESS_DB), LARGEST_EXCESS_DB)
@@ -116,11 +116,11 @@ class RadioMap:
         if self.exact and np.abs(excess).max() > _EXACT_DB:
             self.exact = False
             self._factor(np.arange(len(self.count)))
-        # Loading numba takes a fifth of a second, which commands that learn no channel save.
+        # Imported here, because commands that learn no channel should not load numba, which takes a fifth of a second.
         from shared.belief.kriging import take_measurements
 
         east, north = np.asarray(place, dtype=np.float64).tolist()
-        # A copy, because numba would compile the function again for an array that is read-only.
+        # A copy, because numba would recompile the function for a read-only array.
         take_measurements(self._measurements(), self._links(), np.array(ids), east, north, excess)
         if self.exact:
             self.deviation_db = 0.0
@@ -176,7 +176,7 @@ class RadioMap:
         self._factor(np.flatnonzero(self.count))
 
     def state_dict(self) -> dict[str, Any]:
-        """The measurements and what was solved of them, as copies."""
+        """The measurements and their solutions, as copies."""
         arrays = {name: getattr(self, name).copy() for name in ("places", "excess", "noise", "count")}
         measured, ones = self._kept[..., MEASURED].copy(), self._kept[..., ONES].copy()
         return {

@@ -30,7 +30,7 @@ class Measurements(NamedTuple):
 
 
 class LinkStatistics(NamedTuple):
-    """What all links have in common.
+    """The statistics of all links.
 
     The first four are of the kind of :class:`~shared.belief.shadowing.Shadowing`, ``offset_db`` and ``deviation_db``
     ``mu`` and ``sigma``; ``heard`` counts the measurements of all sensors so far.

@@ -1,4 +1,4 @@
-"""What beacons change in the sensors' records, compiled by numba; without numba it is plain Python."""
+"""Updates of the sensors' records by beacons, compiled by numba; without numba it is plain Python."""
 
 from __future__ import annotations
 

@@ -45,20 +45,17 @@ class Records:
         return rates
 
     def hear(self, ids: NDArray[np.int64], seen: NDArray[np.int64], queue: FloatArray) -> None:
-        """Take the beacons that are newer than the known ones, ``(n,)`` each.
+        """Add the beacons that are newer than the known ones, ``(n,)`` each.
 
         Between two beacons of a sensor without a visit or an overflow, the queue grows by the arrivals.
         """
         from shared.belief.record_updates import record_beacons
 
         arrays = self.visits, self._seen, self._queue, self._arrivals, self._exposure
-        # Copies, because numba would compile the function again for other numbers, and for arrays that are read-only.
-        which, steps, queues = (
-            np.array(ids, dtype=np.int64),
-            np.array(seen, dtype=np.int64),
-            np.array(queue, dtype=np.float64),
-        )
-        # numpy raises an error for a sensor that there is not, which compiled code would not notice.
+        # Copies, because numba would recompile the function for other types and for read-only arrays.
+        which, steps = np.array(ids, dtype=np.int64), np.array(seen, dtype=np.int64)
+        queues = np.array(queue, dtype=np.float64)
+        # numpy raises an error for an unknown sensor ID; compiled code would not.
         before = self._seen[which]
         if not len(which) == len(steps) == len(queues):
             raise ValueError(f"{len(which)} sensors with {len(steps)} steps and {len(queues)} queues")
@@ -70,7 +67,7 @@ class Records:
         self._update(sensor_id)
 
     def confirm(self, sensor_id: int, decision_id: str, step: int) -> None:
-        """Count the visit for good: it succeeded, or its outcome will never be known."""
+        """Make the visit final: it succeeded, or its outcome will never be known."""
         self._confirmed[sensor_id] = max(self._confirmed[sensor_id], step)
         self.withdraw(sensor_id, decision_id)
 
@@ -113,31 +110,31 @@ def take_readings(
     records: Records,
     belief: FleetBelief,
 ) -> NDArray[np.bool_]:
-    """Add readings that sensors sent by another network to their records and to the belief; returns which are news.
+    """Add sensors' own readings to their records and to the belief; returns which readings are new.
 
-    A reading is news if it is newer than the sensor's last beacon, reading and visit: the belief has taken a visit's
-    packets from an older queue.
+    A reading is new if it is later than the sensor's last beacon, reading and visit: the belief has already subtracted
+    a visit's packets.
 
     Args:
         ids: shape ``(n,)``, each sensor once.
         steps: shape ``(n,)``, negative before the mission's first step.
         queue: shape ``(n,)``, packets at the start of that step.
-        battery: shape ``(n,)``, joules; NaN where the reading does not tell.
+        battery: shape ``(n,)``, joules; NaN if the reading has none.
     """
     latest = np.maximum(belief.heard[ids], belief.visited[ids])
     since = belief.since[ids]
     before = steps < 0
-    news = np.where(before, (latest < 0) & ((since >= 0) | (steps > since)), steps > latest)
+    new = np.where(before, (latest < 0) & ((since >= 0) | (steps > since)), steps > latest)
     battery = np.where(np.isnan(battery), belief.battery[ids], battery)
-    first, now = news & before, news & ~before
+    first, now = new & before, new & ~before
     belief.begin(ids[first], steps[first], queue[first], battery[first])
     belief.hear(ids[now], belief.places[ids[now]], steps[now], queue[now], battery[now])
     records.hear(ids[now], steps[now], queue[now])
-    return np.asarray(news)
+    return np.asarray(new)
 
 
 def take_report(uav: UavState, step: int, records: Records, belief: FleetBelief) -> Measured:
-    """Add a UAV's full report to the sensors' records and to the belief; returns what its gains show."""
+    """Add a UAV's full report to the sensors' records and to the belief; returns the measurements of its gains."""
     reported = arrays_of(uav.sensors)
     belief.advance(step)
     belief.locate(uav.uav_id, step, uav.position, uav.progress_m)

@@ -1,4 +1,4 @@
-"""Shadowing: how the excess losses of one sensor's links at several places belong together."""
+"""Shadowing: the covariance of the excess losses of one sensor's links at several places."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Shadowing:
 
     @cached_property
     def fading(self) -> float:
-        """The share of the variance that no earlier measurement tells anything about."""
+        """The share of the variance that earlier measurements cannot explain."""
         return 1.0 - self.sensor - self.place
 
     def covariance(self, apart_m: FloatArray) -> FloatArray:
@@ -38,7 +38,7 @@ class Shadowing:
         return self.sensor + self.place * np.exp(-apart_m / self.range_m)
 
 
-# The likelihood of the measurements chooses between them. The first is the assumption before.
+# The measurements' likelihood selects one of them; the first is the prior assumption.
 KINDS = (
     Shadowing(sensor=0.4, place=0.4, range_m=60.0),
     *(
@@ -47,7 +47,7 @@ KINDS = (
         for range_m in (50.0, 150.0)
         for fading in (0.02, 0.2)
     ),
-    # A sensor's own excess alone, and fading alone.
+    # Mainly a sensor's own excess, and mainly fading.
     Shadowing(sensor=0.996, place=0.002, range_m=60.0),
     Shadowing(sensor=0.9, place=0.08, range_m=60.0),
     Shadowing(sensor=0.4, place=0.2, range_m=60.0),

@@ -1,4 +1,4 @@
-"""Which kind of shadowing explains a radio map's measurements, compiled as :mod:`shared.belief.kriging` is."""
+"""The likelihoods of the kinds of shadowing for a radio map, compiled as :mod:`shared.belief.kriging` is."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def likelihoods(kept: FloatArray, counts: IntArray) -> FloatArray:
     offset = both / (ones + OFFSET_WEIGHT)
     off = squares - 2.0 * offset * both + np.square(offset) * ones
     total = PRIOR_WEIGHT * PRIOR_DB**2 + np.maximum(off, 0.0)
-    every = float(counts.sum())
-    return np.asarray(-0.5 * every * np.log(total / (PRIOR_WEIGHT + every)) - 0.5 * spread)
+    number = float(counts.sum())
+    return np.asarray(-0.5 * number * np.log(total / (PRIOR_WEIGHT + number)) - 0.5 * spread)
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Where a UAV of a fleet is, what it was told, and what it has flown last."""
+"""A UAV's position, its current decision, and its last flown decision."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Whereabouts:
 
     ``progress_m`` along its trajectory is ``None`` for a UAV off its trajectory, which is assumed to stay in place.
     ``failed`` is the reported outcome of ``action``, ``None`` before the report. ``taught`` is the step of the newest
-    report that the channel and the drift have learned from: a report that comes again teaches nothing.
+    report from which channel and drift have learned: a repeated report is ignored.
     """
 
     step: int
@@ -59,7 +59,7 @@ class Whereabouts:
         return path.at(self.progress_m + drift.flown(path, self.progress_m, flown))
 
     def state(self) -> list[Any]:
-        """All of it, as plain values."""
+        """The attributes, as plain values."""
         visit = None if self.visit is None else astuple(self.visit)
         return [self.step, list(self.position), self.progress_m, self.action, self.failed, visit, self.taught]
 

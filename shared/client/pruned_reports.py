@@ -99,7 +99,7 @@ class UavKnowledge:
             self._records.confirm(last.sensor_id, last.decision_id, last.step)
         self._pending = response
         self._records.presume(response.sensor_id, response.decision_id, response.step)
-        self._belief.tell(response.uav_id, response.step, response.sensor_id, response.velocity)
+        self._belief.record_decision(response.uav_id, response.step, response.sensor_id, response.velocity)
 
     def best_rows(self, uav: UavState, step: int) -> list[int]:
         """Rows of the report to send, best first: the k with the highest attention scores.

@@ -13,7 +13,7 @@ from shared.kit.validation_messages import suggestion
 
 _SUMMARIES = {
     "serve": "run the edge decision service (LLM included)",
-    "doctor": "look for what keeps an edge from running here, and say what to type",
+    "doctor": "find problems that keep an edge from running here, with remedies",
     "mqtt": "forward LoRaWAN sensors' readings from an MQTT broker to an edge",
     "mission": "`mission create`: tell an edge your world, and print a request that works for it",
     "world": "`world import` and `world export`: flight plans of QGroundControl to a world and back",
@@ -27,7 +27,7 @@ _SUMMARIES = {
     "model": "`model fetch`: put the embedded LLM and the token vocabulary on this machine",
 }
 
-# The extra of each command that needs another one than its package's.
+# The extras of commands that need another one than their package's.
 _EXTRAS = {"mqtt": "mqtt", "fly": "mavlink"}
 # Modules that only some options of the simulator's commands import, and their extras.
 _EXTRA_OF_MODULE = {"numba": "planner", "ortools": "bound"}
@@ -41,7 +41,7 @@ _OF_EXTRAS = frozenset((
 ))
 # fmt: on
 
-# An editable installation has the commands of the day when it was made, and the code of today.
+# An editable installation has today's code, but the commands of the day when it was made.
 _STALE = (
     "this installation is older than its checkout and cannot find that command. "
     "Type `make install` in the checkout, or install the package again with pip."
@@ -84,7 +84,7 @@ def main() -> int:
 
 
 def _reader_is_gone() -> bool:
-    """Whether standard output is a pipe that nothing reads any more; another broken pipe is an error of the command."""
+    """Whether standard output is a pipe without a reader; any other broken pipe is an error of the command."""
     output = select.poll()
     output.register(sys.stdout, 0)
     return any(event & select.POLLERR for _, event in output.poll(0))

@@ -9,18 +9,18 @@ from typing import Any, ParamSpec, TypeVar
 try:
     import numba
 except ModuleNotFoundError:
-    # Not installed with the simulator alone.
+    # The extra `simulator` does not install it.
     numba = None  # type: ignore[assignment]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
-# Other threads of Python run meanwhile. Without numba's run-time (``_nrt``) a function makes no array, and reading one
-# counts no reference, which would take most of the time.
+# nogil: other Python threads run meanwhile. _nrt off: functions create no arrays and count no references, which would
+# take most of the time.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-# Where compiled functions are kept: beside their module, else in the user's folder of caches.
-_PLACES = "shared.kit.compiled_cache.BesideModule,UserWideCacheLocator"
-# Two threads may each import a module of compiled functions at a time, and numba's setting is one for all.
+# numba's cache locators: the module's __pycache__, else the user's cache folder.
+_LOCATORS = "shared.kit.compiled_cache.ModuleCacheLocator,UserWideCacheLocator"
+# Two threads may import modules of compiled functions at the same time, and numba's setting is global.
 _placing = threading.Lock()
 
 
@@ -31,12 +31,12 @@ def require_numba() -> None:
 
 
 def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """A function that Python calls; it is kept, so that later processes need not compile it."""
+    """A function for calls from Python; its machine code is cached for later processes."""
     if numba is None:
         return function
     config: Any = numba.config
     with _placing:
-        before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, _PLACES
+        before, config.CACHE_LOCATOR_CLASSES = config.CACHE_LOCATOR_CLASSES, _LOCATORS
         try:
             made: Callable[_P, _R] = numba.njit(cache=True, **_OPTIONS)(function)
         except RuntimeError:
@@ -48,7 +48,7 @@ def compiled(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def inlined(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """A part of compiled functions."""
+    """A function that is inlined into compiled functions."""
     if numba is None:
         return function
     made: Callable[_P, _R] = numba.njit(forceinline=True, **_OPTIONS)(function)

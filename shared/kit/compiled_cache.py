@@ -1,4 +1,4 @@
-"""The place of compiled functions beside their module, for :mod:`shared.kit.compiled`."""
+"""The cache locator of compiled functions for :mod:`shared.kit.compiled`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from numba.core.caching import InTreeCacheLocator
 _RULES = Path(__file__).parents[1] / "world"
 
 
-class BesideModule(InTreeCacheLocator):
-    """The folder ``__pycache__`` beside a module, also one that is read-only but has the function, as in an image.
+class ModuleCacheLocator(InTreeCacheLocator):
+    """A module's ``__pycache__``, which may be read-only if it has the function, as in an image.
 
-    A function is compiled anew after a change in its folder or in ``shared/world``, which have its callees.
+    A function is recompiled after a change in its folder or in ``shared/world``, where its callees are.
     """
 
     def get_source_stamp(self) -> bytes:
@@ -25,7 +25,7 @@ class BesideModule(InTreeCacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
-        """The place of a function; None if the folder is read-only and has nothing of it."""
+        """A function's locator; None if the folder is read-only and has no cached code of it."""
         own: Any = cls(py_func, py_file)
         kept = Path(own.get_cache_path()).glob(f"{Path(py_file).stem}.{py_func.__qualname__}-*.nbi")
         writable: Any = super().from_function(py_func, py_file)  # type: ignore[no-untyped-call]

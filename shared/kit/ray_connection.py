@@ -1,4 +1,4 @@
-"""The connection of a command to Ray: started here for its time, or a cluster's."""
+"""The connection of a command to Ray: to one started here for the command, or to a cluster."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class RayUnusable(ValueError):
 def connected(address: str, cores: int) -> Iterator[None]:
     """Within the context, this process is connected to Ray, without usage statistics and dashboard.
 
-    A Ray that is started here has a token of its own. Ray reads it when it is imported, so nothing may import Ray (as
-    ``torchrl.envs`` does) before.
+    A Ray that is started here has its own token. Ray reads it when it is imported, so nothing may import Ray earlier,
+    as ``torchrl.envs`` does.
 
     Args:
         address: ``local`` to start Ray on this machine, or the address of a cluster of which this machine is a part.

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import ValidationInfo
 
-# More than any model has fields, so that a few misspelt names still get an error each.
+# More than the fields of any model, so that a few misspelt names still get an error each.
 MOST_NAMES = 128
 
 
@@ -17,7 +17,7 @@ def few_names(given: Any) -> Any:
         ValueError: the object has more than 128 names.
     """
     if isinstance(given, dict) and len(given) > MOST_NAMES:
-        raise ValueError(f"an object of {len(given)} names, and {MOST_NAMES} are more than there are")
+        raise ValueError(f"too many fields: {len(given)}, at most {MOST_NAMES}")
     return given
 
 
@@ -32,7 +32,7 @@ def plain(given: Any, info: ValidationInfo) -> Any:
 
 
 def _numeric(value: Any) -> bool:
-    """Whether it is numpy's, or a list that begins with a number of numpy's."""
+    """Whether it is a numpy value, or a list that begins with a numpy number."""
     if isinstance(value, list | tuple):
         return bool(value) and hasattr(value[0], "tolist")
     return hasattr(value, "tolist")

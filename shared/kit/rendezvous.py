@@ -1,7 +1,7 @@
 """Rendezvous hashing (Thaler and Ravishankar 1998, "Using Name-Based Mappings to Increase Hit Rates").
 
-Processes that know the same names rank them alike for a key, in whatever order they list them. Where a name leaves,
-only the keys move that it ranked first for, evenly to the others; where it returns, they return.
+Processes that know the same names rank them alike for a key, in whatever order they list them. If a name is removed,
+only its own keys move, evenly to the others; if it is added again, they return.
 """
 
 from __future__ import annotations

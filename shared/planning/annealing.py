@@ -34,7 +34,7 @@ from shared.world.trajectory import trajectories
 
 # The cumulative shares of the kinds of changes: another sensor at one step; one velocity for several steps; another
 # velocity at one step; the same with the opposite change at a later step; the rest exchange two sensors.
-_SENSOR, _RUN, _ALONE, _SHIFT = 0.4, 0.5, 0.65, 0.9
+_SENSOR, _RUN, _SINGLE, _SHIFT = 0.4, 0.5, 0.65, 0.9
 # The cumulative shares of new velocities: any one; the highest one, because some sensors are reached only if every
 # velocity is the highest; the rest are one or two levels from the old one.
 _ANY_VELOCITY, _HIGHEST_VELOCITY, _NEAR_VELOCITY = 0.4, 0.6, 2
@@ -145,7 +145,7 @@ def _velocity(tables: Tables, now: int) -> int:
 def _propose_velocity(
     tables: Tables, current: CurrentPlan, new: Proposal, step: int, uav: int, temperature: float, kind: float
 ) -> bool:
-    """Draw another velocity of a UAV's step, alone, with the opposite change at a later step, or for some steps."""
+    """Draw another velocity of a UAV: for one step, with the opposite change at a later one, or for some steps."""
     steps, drawn = len(current.sensor), _velocity(tables, current.velocity[step, uav])
     more = drawn - current.velocity[step, uav]
     new.velocity[step, uav] = drawn
@@ -154,7 +154,7 @@ def _propose_velocity(
             new.velocity[then, uav] = drawn
     elif more == 0:
         return False
-    elif kind >= _ALONE:
+    elif kind >= _SINGLE:
         if step + 1 >= steps:
             return False
         then = step + 1 + _below(steps - step - 1)

@@ -1,4 +1,4 @@
-"""Operator guidance: a fleet's orders beside the loss of packets, as a structure that the edge can check and obey.
+"""Operator guidance: a fleet's orders in addition to its goal to lose no packets, in a form that code can check.
 
 An operator writes a note in plain words, and an LLM compiles it to a :class:`Guidance`. The edge obeys only confirmed
 guidance. Empty guidance changes no number anywhere.
@@ -115,13 +115,13 @@ class Guidance(Received):
             weights[wish.sensor_id] = wish.weight
         return weights
 
-    def every(self, sensors: int) -> FloatArray:
-        """Steps within which the fleet is to visit each sensor, shape ``(J,)``; infinite without an order."""
-        every = np.full(sensors, np.inf)
+    def visit_intervals(self, sensors: int) -> FloatArray:
+        """The longest interval between visits to each sensor, steps, shape ``(J,)``; infinite without an order."""
+        intervals = np.full(sensors, np.inf)
         for wish in self.sensors:
             if wish.visit_every is not None:
-                every[wish.sensor_id] = wish.visit_every
-        return every
+                intervals[wish.sensor_id] = wish.visit_every
+        return intervals
 
     def overdue(self, step: int, visits: NDArray[np.int64]) -> FloatArray:
         """The steps by which each sensor is overdue if no UAV visits it in this step, shape ``(J,)``.
@@ -131,7 +131,7 @@ class Guidance(Received):
         Args:
             visits: step of the last visit, ``(J,)``; -1 for never, which counts as a visit just before step 0.
         """
-        late: FloatArray = np.maximum(step - visits - self.every(len(visits)) + 1.0, 0.0)
+        late: FloatArray = np.maximum(step - visits - self.visit_intervals(len(visits)) + 1.0, 0.0)
         return late
 
     def lateness(self, step: int, visits: NDArray[np.int64], horizon: int, beyond: int) -> FloatArray:
@@ -154,11 +154,11 @@ class Guidance(Received):
                 late[since, now] = sum(LATE_PACKETS * (self.overdue(step + n, last) > 0) for n in steps)
         return late
 
-    def beside(self, in_force: Guidance, levels: int) -> Guidance:
-        """These orders and those in force at once.
+    def merged_with(self, in_force: Guidance, levels: int) -> Guidance:
+        """These orders merged with the orders in force.
 
-        Of a sensor that both name, these count. The velocities are those of 0..levels - 1 m/s that both allow, or
-        where none is left those that the orders in force allow.
+        For a sensor in both, these orders apply. The allowed velocities are those of 0..levels - 1 m/s that both allow;
+        if there are none, those that the orders in force allow.
         """
         if not in_force:
             return self
@@ -179,23 +179,23 @@ class Guidance(Received):
         return [order for order in self._each_in_words() if order not in others]
 
     def _each_in_words(self) -> list[str]:
-        said = []
+        words = []
         for wish in self.sensors:
             if wish.visit_every is not None:
                 often = "in every step" if wish.visit_every == 1 else f"at least once in every {wish.visit_every} steps"
-                said.append(f"Visit sensor {wish.sensor_id} {often}.")
+                words.append(f"Visit sensor {wish.sensor_id} {often}.")
             if wish.weight == 0:
-                said.append(f"Ignore what sensor {wish.sensor_id} loses.")
+                words.append(f"Ignore what sensor {wish.sensor_id} loses.")
             elif wish.weight != 1:
-                said.append(f"Count each packet that sensor {wish.sensor_id} loses {wish.weight:g} times.")
+                words.append(f"Count each packet that sensor {wish.sensor_id} loses {wish.weight:g} times.")
         if self.min_velocity is not None:
-            said.append(f"Never fly slower than {self.min_velocity} m/s.")
+            words.append(f"Never fly slower than {self.min_velocity} m/s.")
         if self.max_velocity is not None:
-            said.append(f"Never fly faster than {self.max_velocity} m/s.")
+            words.append(f"Never fly faster than {self.max_velocity} m/s.")
         if self.forbidden_velocities:
             levels = " or ".join(map(str, sorted(set(self.forbidden_velocities))))
-            said.append(f"Never fly at {levels} m/s.")
-        return said
+            words.append(f"Never fly at {levels} m/s.")
+        return words
 
 
 class Impossible(ValueError):

@@ -11,13 +11,13 @@ from shared.world.channel import FloatArray
 
 Floats = NDArray[np.float32]
 
-# A queue has at most this many levels beside the empty one, fewer than annealing_arrays.py has room for; of a larger
-# capacity a level is several packets. With 60 levels, one a packet, missions in six development worlds of `shadowed`
-# and `faulty` lost the same packets.
+# A queue has at most this many levels in addition to the empty one, fewer than annealing_arrays.py has room for; with a
+# larger capacity a level is several packets. With 60 levels, one a packet, missions in six development worlds of
+# `shadowed` and `faulty` lost the same packets.
 _MOST_LEVELS = 30
-# A negative binomial of so many successes is a Poisson.
+# A negative binomial with this many successes is a Poisson distribution.
 _POISSON = 1e9
-# The places of a uniform distribution's quantiles, for a queue that no beacon told.
+# The places of a uniform distribution's quantiles, for a queue without a beacon.
 _QUANTILES = np.linspace(-1.0, 1.0, 9)
 
 
@@ -43,7 +43,7 @@ class QueueChains:
 
 @dataclass(frozen=True)
 class Arriving:
-    """Packets that come to J sensors: their mean and variance, shape ``(..., J)``."""
+    """Arrivals at J sensors, packets: their mean and variance, shape ``(..., J)``."""
 
     mean: FloatArray
     variance: FloatArray

@@ -33,7 +33,7 @@ _BEYOND = (4, 7, 10, 13)
 _GOOD_SHARE = 0.7
 # Between two places of the way after the horizon, as a sum of velocities.
 _STRIDE = 4
-# Larger fleets plan UAV by UAV, each with the others' present plans, and fewer steps ahead.
+# In larger fleets a plan covers only the UAVs that need a decision and fewer steps; the other UAVs keep their plans.
 _JOINT_UAVS = 4
 _NEAR_HORIZON = 4
 _MOST_SENSORS = 40
@@ -72,9 +72,9 @@ class Draft:
     before: IntArray
 
     def search(self, seconds: float = math.inf) -> Found:
-        """The best plan found within the wall clock, never worse than the last plan and the greedy one.
+        """The best plan found within a wall-clock limit, never worse than the last plan and the greedy one.
 
-        The last plan stays, without a search, where it is expected to lose next to nothing.
+        A last plan that is expected to lose next to nothing stays without a search.
 
         Raises:
             ModuleNotFoundError: numba is not installed (extra ``service`` or ``planner``).
@@ -116,13 +116,13 @@ class RecedingHorizon:
     The objective is the expected number of packets lost in those steps and, without further visits, in at least four
     more: as many as the nearest UAV then needs to the sensor, at full speed; see
     :class:`~shared.planning.queue_chains.QueueChains`. A plan covers all UAVs that are present; the decisions already
-    made in this step are fixed. Fleets of more than four UAVs plan UAV by UAV, four steps ahead, and for them the four
-    steps count alone.
+    made in this step are fixed. In fleets of more than four UAVs, a plan covers four steps of the UAVs that need a
+    decision, and exactly four steps after it count.
 
-    Simulated annealing (:class:`~shared.planning.annealing.Annealing`) searches in several runs, from the last plan
-    and from that of :func:`shared.planning.greedy.look_ahead`, on as many cores as there are. Where both are expected
-    to lose a packet, six begin at once; else one does, and five follow where its plan is expected to lose 0.1 packets.
-    The last plan stays where it is expected to lose less than 0.003 packets. A mission repeats to the bit.
+    Simulated annealing (:class:`~shared.planning.annealing.Annealing`) searches in several runs, from the last plan and
+    from that of :func:`shared.planning.greedy.look_ahead`, on all usable cores. If both are expected to lose a packet,
+    six runs start together; otherwise one does, and five follow if its plan is expected to lose 0.1 packets. The last
+    plan stays if it is expected to lose less than 0.003 packets. A mission repeats to the bit.
 
     Attributes:
         plans: by UAV, its planned actions ``(n, 2)``, sensor (-1: none) and velocity, from step ``step`` on.
@@ -138,7 +138,7 @@ class RecedingHorizon:
         self._joint = scenario.uavs <= _JOINT_UAVS
 
     def begin(self, step: int) -> None:
-        """Go to a later step, to which the belief advances by itself: the plans lose their flown steps."""
+        """Go to a later step: drop the plans' flown steps. The belief advances separately."""
         if step <= self.step:
             return
         passed = step - self.step
@@ -156,7 +156,7 @@ class RecedingHorizon:
 
         Args:
             uavs: UAVs located in this step.
-            taken: sensors reserved in this step, beside those of the belief's decisions.
+            taken: sensors reserved in this step, in addition to those of the belief's decisions.
 
         Returns:
             None if none of the UAVs flies its trajectory.
@@ -168,7 +168,7 @@ class RecedingHorizon:
             return None
         decided = {uav: action for uav, action in belief.decided(step).items() if uav in present}
         left = world.steps - step
-        # Past the scenario's last step a fleet may fly on.
+        # A fleet may continue past the scenario's last step.
         horizon = min(_HORIZON if self._joint else _NEAR_HORIZON, left if left > 0 else _HORIZON)
         fixed = {u: np.array([action]) for u, action in decided.items()}
         fixed |= {u: self.plans[u][:horizon] for u in present if u not in free and len(self.plans.get(u, ()))}
@@ -215,9 +215,9 @@ class RecedingHorizon:
                 self.plans[uav] = np.stack((names[actions[:, 0]], actions[:, 1]), axis=-1)
 
     def action(self, uav: int, reserved: Collection[int] = ()) -> Action | None:
-        """The planned sensor and velocity of a UAV now; where a plan has none in reach, the nearest sensor.
+        """The planned sensor and velocity of a UAV now; if its plan names no sensor, the nearest one.
 
-        ``None`` without a plan of this step, or where the sensor is reserved.
+        ``None`` without a plan of this step, or if the sensor is reserved.
         """
         last, actions = self._belief.uavs.get(uav), self.plans.get(uav)
         if last is None or last.step != self.step or actions is None or not len(actions):
@@ -230,9 +230,9 @@ class RecedingHorizon:
         return None if sensor in reserved else Action(sensor, velocity)
 
     def _worth_planning(self, free: list[int], horizon: int) -> IntArray:
-        """The sensors that these UAVs can reach within the horizon; of too many, the first to fill.
+        """The sensors that these UAVs can reach within the horizon; of too many, those that fill first.
 
-        A small fleet's plan has room for those, too, that its UAVs can reach in the steps after the horizon that count.
+        A small fleet's plan also includes sensors in reach during the steps after the horizon that count.
         """
         belief, world = self._belief, self._scenario
         ends = horizon * world.max_velocity
@@ -244,7 +244,7 @@ class RecedingHorizon:
         room = (world.queue_capacity - belief.queue(self.step)) / np.maximum(belief.arrivals.rate, 1e-9)
         if self.guidance.wishes:
             # The operator's sensors come before those that fill first.
-            room = np.where(np.isfinite(self.guidance.every(world.sensors)), -1.0, room)
+            room = np.where(np.isfinite(self.guidance.visit_intervals(world.sensors)), -1.0, room)
         order = np.lexsort((room, ~near, ~ahead))
         return np.sort(order[: min(int(ahead.sum()), _MOST_SENSORS if self._joint else _NEAR_SENSORS)])
 

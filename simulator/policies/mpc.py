@@ -51,7 +51,7 @@ class RecedingHorizonPolicy:
         action = self._plan_action(uav, taken)
         if action is None:
             action = Action(longest_unheard(observation, taken), self._scenario.max_velocity)
-        self.belief.tell(uav, step, *action)
+        self.belief.record_decision(uav, step, *action)
         return action
 
     def learn(self, uav: int, step: int, failed: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from shared.planning.visit_deadlines import judged
+from shared.planning.visit_deadlines import count_deadlines
 from shared.wire.missions import VisitDeadline
 from simulator.records.decision import Decision
 from simulator.records.record import Record
@@ -45,6 +45,6 @@ def recount_deadlines(
     counted = []
     for order in orders:
         last = steps - 1 if order.until is None else min(steps, order.until) - 1
-        met, missed = judged(order.visit_every, order.since, last, served.get(order.sensor_id, ()))
+        met, missed = count_deadlines(order.visit_every, order.since, last, served.get(order.sensor_id, ()))
         counted.append(order.model_copy(update={"met": met, "missed": missed}))
     return counted

@@ -114,7 +114,8 @@ class PlainFlight:
     def fly(self, sensor: int, velocity: int) -> tuple[float, float]:
         """Packets lost, and the cost of the candidate's step."""
         state, own, lost, cost = self.state, self.state.uav, 0.0, 0.0
-        weights, every = (of(WORLD.sensors)[state.sensors] for of in (state.guidance.weights, state.guidance.every))
+        orders, which = state.guidance, state.sensors
+        weights, intervals = orders.weights(WORLD.sensors)[which], orders.visit_intervals(WORLD.sensors)[which]
         in_reach = [self.link(own, j, velocity) > 0 for j in range(SENSORS)]
         for step in range(state.horizon):
             served = set(np.flatnonzero(state.reserved).tolist()) if step == 0 else set()
@@ -131,7 +132,7 @@ class PlainFlight:
             for j in range(SENSORS):
                 over = max(self.queue[j] + self.arrivals[step, j] - WORLD.queue_capacity, 0.0)
                 self.queue[j] += self.arrivals[step, j] - over
-                lost += over * weights[j] + LATE_PACKETS * (self.waited[j] >= every[j])
+                lost += over * weights[j] + LATE_PACKETS * (self.waited[j] >= intervals[j])
                 self.waited[j] += 1
                 cost += over / WORLD.queue_capacity if step == 0 and in_reach[j] else 0.0
         return lost, cost

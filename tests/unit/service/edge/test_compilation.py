@@ -42,7 +42,7 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
                 report(step), step, WORLD, visits=records.visits, rates=rates, reserved=(), preset="reach", belief=known
             )
             UnprunedState(state, ",".join).tokens(len)
-        again.tell(step % 2, step, 0, 3)
+        again.record_decision(step % 2, step, 0, 3)
         again.settle(step % 2, step, failed=False)
     again.queue(70)
     again.arrivals.burst(70)

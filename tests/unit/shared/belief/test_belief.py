@@ -83,7 +83,7 @@ def start(fleet: FleetBelief, uav: int) -> tuple[float, float]:
 def test_a_uav_has_flown_what_it_was_told() -> None:
     fleet = belief()
     fleet.locate(0, 3, start(fleet, 0), 0.0)
-    fleet.tell(0, 3, sensor=1, velocity=7)
+    fleet.record_decision(0, 3, sensor=1, velocity=7)
     fleet.advance(4)
     assert fleet.uavs[0].progress_m == pytest.approx(70.0)
     assert fleet.uavs[0].step == 4
@@ -94,7 +94,7 @@ def test_what_a_uav_was_told_to_collect_is_gone_a_step_later() -> None:
     fleet = belief()
     fleet.hear(np.arange(2), np.array([start(fleet, 0)] * 2), np.zeros(2, np.int64), np.full(2, 50.0), np.ones(2))
     fleet.locate(0, 0, start(fleet, 0), 0.0)
-    fleet.tell(0, 0, sensor=1, velocity=0)
+    fleet.record_decision(0, 0, sensor=1, velocity=0)
     assert fleet.queue(0).tolist() == [50.0, 50.0]
     fleet.advance(1)
     np.testing.assert_allclose(fleet.queue(1), [55.0, 5.0])
@@ -106,7 +106,7 @@ def test_nothing_is_collected_of_a_sensor_out_of_reach_or_that_nobody_has_named(
     fleet.hear(np.array([0]), np.array([[1e5, 0.0]]), np.array([3]), np.array([50.0]), np.array([40.0]))
     before = fleet.base.copy()
     fleet.locate(0, 3, (1.0, 0.0))
-    fleet.tell(0, 3, sensor, 5)
+    fleet.record_decision(0, 3, sensor, 5)
     fleet.advance(4)
     np.testing.assert_array_equal(fleet.base, before)
     assert fleet.visited.tolist() == [-1, -1]
@@ -121,7 +121,7 @@ def test_two_uavs_at_one_sensor_collect_from_it_once() -> None:
         for uav in range(uavs):
             fleet.uavs.pop(uav, None)
             fleet.locate(uav, 0, start(fleet, 0))
-            fleet.tell(uav, 0, sensor=1, velocity=0)
+            fleet.record_decision(uav, 0, sensor=1, velocity=0)
         fleet.advance(1)
         lefts.append(float(fleet.queue(1)[1]))
     assert lefts[0] == lefts[1] > 5.0
@@ -130,7 +130,7 @@ def test_two_uavs_at_one_sensor_collect_from_it_once() -> None:
 def test_a_uav_off_its_trajectory_is_taken_to_stay() -> None:
     fleet = belief()
     fleet.locate(0, 0, (1.0, 1.0))
-    fleet.tell(0, 0, sensor=0, velocity=14)
+    fleet.record_decision(0, 0, sensor=0, velocity=14)
     fleet.advance(1)
     assert fleet.uavs[0].position == (1.0, 1.0)
     assert fleet.uavs[0].progress_m is None
@@ -147,7 +147,7 @@ def test_a_silent_uav_is_no_longer_present() -> None:
 def test_a_uav_asked_again_is_not_held_to_what_it_was_told() -> None:
     fleet = belief()
     fleet.locate(0, 0, start(fleet, 0), 0.0)
-    fleet.tell(0, 0, sensor=1, velocity=3)
+    fleet.record_decision(0, 0, sensor=1, velocity=3)
     fleet.locate(0, 0, start(fleet, 0), 0.0)
     assert fleet.decided(0) == {}
 

@@ -40,7 +40,7 @@ def visited(sensor: int = 0, **told: Any) -> FleetBelief:
     """A fleet whose UAV 0 is told in step 0 to visit a sensor, hovering."""
     fleet = FleetBelief(WORLD)
     report(fleet, 0, **told)
-    fleet.tell(0, 0, sensor, 0)
+    fleet.record_decision(0, 0, sensor, 0)
     return fleet
 
 
@@ -75,7 +75,7 @@ def test_a_failure_that_is_told_after_a_newer_beacon_changes_nothing() -> None:
 def test_the_packets_of_a_failed_visit_do_not_come_back_if_another_uav_has_them() -> None:
     fleet = visited()
     report(fleet, 1, uav=1, heard=IDS[1:])
-    fleet.tell(1, 1, 0, 0)
+    fleet.record_decision(1, 1, 0, 0)
     fleet.advance(2)
     fleet.settle(0, 0, failed=True)
     assert fleet.queue(2)[0] == pytest.approx(5.0)
@@ -87,7 +87,7 @@ def test_a_success_that_nobody_expected_collects(late: bool) -> None:
     fleet = FleetBelief(WORLD)
     for step in range(3):
         report(fleet, step, excess_db=np.array([40.0, 0.0, 0.0]))
-    fleet.tell(0, 2, 0, 0)
+    fleet.record_decision(0, 2, 0, 0)
     if late:
         report(fleet, 3, uav=1, heard=IDS[1:])
         assert fleet.queue(3)[0] > 50.0
@@ -100,7 +100,7 @@ def test_a_success_that_nobody_expected_collects(late: bool) -> None:
 def test_only_the_outcome_of_the_last_decision_counts_and_only_once() -> None:
     fleet = visited()
     report(fleet, 1)
-    fleet.tell(0, 1, 1, 0)
+    fleet.record_decision(0, 1, 1, 0)
     report(fleet, 2)
     before = fleet.base.copy()
     fleet.settle(0, 0, failed=True)
@@ -117,7 +117,7 @@ def test_a_visit_that_is_older_than_the_beacon_collects_nothing_of_it() -> None:
     fleet = visited()
     report(fleet, 5, uav=1)
     fleet.locate(0, 3, start(fleet), 0.0)
-    fleet.tell(0, 3, 0, 0)
+    fleet.record_decision(0, 3, 0, 0)
     fleet.advance(6)
     assert fleet.queue(6)[0] == pytest.approx(55.0)
 
@@ -153,7 +153,7 @@ def flown(share: float, *, wraps: bool = False, steps: int = 12, again: int = 1)
         for _ in range(again):
             fleet.locate(0, step, start(fleet, 0, progress), told)
             fleet.measure(0, IDS[:0], np.array([]))
-        fleet.tell(0, step, 0, 14)
+        fleet.record_decision(0, step, 0, 14)
         progress += 140.0 * share
     return fleet
 
@@ -180,7 +180,7 @@ def fails(times: int, **told: Any) -> FleetBelief:
         if failed is not None and step:
             fleet.settle(0, step - 1, failed)
         report(fleet, step, **told)
-        fleet.tell(0, step, sensor, 0)
+        fleet.record_decision(0, step, sensor, 0)
     return fleet
 
 
@@ -226,7 +226,7 @@ def test_a_sensor_that_serves_one_of_three_uavs_has_no_dead_radio() -> None:
         for uav in range(3):
             report(fleet, step, uav)
         for uav in range(3):
-            fleet.tell(uav, step, 0, 0)
+            fleet.record_decision(uav, step, 0, 0)
     assert fleet.channel.failures.none
 
 
@@ -236,7 +236,7 @@ def test_the_rate_share_follows_what_visits_move() -> None:
         if step:
             fleet.settle(0, step - 1, failed=False)
         report(fleet, step, queue=queue)
-        fleet.tell(0, step, 0, 0)
+        fleet.record_decision(0, step, 0, 0)
         # A quarter of the 60 packets, five arrivals, and another UAV's visit of no interest in between.
         queue = queue - 15.0 + 5.0 if queue > 30.0 else 60.0
     assert fleet.channel.share == pytest.approx(0.25, abs=0.08)
@@ -252,7 +252,7 @@ def test_a_restored_belief_learns_on_to_the_bit() -> None:
             if step:
                 fleet.settle(0, step - 1, failed=step % 3 == 0)
             report(fleet, step, excess_db=excess[step], queue=float(queues[step]))
-            fleet.tell(0, step, step % 2, 0)
+            fleet.record_decision(0, step, step % 2, 0)
         if step % 4 == 1:
             state = again.state_dict()
             again = FleetBelief(WORLD)

@@ -53,7 +53,7 @@ def flown(steps: int) -> tuple[FleetBelief, Records]:
     belief, records = FleetBelief(WORLD), Records(WORLD)
     for step in range(steps):
         take_report(report(step), step, records, belief)
-        belief.tell(step % 2, step, step % 10, 7)
+        belief.record_decision(step % 2, step, step % 10, 7)
         records.presume(step % 10, str(step), step)
         belief.settle(step % 2, step, step % 3 == 0)
     return belief, records

@@ -178,7 +178,7 @@ def test_without_guidance_nothing_reaches_the_problem() -> None:
 def test_the_belief_knows_who_was_visited() -> None:
     belief, _ = heard(0)
     near = int(belief.links(0, [0.0]).packets[0].argmax())
-    belief.tell(0, 0, near, 0)
+    belief.record_decision(0, 0, near, 0)
     belief.advance(1)
     assert belief.visited[near] == 0
     assert (np.delete(belief.visited, near) == -1).all()

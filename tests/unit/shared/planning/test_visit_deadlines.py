@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from shared.planning.visit_deadlines import judged
+from shared.planning.visit_deadlines import count_deadlines
 
 
 def by_hand(every: int, since: int, last: int, visited: set[int]) -> tuple[int, int]:
@@ -28,7 +28,7 @@ def by_hand(every: int, since: int, last: int, visited: set[int]) -> tuple[int, 
 def test_windows_with_and_without_a_visit(
     every: int, since: int, last: int, visited: list[int], met: int, missed: int
 ) -> None:
-    assert judged(every, since, last, visited) == (met, missed)
+    assert count_deadlines(every, since, last, visited) == (met, missed)
 
 
 def test_it_counts_as_one_does_by_hand() -> None:
@@ -38,4 +38,4 @@ def test_it_counts_as_one_does_by_hand() -> None:
         visited = rng.integers(0, 60, rng.integers(0, 15)).tolist()
         last = since + length
         inside = {step for step in visited if since <= step <= last}
-        assert judged(every, since, last, visited) == by_hand(every, since, last, inside)
+        assert count_deadlines(every, since, last, visited) == by_hand(every, since, last, inside)
