@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from service.config.settings import Settings
-from tests.e2e.chart_tools import CHART, helm, run, validator
+from tests.support.chart_tools import CHART, helm, run, validator
 from tests.support.places import ROOT
 
 pytestmark = pytest.mark.long

@@ -11,9 +11,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.e2e.processes import output_until, run_here, started
-from tests.faults.shared_store import Database
+from tests.support.processes import output_until, run_here, started
 from tests.support.running_edges import Report, drained, first_event
+from tests.support.shared_store import Database
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("made_on_decide")]

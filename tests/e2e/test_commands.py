@@ -20,9 +20,9 @@ import tyro
 from lab.experiments.catalogue import EXPERIMENTS
 from shared.client.edge_client import EdgeClient
 from shared.kit import command_line as cli
-from tests.e2e.processes import serving_edge
 from tests.support.edge_stub import free_port
 from tests.support.places import ROOT
+from tests.support.processes import serving_edge
 from tests.support.waiting import PATIENCE_S
 
 PAGES = [
@@ -60,7 +60,7 @@ KEYED = [
 ]
 # Their command lines are parsed and no more; by how they begin.
 PARSED = {
-    "aicvds doctor": "its result is this machine's; tests/unit/service/commands/test_doctor.py runs it",
+    "aicvds doctor": "its result is this machine's; tests/integration/service/commands/test_doctor.py runs it",
     "aicvds serve --ray": "it needs a PostgreSQL; tests/faults/test_ray.py runs it",
     "aicvds mqtt": "it goes on until it is ended; tests/e2e/test_mqtt.py runs it with a broker",
     "aicvds fly": "it waits for vehicles; tests/unit/field/vehicles and tests/e2e/test_fly.py fly it",
@@ -82,9 +82,9 @@ MADE = {
     "make compose": "it needs a Docker engine; CI runs it",
     "make bench": "a quarter of an hour, and it measures",
     "make faults": "ten minutes",
-    "make fuzz": "some minutes; tests/unit/service/api/test_fuzz.py is a short one",
+    "make fuzz": "some minutes; tests/integration/service/api/test_fuzz.py is a short one",
     "make soak": "ten minutes",
-    "make docs": "tests/unit/test_docs.py builds the pages",
+    "make docs": "tests/integration/test_docs.py builds the pages",
     "make release": "minutes; it tries what it builds",
 }
 # Programs that this package does not bring.

@@ -18,12 +18,12 @@ from simulator.records.decision_log import read_decisions
 from simulator.records.real_uavs import sums_by_uav
 from simulator.records.summary import Summary
 from simulator.sites.plans.plan_folder import export_plans
-from tests.e2e.processes import serving_edge, started
+from tests.support.airframe import once
 from tests.support.edge_stub import free_port
+from tests.support.processes import serving_edge, started
+from tests.support.pymavlink_peer import SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
+from tests.support.vehicle_worlds import mission_in, pipeline_folder, starts_m
 from tests.support.waiting import PATIENCE_S
-from tests.unit.field.vehicles.airframe import once
-from tests.unit.field.vehicles.pymavlink_peer import SET_MODE, SPEED, PymavlinkPeer, pymavlink_peer
-from tests.unit.field.vehicles.worlds import mission_in, pipeline_folder, starts_m
 
 SEED, STEPS, UAVS = 0, 30, 3
 OUTAGE_S = 20.0

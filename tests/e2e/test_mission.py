@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from simulator.records.decision_log import read_decisions
-from tests.e2e.processes import run, serving_edge
+from tests.support.processes import run, serving_edge
 
 pytestmark = pytest.mark.long
 

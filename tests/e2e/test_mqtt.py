@@ -18,10 +18,10 @@ import pytest
 import trustme
 from paho.mqtt import publish
 
-from tests.e2e.processes import output_until, run, started
 from tests.support.edge_stub import free_port
+from tests.support.lorawan_messages import APPLICATION, TENANT, chirpstack_up, dev_eui, the_things_stack_up
+from tests.support.processes import output_until, run, started
 from tests.support.waiting import PATIENCE_S, until
-from tests.unit.field.lorawan.messages import APPLICATION, TENANT, chirpstack_up, dev_eui, the_things_stack_up
 
 Report = Callable[..., dict[str, Any]]
 Edge = Callable[..., httpx.Client]

@@ -24,9 +24,9 @@ from grafana_foundation_sdk.cog import plugins
 from grafana_foundation_sdk.cog.encoder import JSONEncoder
 from grafana_foundation_sdk.models.dashboard import Dashboard
 
-from tests.e2e.processes import serving_edge, started
 from tests.support.edge_stub import free_port
 from tests.support.places import ROOT
+from tests.support.processes import serving_edge, started
 
 pytestmark = pytest.mark.needs("prometheus")
 

@@ -25,7 +25,7 @@ from lab.exploration.rollouts import read_rollouts
 from shared.kit.ray_connection import RayUnusable
 from shared.world.scenario import SCENARIOS
 from simulator.sites.site import Site
-from tests.lab.experiments.tiny_flights import declared, run_in
+from tests.support.tiny_flights import declared, run_in
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.long
@@ -44,7 +44,7 @@ SCHEMES, SEEDS = ("eof", "random", "madqn"), 16
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """Ray on this machine with two cores, with this process's token; it takes many seconds to start."""
-    command = [sys.executable, "-m", "tests.e2e.ray_here", "2"]
+    command = [sys.executable, "-m", "tests.support.ray_here", "2"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
         assert process.stdout is not None
         yield process.stdout.readline().decode().strip()

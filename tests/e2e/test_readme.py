@@ -12,8 +12,8 @@ from shared.planning.orders import GuidanceStatus
 from shared.wire.reasons import Reason
 from shared.wire.schemas import DecideResponse
 from tests.conftest import Edge
-from tests.e2e.processes import serving_edge
 from tests.support.places import ROOT
+from tests.support.processes import serving_edge
 from tests.support.waiting import until
 
 README, DECIDING, OPERATOR, SETTINGS = (

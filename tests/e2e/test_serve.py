@@ -16,10 +16,10 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.e2e.processes import output_until, run, run_here, serving_edge, started
+from tests.support.processes import output_until, run, run_here, serving_edge, started
 from tests.support.running import listening
+from tests.support.stub_llm import misbehaving, wait_for
 from tests.support.waiting import PATIENCE_S, Gate, until
-from tests.unit.service.stub_llm import misbehaving, wait_for
 
 
 @pytest.fixture

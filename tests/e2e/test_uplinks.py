@@ -22,8 +22,8 @@ from simulator.records.flight import Flight
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 from tests.conftest import Edge
-from tests.e2e.processes import output_until, run_here, serving_edge, started
 from tests.support.edge_stub import free_port
+from tests.support.processes import output_until, run_here, serving_edge, started
 from tests.support.waiting import PATIENCE_S, until
 
 SCENARIO = SCENARIOS["paper"].model_copy(update={"steps": 12})

@@ -12,9 +12,9 @@ import psutil
 import psycopg
 import pytest
 
-from tests.e2e.processes import output_until, started
-from tests.faults.shared_store import Database
+from tests.support.processes import output_until, started
 from tests.support.running_edges import Report, drained
+from tests.support.shared_store import Database
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(400)]

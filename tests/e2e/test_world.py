@@ -12,8 +12,8 @@ import pytest
 
 from simulator.records.decision_log import read_decisions
 from tests.conftest import Edge
-from tests.e2e.processes import run, run_here
 from tests.support.places import ROOT
+from tests.support.processes import run, run_here
 from tests.support.undrawn import reports_undrawn
 
 EXAMPLE = ROOT / "examples" / "pipeline_world"

@@ -13,8 +13,8 @@ from typing import Any
 import httpx
 
 from tests.faults.fleet import Report
-from tests.faults.shared_store import DEADLINE_MS, GIVEN_UP_MS
 from tests.faults.table import Tables
+from tests.support.shared_store import DEADLINE_MS, GIVEN_UP_MS
 from tests.support.waiting import PATIENCE_S, until
 
 MISSIONS, LEASE_S = 4, 2.0

@@ -13,8 +13,8 @@ from schemathesis import GenerationMode
 from schemathesis.checks import not_a_server_error
 from schemathesis.core.result import Ok
 
-from tests.e2e.processes import run, serving_edge
 from tests.faults.table import Tables
+from tests.support.processes import run, serving_edge
 
 pytestmark = [pytest.mark.fuzz, pytest.mark.timeout(1800)]
 

@@ -20,11 +20,11 @@ from service.api.app import create_app
 from service.config.settings import Settings
 from service.storage.journal import Journal
 from service.storage.store import Store
-from tests.e2e.processes import serving_edge
 from tests.faults.fleet import UAVS, Report
 from tests.faults.table import Tables
+from tests.support.processes import serving_edge
 from tests.support.running import serving
-from tests.unit.service.keeping import writers
+from tests.support.stored_missions import writers
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(600)]
 

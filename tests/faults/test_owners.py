@@ -15,8 +15,8 @@ import pytest
 
 from tests.faults.fleet import Report
 from tests.faults.shared_fleet import LEASE_S, MISSIONS, Trial, Uav, flying
-from tests.faults.shared_store import Database, SharedEdge, edges, proxy
 from tests.faults.table import Tables
+from tests.support.shared_store import Database, SharedEdge, edges, proxy
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(900), pytest.mark.needs("haproxy")]

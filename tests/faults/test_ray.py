@@ -14,12 +14,12 @@ import httpx
 import psutil
 import pytest
 
-from tests.e2e.processes import output_until, run, started
 from tests.faults.fleet import Report
 from tests.faults.shared_fleet import LEASE_S, flying
-from tests.faults.shared_store import DEADLINE_MS, Database
 from tests.faults.table import Tables
+from tests.support.processes import output_until, run, started
 from tests.support.running_edges import drained
+from tests.support.shared_store import DEADLINE_MS, Database
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(900)]

@@ -15,13 +15,13 @@ import pytest
 from service.cluster.ingress import ingress_application
 from service.config.settings import Settings
 from shared.kit.ray_connection import LOCAL, connected
-from tests.e2e.processes import output_until, started
 from tests.faults.fleet import Report
 from tests.faults.shared_fleet import LEASE_S, flying
-from tests.faults.shared_store import DEADLINE_MS, Database
 from tests.faults.test_ray import command, ingress, replicas, settings, two_raylets
+from tests.support.processes import output_until, started
 from tests.support.running import serving
 from tests.support.running_edges import drained
+from tests.support.shared_store import DEADLINE_MS, Database
 from tests.support.waiting import PATIENCE_S, until
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(600)]

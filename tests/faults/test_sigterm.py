@@ -12,11 +12,11 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.e2e.processes import serving_edge
 from tests.faults.fleet import Report
 from tests.faults.table import Tables
+from tests.support.processes import serving_edge
 from tests.support.running import listening
-from tests.unit.service.stub_llm import misbehaving, saying, wait_for
+from tests.support.stub_llm import misbehaving, saying, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 

@@ -13,11 +13,11 @@ import pytest
 import trustme
 import uvicorn
 
-from tests.e2e.processes import serving_edge
 from tests.faults.fleet import Report, ask, resident_mb
 from tests.faults.table import Tables
+from tests.support.processes import serving_edge
 from tests.support.running import Handler, listening
-from tests.unit.service.stub_llm import FAULTS, bomb, misbehaving, saying, wait_for
+from tests.support.stub_llm import FAULTS, bomb, misbehaving, saying, wait_for
 
 pytestmark = [pytest.mark.faults, pytest.mark.timeout(300)]
 

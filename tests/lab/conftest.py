@@ -1,7 +1,7 @@
-"""Fixtures shared by the laboratory's tests."""
+"""Fixtures of the laboratory's tests."""
 
 from __future__ import annotations
 
-from tests.unit.simulator.conftest import brief, unbounded, undrawn, without_extra
+from tests.support.simulator_fixtures import brief, unbounded, undrawn, without_extra
 
 __all__ = ["brief", "unbounded", "undrawn", "without_extra"]

@@ -13,7 +13,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
-from tests.e2e.processes import serving_edge
+from tests.support.processes import serving_edge
 from tests.support.waiting import PATIENCE_S
 
 # As root, without a sandbox of its own, and without its calls home, which a closed network would refuse one by one.

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.e2e.page.conftest import Open, Report, Start, violations
-from tests.e2e.processes import output_until, run, started
+from tests.support.processes import output_until, run, started
 from tests.support.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.needs("chromium"), pytest.mark.long]

@@ -19,11 +19,11 @@ from simulator.commands import simulate
 from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.world.observation import Observation
 from tests.e2e.page.conftest import Open, violations
+from tests.integration.service.guidance.test_operator_guidance import Scribe
 from tests.support.running import serving
+from tests.support.stub_llm import wait_for
 from tests.support.undrawn import reports_undrawn
 from tests.support.waiting import until
-from tests.unit.service.guidance.test_operator_guidance import Scribe
-from tests.unit.service.stub_llm import wait_for
 
 pytestmark = pytest.mark.needs("chromium")
 

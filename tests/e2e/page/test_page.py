@@ -18,9 +18,9 @@ from service.config.settings import Settings
 from simulator.commands import simulate
 from tests.e2e.page.conftest import Open, Report, Start, violations
 from tests.support.running import serving
+from tests.support.stub_llm import wait_for
 from tests.support.undrawn import reports_undrawn
 from tests.support.waiting import PATIENCE_S
-from tests.unit.service.stub_llm import wait_for
 
 pytestmark = pytest.mark.needs("chromium")
 

@@ -15,7 +15,7 @@ from playwright.sync_api import Page, expect
 
 from shared.world.scenario import SCENARIOS
 from tests.e2e.page.conftest import Open
-from tests.e2e.processes import run, serving_edge
+from tests.support.processes import run, serving_edge
 
 pytestmark = [pytest.mark.needs("chromium"), pytest.mark.long]
 

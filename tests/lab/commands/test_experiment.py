@@ -15,8 +15,8 @@ import pytest
 from lab.experiments.catalogue import EXPERIMENTS
 from lab.experiments.result import Result
 from lab.experiments.stand_ins import answering, drawn
-from tests.e2e.processes import LAB, run_lab, run_lab_here, serving_edge
 from tests.support.places import ROOT
+from tests.support.processes import LAB, run_lab, run_lab_here, serving_edge
 from tests.support.waiting import PATIENCE_S, until
 
 

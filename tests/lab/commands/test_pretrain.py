@@ -16,7 +16,7 @@ from service.learning.initial_weights import initial_modules, initial_weights, s
 from service.learning.modules import Modules
 from shared.wire.schemas import Features
 from shared.world.scenario import SCENARIOS, Scenario
-from tests.e2e.processes import run_lab, run_lab_here
+from tests.support.processes import run_lab, run_lab_here
 
 PAPER = SCENARIOS["paper"]
 # Far past the training worlds that `python -m lab explore` records by default.

@@ -10,7 +10,7 @@ import pytest
 
 from lab.marl.checkpoint import PolicyCheckpoint
 from lab.marl.curve import read_csv
-from tests.e2e.processes import run_lab, run_lab_here
+from tests.support.processes import run_lab, run_lab_here
 from tests.support.waiting import until
 
 EPISODES = ("--episodes", "120")

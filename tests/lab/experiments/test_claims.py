@@ -9,7 +9,7 @@ import pytest
 from lab.experiments.claims import WITH_ADAPTER, ClaimFinding, Verdict, judge, judge_with_adapter
 from lab.experiments.evidence import beats_chance, difference, settled_at
 from lab.experiments.result import Result, Sweep
-from tests.lab.experiments.made_results import interval, result, zero_from
+from tests.support.made_results import interval, result, zero_from
 
 REPRODUCED, NOT, APART = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_COMPARABLE
 

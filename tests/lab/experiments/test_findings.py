@@ -18,7 +18,7 @@ from lab.experiments.result import Result
 from lab.experiments.schemes import BOUND, llm, local
 from lab.experiments.tables import measure_tables
 from simulator.sites.site import Site
-from tests.lab.experiments.tiny_flights import TINY, decided, declared, flown, setup
+from tests.support.tiny_flights import TINY, decided, declared, flown, setup
 
 LOST = {"eof": 10, "random": 30, "llm": 20}
 

@@ -17,7 +17,7 @@ from simulator.policies.registry import policy_named
 from simulator.sites.site import Site
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Observation
-from tests.lab.experiments.tiny_flights import TINY, declared, flown, run_in
+from tests.support.tiny_flights import TINY, declared, flown, run_in
 
 
 def flights_in(out: Path) -> dict[str, int]:

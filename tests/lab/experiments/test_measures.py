@@ -6,7 +6,7 @@ import pytest
 
 from lab.experiments.flight import TokenCounts
 from lab.experiments.measures import MEASURES, STEP_MEASURES, ages, substituted_decisions
-from tests.lab.experiments.tiny_flights import decided, flown
+from tests.support.tiny_flights import decided, flown
 
 
 def test_losses_are_counted_per_step_and_cumulative() -> None:

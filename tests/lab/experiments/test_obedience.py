@@ -21,10 +21,10 @@ from shared.client.edge_client import EdgeClient
 from shared.planning.orders import NO_GUIDANCE, Guidance, SensorWish
 from shared.wire.schemas import MissionSpec
 from simulator.sites.site import Site
-from tests.lab.experiments.tiny_flights import TINY, decided, declared, flown, setup
+from tests.integration.service.guidance.test_operator_guidance import Scribe
 from tests.support.running import serving
-from tests.unit.service.guidance.test_operator_guidance import Scribe
-from tests.unit.service.stub_llm import wait_for
+from tests.support.stub_llm import wait_for
+from tests.support.tiny_flights import TINY, decided, declared, flown, setup
 
 Edge = Callable[..., httpx.Client]
 

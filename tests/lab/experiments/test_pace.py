@@ -8,7 +8,7 @@ from lab.experiments.pace import Pace, duration_text
 from lab.experiments.plan import Planned, plan
 from lab.experiments.schemes import llm, local, value
 from simulator.sites.site import Site
-from tests.lab.experiments.tiny_flights import TINY, declared, setup
+from tests.support.tiny_flights import TINY, declared, setup
 
 
 def flights() -> list[Planned]:

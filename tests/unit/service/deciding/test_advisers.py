@@ -6,7 +6,7 @@ from service.deciding.advisers import look_ahead
 from shared.features.augmented_state import State
 from shared.world.channel import link_holds
 from shared.world.trajectory import trajectories
-from tests.unit.service.making import PAPER, attended, mission, uav
+from tests.support.missions import PAPER, attended, mission, uav
 
 X, Y = PAPER.lap_centres[0]
 PATH = trajectories(PAPER)[0]

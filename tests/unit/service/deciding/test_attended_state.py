@@ -5,7 +5,7 @@ from shared.wire.schemas import MissionSpec
 from shared.world.actions import Action
 from shared.world.channel import channel_gain_db
 from shared.world.urgency import urgency
-from tests.unit.service.making import PAPER, attended, mission, uav
+from tests.support.missions import PAPER, attended, mission, uav
 
 
 def test_features_are_the_papers_five_between_zero_and_one() -> None:

@@ -12,7 +12,7 @@ from shared.planning.orders import Guidance, GuidanceAnswer
 from shared.wire.schemas import MissionSpec, Mode
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request
-from tests.unit.service.making import PAPER, attended
+from tests.support.missions import PAPER, attended
 from tests.unit.service.prompting.test_compact_prompt import ADAPTED
 
 CAPACITY = PAPER.queue_capacity

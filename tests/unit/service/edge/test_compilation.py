@@ -9,7 +9,7 @@ from shared.belief import beacon_updates, expected_queues, link_expectations, re
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.records import take_report
 from shared.features.augmented_state import augment
-from tests.unit.shared.belief.test_belief_updates import WORLD, flown, report
+from tests.integration.shared.belief.test_belief_updates import WORLD, flown, report
 
 
 def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:

@@ -7,7 +7,7 @@ import pytest
 from service.live.fleet_watch import FleetWatch
 from service.mission.mission import Mission
 from shared.wire.schemas import UavState
-from tests.unit.service.making import mission, uav
+from tests.support.missions import mission, uav
 
 
 def watch(fleet: Mission, *reports: UavState) -> FleetWatch:

@@ -5,7 +5,7 @@ from service.mission.mission import Mission
 from service.mission.mission_status import status_of
 from shared.wire.schemas import Outcome
 from shared.world.actions import Action
-from tests.unit.service.making import attended, mission, uav
+from tests.support.missions import attended, mission, uav
 
 
 def decide(m: Mission, number: int, *, step: int = 0, uav_id: int = 0, sensor: int = 1) -> str:

@@ -13,7 +13,7 @@ from service.mission.mission import Mission
 from service.mission.mission_status import status_of
 from shared.wire.readings import SensorReading
 from shared.world.actions import Action
-from tests.unit.service.making import attended, mission, uav
+from tests.support.missions import attended, mission, uav
 
 
 def reading(sensor_id: int = 9, queue: float = 20.0, **more: Any) -> SensorReading:

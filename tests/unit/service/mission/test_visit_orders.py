@@ -12,7 +12,7 @@ from service.mission.mission_status import status_of
 from service.mission.visit_orders import VisitOrders
 from shared.planning.orders import NO_GUIDANCE, Guidance, GuidanceAnswer, SensorWish
 from shared.wire.missions import VisitDeadline
-from tests.unit.service.making import mission
+from tests.support.missions import mission
 from tests.unit.service.mission.test_mission import decide, outcome
 
 

@@ -21,7 +21,7 @@ from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation_report import decide_request
-from tests.unit.service.making import PAPER, attended
+from tests.support.missions import PAPER, attended
 
 ADAPTED = Settings(mode="llm", llm_url="http://127.0.0.1:9/v1", llm_adapter="served")
 MESSAGE = re.compile(r"(\d{6})U((?:\d[a-jk]\d{7}[A-T])+)".replace("a-jk", SIGNS))

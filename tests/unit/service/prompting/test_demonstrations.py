@@ -16,7 +16,7 @@ from shared.features.augmented_state import State
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
 from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS, Scenario
-from tests.unit.service.making import PAPER, attended, mission, uav
+from tests.support.missions import PAPER, attended, mission, uav
 
 SHORT = PAPER.model_copy(update={"steps": 8})
 HEADER = Header(scenario=PAPER, missions=1, behaviour="test")

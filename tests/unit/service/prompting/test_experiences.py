@@ -9,7 +9,7 @@ from service.mission.mission_status import status_of
 from service.prompting.experiences import Experience, Experiences
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle, Selection
 from shared.world.actions import Action
-from tests.unit.service.making import attended, mission, uav
+from tests.support.missions import attended, mission, uav
 
 SELECTIONS: tuple[Selection, ...] = get_args(Selection)
 

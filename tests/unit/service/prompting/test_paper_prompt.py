@@ -10,7 +10,7 @@ from service.prompting.prompt import Prompt
 from shared.wire.schemas import MissionSpec, Outcome, PromptStyle
 from shared.world.actions import Action
 from shared.world.scenario import SCENARIOS
-from tests.unit.service.making import PAPER, attended, mission, uav
+from tests.support.missions import PAPER, attended, mission, uav
 
 
 def flown(steps: int = 3, spec: MissionSpec | None = None, **settings: Any) -> list[Prompt]:

@@ -12,7 +12,7 @@ from shared.wire.schemas import Features, MissionSpec, UavState
 from shared.world.channel import link_holds, packets_per_step
 from shared.world.scenario import SCENARIOS, Point
 from shared.world.trajectory import trajectories
-from tests.unit.service.making import PAPER, attended, mission, uav
+from tests.support.missions import PAPER, attended, mission, uav
 
 PATH = trajectories(PAPER)[0]
 REACH = MissionSpec(features="reach")

@@ -12,7 +12,7 @@ from service.prompting.tokenizer import VocabularyDamaged, encoding, ensure_voca
 from service.prompting.unpruned_state import UnprunedState
 from shared.wire.schemas import Features, MissionSpec
 from shared.world.scenario import Scenario
-from tests.unit.service.making import attended, mission, uav
+from tests.support.missions import attended, mission, uav
 
 COUNTER = TokenCounter(Settings().cache_dir)
 

@@ -19,9 +19,9 @@ from shared.wire.schemas import MissionSpec, Outcome, SensorColumns, UavState
 from shared.world.actions import Action
 from shared.world.channel import channel_gain_db
 from shared.world.trajectory import trajectories
+from tests.support.missions import PAPER, attended
+from tests.support.stored_missions import same, state
 from tests.support.waiting import PATIENCE_S
-from tests.unit.service.keeping import same, state
-from tests.unit.service.making import PAPER, attended
 
 RADIUS_M, SENSORS = PAPER.radio_radius_m, 10
 

@@ -16,7 +16,7 @@ from shared.world.scenario import Point
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
 from simulator.sites.files.world_folder import site_from_folder
-from tests.unit.simulator.sites.files.made_folder import GOOD, feature, write
+from tests.support.world_folders import GOOD, feature, write
 
 # An L: its inner corner is at 5, 5.
 BENT = ((0.0, 0.0), (10.0, 0.0), (10.0, 5.0), (5.0, 5.0), (5.0, 10.0), (0.0, 10.0), (0.0, 0.0))

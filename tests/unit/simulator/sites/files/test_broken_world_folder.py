@@ -18,7 +18,7 @@ from simulator.errors import UsageError
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
-from tests.unit.simulator.sites.files.made_folder import (
+from tests.support.world_folders import (
     GOOD,
     RING,
     Json,

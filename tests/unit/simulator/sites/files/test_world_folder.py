@@ -19,7 +19,7 @@ from simulator.policies.registry import policy_named
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.projection import to_metres
 from simulator.sites.site import Site
-from tests.unit.simulator.sites.files.made_folder import (
+from tests.support.world_folders import (
     EXAMPLE,
     GOOD,
     RING,

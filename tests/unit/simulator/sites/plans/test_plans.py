@@ -19,9 +19,7 @@ from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.mission_path import items_of, path_of
 from simulator.sites.plans.plan_folder import export_plans, import_plans
 from simulator.sites.plans.qgroundcontrol import read_plan
-from tests.unit.simulator.sites.files.made_folder import EXAMPLE, feature, sensor
-from tests.unit.simulator.sites.files.made_folder import write as write_world
-from tests.unit.simulator.sites.plans.made_plan import (
+from tests.support.flight_plans import (
     AGAIN,
     TAKE_OFF,
     TRIANGLE,
@@ -34,6 +32,8 @@ from tests.unit.simulator.sites.plans.made_plan import (
     waypoint,
     write,
 )
+from tests.support.world_folders import EXAMPLE, feature, sensor
+from tests.support.world_folders import write as write_world
 
 AROUND = [[39.94, 41.49], [39.94, 41.52], [39.97, 41.52], [39.97, 41.49]]
 FENCED: Json = {"circles": [], "polygons": [{"inclusion": True, "polygon": AROUND, "version": 1}], "version": 2}

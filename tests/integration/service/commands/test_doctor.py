@@ -1,0 +1,111 @@
+"""`aicvds doctor`: each finding, and what to type about it."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+from fastapi import FastAPI
+from fastapi.responses import Response
+
+from service.commands import banner, doctor
+from service.config.settings import Settings
+from service.storage.locks import FileLock
+from tests.support.running import serving
+from tests.support.stub_llm import StubLlm
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def test_nothing_is_in_the_way(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("AICVDS_MODE", "value")
+    monkeypatch.setenv("AICVDS_STORE", str(tmp_path / "new" / "missions.db"))
+    assert doctor.main(["--port", str(free_port())]) == 0
+    printed = capsys.readouterr().out
+    assert "!!" not in printed and "Next:  aicvds serve" in printed
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_taken_port_and_bad_settings_have_remedies(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("AICVDS_TOP_K", "0")
+    monkeypatch.setenv("AICVDS_TOPK", "3")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        taken.setblocking(False)
+        assert doctor.main(["--port", str(taken.getsockname()[1])]) == 1
+    printed = capsys.readouterr().out
+    assert "aicvds serve --port 0" in printed
+    assert "did you mean AICVDS_TOP_K?" in printed and "unset AICVDS_TOPK" in printed
+    assert "AICVDS_TOP_K: must be greater" in printed and "3 in the way" in printed
+
+
+def test_a_locked_store_names_its_file(tmp_path: Path) -> None:
+    file = tmp_path / "missions.db"
+    file.touch()
+    settings = Settings(store=str(file))
+    assert doctor.store_of(settings).remedy is None
+    held = FileLock(str(file))
+    try:
+        found = doctor.store_of(settings)
+        assert "another edge uses" in found.found and found.remedy is not None and "--store" in found.remedy
+    finally:
+        held.close()
+
+
+def test_an_llm_server_must_have_the_model() -> None:
+    with serving(StubLlm("0 1").app) as url:
+        [there] = doctor.llm_servers(Settings(llm_url=f"{url}/v1"))
+        [other] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", llm_model="none-such"))
+    [gone] = doctor.llm_servers(Settings(llm_url="http://127.0.0.1:1/v1"))
+    assert there.remedy is None and "stub-1" in there.found
+    assert other.remedy is not None and "not none-such" in other.found
+    assert gone.remedy is not None
+
+
+def test_a_missing_model_file_is_fetched(tmp_path: Path) -> None:
+    [found] = doctor.embedded(Settings(cache_dir=tmp_path))
+    assert found.remedy == "aicvds model fetch"
+
+
+@pytest.mark.parametrize("address", ["{0}/m.db", "sqlite:///{0}/m.db"])
+def test_a_file_is_a_file_by_its_path_or_its_address(tmp_path: Path, address: str) -> None:
+    settings = Settings(store=address.format(tmp_path), llm_url=None)
+    assert doctor.store_of(settings).found == f"{tmp_path}/m.db (new)"
+    assert banner.store(settings, 2) == f"{tmp_path}/m.db, 2 missions"
+
+
+@pytest.mark.parametrize("address", ["postgresql://u:secret@h/d", "postgresql+psycopg://u:secret@h/d"])
+def test_postgresql_is_named_without_its_password(address: str) -> None:
+    settings = Settings(store=address)
+    assert doctor.store_of(settings).found == "PostgreSQL (not tried)"
+    assert banner.store(settings, 1) == "PostgreSQL, 1 mission"
+
+
+def test_an_address_that_is_none_is_said() -> None:
+    assert doctor.store_of(Settings(store="mysql://u:secret@h/d")).remedy == "aicvds serve --store FILE"
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [b'{"data": null}', b"[]", b'"text"', b'{"data": [null, 7, {"id": null}, {}]}', b"\xff\xfe", b"[" * 100_000, b"{}"],
+)
+def test_no_list_of_models_ends_in_a_traceback(listed: bytes) -> None:
+    app = FastAPI()
+    app.get("/v1/models")(lambda: Response(listed, media_type="application/json"))
+    with serving(app) as url:
+        [found] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", llm_model="m"))
+    assert str(found)
+
+
+@pytest.mark.parametrize("named", ["socks5://127.0.0.1:1", "gopher://x", "http://x:port", "::::"])
+def test_no_proxy_ends_in_a_traceback(monkeypatch: pytest.MonkeyPatch, named: str) -> None:
+    monkeypatch.setenv("ALL_PROXY", named)
+    [found] = doctor.llm_servers(Settings(llm_url="http://llm.example/v1"))
+    assert found.remedy is not None and ("proxy" in found.found or "port" in found.found)

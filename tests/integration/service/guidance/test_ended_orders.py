@@ -1,0 +1,158 @@
+"""Orders that end: withdrawn whatever has become of the newest note, or replaced, which is said before and after."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.mission.events import GuidanceChanged
+from service.storage.rows import decode
+from tests.integration.service.api.test_routes import fields
+from tests.integration.service.guidance.test_operator_guidance import NOTE, ORDERS, OWN, Edge, Report, Scribe, guidance
+from tests.support.processes import serving_edge
+from tests.support.running import serving
+from tests.support.stub_llm import wait_for
+from tests.support.waiting import PATIENCE_S
+
+AT = "/missions/test/guidance"
+OWN_IN_WORDS = [
+    "Visit sensor 1 at least once in every 2 steps.",
+    "Count each packet that sensor 1 loses 4 times.",
+    "Never fly faster than 5 m/s.",
+    "Never fly at 0 m/s.",
+]
+NOTED_IN_WORDS = "Visit sensor 3 at least once in every 3 steps."
+
+
+def say(client: httpx.Client, **answer: Any) -> dict[str, Any]:
+    response = client.post(AT, json=answer)
+    assert response.status_code == 200, response.text
+    told: dict[str, Any] = response.json()
+    return told
+
+
+@pytest.mark.parametrize("answer", ["withdraw", "reject"])
+@pytest.mark.parametrize("state", ["compiling", "failed", "confirmed", "rejected"])
+def test_orders_in_force_can_be_withdrawn_whatever_the_note(
+    edge: Edge, report: Report, state: str, answer: str
+) -> None:
+    scribe = Scribe("hm" if state == "failed" else ORDERS)
+    with serving(scribe.app) as url, scribe.gate:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value"})
+        say(client, guidance={"max_velocity": 3})
+        if state == "compiling":
+            scribe.gate.shut()
+        if state != "confirmed":
+            say(client, note=NOTE)
+        if state == "rejected":
+            guidance(client, "proposed")
+            say(client, answer="reject")
+        before = guidance(client, state)
+        assert before["obeyed_in_words"] == "Never fly faster than 3 m/s."
+        told = say(client, answer=answer)
+        assert told["obeyed_in_words"] is None
+        assert (told["begun"], told["ended"]) == ([], ["Never fly faster than 3 m/s."])
+        # What became of the note stays: an own structure that was withdrawn counts as rejected.
+        assert told["status"] == ("rejected" if state == "confirmed" else state)
+        assert [told[name] for name in ("note", "failure")] == [before[name] for name in ("note", "failure")]
+        assert client.post("/decide", json=report()).json()["velocity"] > 3
+        # Withdrawn twice is withdrawn.
+        assert say(client, answer="withdraw") == told
+
+
+def test_orders_are_withdrawn_beside_a_reading_that_still_waits(edge: Edge) -> None:
+    with serving(Scribe(ORDERS).app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value"})
+        say(client, guidance=OWN)
+        say(client, note=NOTE)
+        guidance(client, "proposed")
+        told = say(client, answer="withdraw")
+        assert (told["status"], told["obeyed_in_words"], told["in_words"]) == ("proposed", None, NOTED_IN_WORDS)
+        # Nothing is left that a confirmation ends.
+        assert (told["begins"], told["ends"]) == ([NOTED_IN_WORDS], [])
+        assert say(client, answer="confirm")["obeyed_in_words"] == NOTED_IN_WORDS
+
+
+def test_without_orders_there_is_nothing_to_reject_and_withdrawing_changes_nothing(edge: Edge) -> None:
+    client = edge()
+    client.put("/missions/test", json={"note": NOTE})
+    before = guidance(client, "failed")
+    assert client.post(AT, json={"answer": "reject"}).status_code == 409
+    assert say(client, answer="withdraw") == before
+
+
+def test_what_a_confirmation_ends_is_said_before_and_after_and_in_the_journal(edge: Edge, tmp_path: Path) -> None:
+    scribe = Scribe(ORDERS, f"{ORDERS}, fly at most 9 m/s", "visit sensor 3 every 4 steps")
+    with serving(scribe.app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value", "note": NOTE})
+        first = guidance(client, "proposed")
+        assert (first["begins"], first["ends"]) == ([NOTED_IN_WORDS], [])
+        say(client, answer="confirm")
+        # An order that both name stays: it neither begins nor ends.
+        say(client, note="Look at sensor 3 every 3 steps, at most 9 m/s.")
+        second = guidance(client, "proposed")
+        assert (second["begins"], second["ends"]) == (["Never fly faster than 9 m/s."], [])
+        say(client, answer="confirm")
+        say(client, note="Look at sensor 3 every 4 steps.")
+        third = guidance(client, "proposed")
+        fourth_step = "Visit sensor 3 at least once in every 4 steps."
+        assert (third["begins"], third["ends"]) == ([fourth_step], [NOTED_IN_WORDS, "Never fly faster than 9 m/s."])
+        told = say(client, answer="confirm")
+        assert (told["begins"], told["ends"]) == ([], [])
+        assert (told["begun"], told["ended"]) == (third["begins"], third["ends"])
+        # A structure takes effect at once, so that this is said afterwards.
+        own = say(client, guidance=OWN)
+        assert (own["begun"], own["ended"]) == (OWN_IN_WORDS, [fourth_step])
+        with sqlite3.connect(tmp_path / "missions-0.db") as db:
+            rows = db.execute("SELECT body FROM journal WHERE kind = 'guided' ORDER BY seq DESC LIMIT 2").fetchall()
+        db.close()
+    events = [decode("guided", body) for (body,) in rows]
+    written = [(event.state["begun"], event.state["ended"]) for event in events if isinstance(event, GuidanceChanged)]
+    assert written == [(own["begun"], own["ended"]), (told["begun"], told["ended"])]
+
+
+def test_of_two_operators_the_second_answers_no_reading_that_he_has_not_seen(edge: Edge) -> None:
+    scribe = Scribe(ORDERS, "visit sensor 2 every 4 steps")
+    with serving(scribe.app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value", "note": NOTE})
+        seen = guidance(client, "proposed")["version"]
+        say(client, note="Look at sensor 2 every 4 steps.")
+        other = guidance(client, "proposed")
+        for answer in ("confirm", "reject"):
+            late = client.post(AT, json={"answer": answer, "version": seen})
+            assert (late.status_code, fields(late)) == (409, ["version"])
+        assert client.get(AT).json() == other
+        assert say(client, answer="reject", version=other["version"])["status"] == "rejected"
+        # Both reject the same reading: the second does not end the orders in force by it.
+        again = client.post(AT, json={"answer": "reject", "version": other["version"]})
+        assert (again.status_code, fields(again)) == (409, ["version"])
+        assert client.post(AT, json={"answer": "confirm", "version": "x" * 65}).status_code == 422
+
+
+def test_an_edge_that_was_killed_withdraws_the_orders_of_before(tmp_path: Path) -> None:
+    env = {"AICVDS_STORE": str(tmp_path / "missions.db"), "AICVDS_MODE": "value"}
+    with serving_edge(**env) as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+        client.put("/missions/test", json={})
+        say(client, guidance=OWN)
+        say(client, note=NOTE)
+        before = guidance(client, "failed")
+        process.kill()
+    with serving_edge(**env) as (url, process), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+        assert guidance(client, "failed") == before
+        told = say(client, answer="withdraw", version=before["version"])
+        assert (told["obeyed_in_words"], told["ended"]) == (None, OWN_IN_WORDS)
+        process.kill()
+    with serving_edge(**env) as (url, _), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+        assert client.get(AT).json() == told

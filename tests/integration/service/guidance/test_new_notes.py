@@ -1,0 +1,51 @@
+"""A new note during a mission: compiled anew, and obeyed once it is confirmed."""
+
+from __future__ import annotations
+
+from tests.integration.service.guidance.test_operator_guidance import NOTE, ORDERS, OWN, Edge, Scribe, guidance
+from tests.support.running import serving
+from tests.support.stub_llm import wait_for
+from tests.support.waiting import Gate, until
+
+
+def test_a_new_note_is_compiled_while_the_orders_before_it_stay(edge: Edge) -> None:
+    scribe = Scribe(ORDERS, "visit sensor 2 every 4 steps")
+    with serving(scribe.app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value", "note": NOTE})
+        guidance(client, "proposed")
+        client.post("/missions/test/guidance", json={"answer": "confirm"})
+        new = {"note": "Look at sensor 2 every 4 steps."}
+        assert client.post("/missions/test/guidance", json=new).status_code == 200
+        told = guidance(client, "proposed")
+        assert (told["note"], told["in_words"]) == (new["note"], "Visit sensor 2 at least once in every 4 steps.")
+        assert told["obeyed_in_words"] == "Visit sensor 3 at least once in every 3 steps."
+        # A rejected proposal leaves the orders before it; rejected once more, they end.
+        rejected = client.post("/missions/test/guidance", json={"answer": "reject"}).json()
+        assert (rejected["status"], rejected["obeyed_in_words"]) == ("rejected", told["obeyed_in_words"])
+        assert client.post("/missions/test/guidance", json={"answer": "reject"}).json()["obeyed_in_words"] is None
+        # The mission's spec is the same: the PUT that made it changes nothing.
+        assert client.put("/missions/test", json={"mode": "value", "note": NOTE}).status_code == 200
+
+
+def test_a_note_that_comes_while_another_is_compiled_replaces_it(edge: Edge) -> None:
+    scribe = Scribe(ORDERS, "visit sensor 2 every 4 steps")
+    scribe.gate = Gate()
+    with serving(scribe.app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(client, "ready")
+        client.put("/missions/test", json={"mode": "value", "note": NOTE})
+        until(lambda: len(scribe.asked) == 1)
+        client.post("/missions/test/guidance", json={"note": "Look at sensor 2 every 4 steps."})
+        scribe.gate.open()
+        assert guidance(client, "proposed")["in_words"] == "Visit sensor 2 at least once in every 4 steps."
+
+
+def test_an_answer_is_one_of_three(edge: Edge) -> None:
+    client = edge()
+    client.put("/missions/test", json={})
+    for body in ({}, {"answer": "confirm", "note": NOTE}, {"guidance": OWN, "note": NOTE}):
+        refused = client.post("/missions/test/guidance", json=body)
+        assert refused.status_code == 422 and "one of answer, guidance and note" in refused.json()["detail"]
+    assert client.post("/missions/test/guidance", json={"note": "x" * 281}).status_code == 422

@@ -1,0 +1,120 @@
+"""Deleted missions: gone from the disk when that is said, from memory, and from what still happens to them."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import weakref
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.edge.mission_registry import MissionRegistry
+from service.mission.mission import Mission
+from service.storage.store import Store, StoredMission
+from tests.support.running import listening
+from tests.support.stored_missions import copy_of, fly, running, writers
+from tests.support.stub_llm import misbehaving, saying, wait_for
+from tests.support.waiting import Gate, until
+
+Report = Callable[..., dict[str, Any]]
+
+
+def test_what_still_happens_to_a_deleted_mission_is_not_the_next_ones(tmp_path: Path, report: Report) -> None:
+    gate = Gate()
+
+    async def slowly(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await gate.passed()
+        await saying(b"200 OK", b'{"choices": [{"message": {"content": "0 7"}}]}')(reader, writer)
+
+    with (
+        listening(misbehaving(slowly)) as llm,
+        running(tmp_path / "m.db", mode="llm", llm_url=f"{llm}/v1", planner="off") as (client, _),
+        ThreadPoolExecutor(1) as pool,
+        gate,
+    ):
+        wait_for(client, "ready")
+        late = pool.submit(client.post, "/decide", json=report())
+        until(lambda: gate.came)
+        assert client.delete("/missions/test").status_code == 204
+        assert client.put("/missions/test", json={"mode": "policy"}).status_code == 200
+        told = client.post("/decide", json=report()).json()
+        gate.open()
+        assert late.result().status_code == 200
+        fed = client.post("/feedback", json={"mission_id": "test", "decision_id": told["decision_id"], "cost": 0.5})
+        assert (fed.status_code, told["stored"]) == (200, True)
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    with running(copied) as (client, _):
+        status = client.get("/missions/test").json()
+        assert (status["mode"], status["decisions"], status["feedback"]) == ("policy", 1, 1)
+
+
+def test_a_mission_deleted_twice_is_gone_when_that_is_said(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+        # As a disk that takes longer than an answer may.
+        (writer,) = writers(os.getpid())
+        writer.suspend()
+        with monkeypatch.context() as impatient:
+            impatient.setattr("service.edge.engine._STORE_S", 0.1)
+            assert [client.delete("/missions/test").status_code for _ in range(2)] == [503, 503]
+        writer.resume()
+        assert client.delete("/missions/test").status_code == 404
+        copied = copy_of(tmp_path / "m.db", tmp_path / "copy.db")
+    left = Store(str(copied))
+    assert left.missions() == []
+    left.close()
+
+
+@pytest.mark.parametrize("mode", ["value", "policy", "guided"])
+def test_a_deleted_mission_is_gone_from_memory_before_any_collection(tmp_path: Path, report: Report, mode: str) -> None:
+    with running(tmp_path / "m.db", mode=mode) as (client, engine):
+        fly(client, report, range(3))
+        deleted = weakref.ref(engine.missions.loaded[0])
+        gc.disable()
+        try:
+            assert client.delete("/missions/test").status_code == 204
+            until(lambda: deleted() is None)
+        finally:
+            gc.enable()
+
+
+def test_a_mission_deleted_while_it_wakes_stays_deleted(
+    tmp_path: Path, report: Report, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(2))
+    load, gate = Store.load, Gate()
+    delete, find, came = MissionRegistry.delete, MissionRegistry._find, list[str]()
+
+    def slowly(self: Store, mission_id: str) -> StoredMission | None:
+        gate.wait()
+        return load(self, mission_id)
+
+    async def deleting(self: MissionRegistry, mission_id: str) -> None:
+        came.append("delete")
+        await delete(self, mission_id)
+
+    async def finding(self: MissionRegistry, mission_id: str, within_s: float) -> Mission | None:
+        came.append("find")
+        return await find(self, mission_id, within_s)
+
+    monkeypatch.setattr(Store, "load", slowly)
+    monkeypatch.setattr(MissionRegistry, "delete", deleting)
+    monkeypatch.setattr(MissionRegistry, "_find", finding)
+    with running(tmp_path / "m.db") as (client, _), ThreadPoolExecutor(3) as pool, gate:
+        got = pool.submit(client.get, "/missions/test")
+        until(lambda: gate.came)
+        deleted = pool.submit(client.delete, "/missions/test")
+        until(lambda: came == ["find", "delete"])
+        decided = pool.submit(client.post, "/decide", json=report())
+        until(lambda: came == ["find", "delete", "find"])
+        gate.open()
+        assert (got.result().status_code, deleted.result().status_code, decided.result().status_code) == (200, 204, 200)
+        assert client.get("/missions/test").json()["decisions"] == 1

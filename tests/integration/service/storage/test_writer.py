@@ -1,0 +1,236 @@
+"""The process that writes a SQLite store: killed, stopped, signalled, unable to start, and left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import pytest
+
+from service.config.settings import Settings
+from service.mission.resolved_spec import ResolvedSpec
+from service.storage.locks import StoreUnusable
+from service.storage.operations import Change, Checkpoint, Deleted, Made
+from service.storage.store import Store
+from service.storage.writer import WriteFailed
+from shared.wire.schemas import MissionSpec
+from tests.support.processes import serving_edge
+from tests.support.stored_missions import fly, kept, running, writers, written
+from tests.support.waiting import PATIENCE_S, until
+
+Report = Callable[..., dict[str, Any]]
+
+
+def made(mission_id: str) -> Made:
+    spec = MissionSpec()
+    return Made(mission_id, spec, ResolvedSpec.of(spec, Settings()))
+
+
+def _ended(process: psutil.Process) -> bool:
+    return bool(psutil.wait_procs([process], timeout=PATIENCE_S)[0])
+
+
+def test_a_writer_that_is_killed_is_followed_by_another_and_nothing_is_lost(
+    tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running(tmp_path / "m.db") as (client, engine):
+        owed = fly(client, report, range(2))
+        (first,) = writers(os.getpid())
+        # What it was sent it has not written.
+        first.suspend()
+        with monkeypatch.context() as impatient:
+            impatient.setattr("service.edge.engine._STORE_S", 0.1)
+            told = client.post("/decide", json=report(step=2, outcome=owed[0]))
+        assert (told.status_code, told.json()["stored"]) == (200, False)
+        first.kill()
+        # Nobody is told: another process writes what this one was to write.
+        assert client.post("/decide", json=report(step=3)).json()["stored"]
+        assert not engine.journal.failing
+        again = client.post("/feedback", json={"mission_id": "test", **owed[0]})
+        assert (again.status_code, again.json()["result"]) == (200, "duplicate")
+        assert "has ended (exit code -9)" in caplog.text
+        # One that has nothing to do is missed only when there is something.
+        (second,) = writers(os.getpid())
+        second.kill()
+        fly(client, report, range(50, 53), {1: owed[1]})
+        before = client.get("/missions/test").json()
+    assert writers(os.getpid()) == []
+    assert "the store fails" not in caplog.text
+    with running(tmp_path / "m.db") as (client, _):
+        assert client.get("/missions/test").json() == before
+
+
+@pytest.mark.long
+def test_the_last_commit_of_a_killed_edge_ends_before_another_edge_begins(tmp_path: Path, report: Report) -> None:
+    path = tmp_path / "m.db"
+    with serving_edge(AICVDS_STORE=str(path), AICVDS_MODE="value") as (url, process):
+        with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+            kept(client, report())
+        (writer,) = writers(process.pid)
+        writer.suspend()
+        assert not httpx.post(f"{url}/decide", json=report(step=1), timeout=PATIENCE_S).json()["stored"]
+        process.kill()
+        process.wait()
+        with pytest.raises(StoreUnusable, match="another edge uses"):
+            Store(str(path))
+        writer.resume()
+        assert _ended(writer)
+    with running(path) as (client, _):
+        assert client.get("/missions/test").json()["decisions"] == 2
+
+
+def test_what_a_terminal_sends_to_the_edge_is_not_for_its_writer(tmp_path: Path, report: Report) -> None:
+    with running(tmp_path / "m.db") as (client, _):
+        fly(client, report, range(1))
+        (writer,) = writers(os.getpid())
+        assert os.getpgid(writer.pid) != os.getpgid(0)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            writer.send_signal(number)
+        fly(client, report, range(1, 3))
+        assert writers(os.getpid()) == [writer]
+
+
+@pytest.mark.long
+def test_an_edge_ends_though_its_writer_hangs(tmp_path: Path, report: Report) -> None:
+    with serving_edge(AICVDS_STORE=str(tmp_path / "m.db"), AICVDS_MODE="value") as (url, process):
+        with httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+            kept(client, report())
+        (writer,) = writers(process.pid)
+        writer.suspend()
+        assert not httpx.post(f"{url}/decide", json=report(step=1), timeout=PATIENCE_S).json()["stored"]
+        process.terminate()
+        assert process.wait(PATIENCE_S) == -signal.SIGTERM
+        writer.resume()
+        assert _ended(writer)
+
+
+async def test_a_writer_that_cannot_be_started_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "none"))
+    writer = store.writer()
+    with pytest.raises(FileNotFoundError):
+        await written(writer, [Deleted("nobody")])
+    monkeypatch.undo()
+    await written(writer, [made("test")])
+    assert store.missions() == ["test"]
+    writer.close()
+    store.close()
+
+
+async def test_a_writer_that_ends_again_and_again_is_told_with_what_it_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    broken = tmp_path / "broken.py"
+    broken.write_text("raise SystemExit('this disk is on fire')")
+    monkeypatch.setattr("service.storage.sqlite_process.__file__", str(broken))
+    writer = store.writer()
+    for _ in range(3):
+        with pytest.raises(WriteFailed, match="this disk is on fire"):
+            await written(writer, [Deleted("nobody")])
+    monkeypatch.undo()
+    await written(writer, [made("test")])
+    assert store.missions() == ["test"]
+    writer.close()
+    store.close()
+
+
+async def test_what_is_larger_than_the_socket_takes_at_once_arrives_whole(tmp_path: Path) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    writer = store.writer()
+    states, kept = [os.urandom(5_000_000), os.urandom(9)], "SELECT seq, state FROM checkpoints"
+    changes: list[Change] = [made("test"), Checkpoint("test", 7, states[0])]
+    await written(writer, changes)
+    with store._engine.connect() as db:
+        assert db.exec_driver_sql(kept).all() == [(7, states[0])]
+    await written(writer, [Checkpoint("test", 8, states[1]), made("other")])
+    assert sorted(store.missions()) == ["other", "test"]
+    with store._engine.connect() as db:
+        assert db.exec_driver_sql(kept).all() == [(8, states[1])]
+    writer.close()
+    store.close()
+
+
+async def test_a_transaction_is_written_whole_or_not_at_all_and_the_next_one_is(tmp_path: Path) -> None:
+    store = Store(str(tmp_path / "m.db"))
+    writer = store.writer()
+    with store._engine.begin() as db:
+        db.exec_driver_sql("CREATE TRIGGER t BEFORE INSERT ON checkpoints BEGIN SELECT RAISE(ABORT, 'not today'); END")
+    with pytest.raises(WriteFailed, match="not today"):
+        await written(writer, [made("test"), Checkpoint("test", 1, b"")])
+    assert store.missions() == []
+    await written(writer, [made("test")])
+    # Nor does it matter that it was written already.
+    await written(writer, [made("test")])
+    assert store.missions() == ["test"]
+    await asyncio.sleep(0)
+    writer.close()
+    store.close()
+
+
+def _replaced(path: Path) -> None:
+    shutil.copy(path, path.with_name("copy"))
+    path.with_name("copy").replace(path)
+
+
+@pytest.mark.parametrize(
+    ("harm", "named"),
+    [
+        (lambda path: path.unlink(), "m.db"),
+        (_replaced, "m.db"),
+        (lambda path: path.parent.rename(path.parent.with_name("elsewhere")), "m.db"),
+        # Then another edge can have the lock too.
+        (lambda path: path.with_name("m.db.lock").unlink(), "m.db.lock"),
+    ],
+    ids=["deleted", "replaced", "folder renamed", "lock deleted"],
+)
+def test_what_goes_into_a_file_without_a_name_is_not_stored(
+    tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture, harm: Callable[[Path], object], named: str
+) -> None:
+    folder = tmp_path / "stores"
+    folder.mkdir()
+    path = folder / "m.db"
+    with running(path) as (client, _):
+        assert client.post("/decide", json=report()).json()["stored"]
+        harm(path)
+        assert not client.post("/decide", json=report(step=1)).json()["stored"]
+        assert client.get("/readyz").status_code == 503
+        # Nor does another process that writes take another file for this one.
+        writers(os.getpid())[0].kill()
+        assert not client.post("/decide", json=report(step=2)).json()["stored"]
+    assert f"stores/{named} was deleted or replaced while the edge ran" in caplog.text
+    assert path.exists() == (named != "m.db" or harm is _replaced)
+
+
+def test_a_file_that_is_put_back_is_the_store_again(tmp_path: Path, report: Report) -> None:
+    path = tmp_path / "m.db"
+    with running(path) as (client, _):
+        assert client.post("/decide", json=report()).json()["stored"]
+        path.rename(tmp_path / "moved")
+        assert not client.post("/decide", json=report(step=1)).json()["stored"]
+        (tmp_path / "moved").rename(path)
+        until(lambda: client.get("/readyz").status_code == 200)
+        assert client.post("/decide", json=report(step=2)).json()["stored"]
+    with running(path) as (client, _):
+        assert client.get("/missions/test").json()["decisions"] == 3
+
+
+def test_a_log_that_is_deleted_loses_nothing(tmp_path: Path, report: Report, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "m.db"
+    with running(path) as (client, _):
+        assert client.post("/decide", json=report()).json()["stored"]
+        path.with_name("m.db-wal").unlink()
+        client.post("/decide", json=report(step=1))
+        until(lambda: client.get("/readyz").status_code == 200)
+        assert client.post("/decide", json=report(step=2)).json()["stored"]
+    assert "m.db-wal was deleted or replaced while the edge ran" in caplog.text
+    with running(path) as (client, _):
+        assert client.get("/missions/test").json()["decisions"] == 3
