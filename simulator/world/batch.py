@@ -102,8 +102,8 @@ class VectorWorld:
 
     All worlds have the scenario's T steps and end together. The entries of an observation have leading dimensions
     ``(B, I)``; those of a UAV that left mean nothing. They are the world's own arrays, not copies, and are valid until
-    the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B
-    worlds the true ``sensors`` and the ``fleet``.
+    the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B worlds the true
+    ``sensors`` and the ``fleet``.
 
     Args:
         cost: the negative of the reward; see :class:`PipelineWorld`.
@@ -160,13 +160,8 @@ class VectorWorld:
     def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[Observation, BatchStep]:
         """As :meth:`step`, of actions known to be right."""
         assert self._truth is not None
-        truth, fleet, ground, scenario, step = (
-            self._truth,
-            self.fleet,
-            self.sensors,
-            self.scenario,
-            self.steps_flown,
-        )
+        truth, fleet, ground = self._truth, self.fleet, self.sensors
+        scenario, step = self.scenario, self.steps_flown
         present = truth.faults.present(step)
         flown = truth.wind.flown_m(velocity * present, fleet.progress_m, fleet.trajectories, step)
         self.fleet = Fleet(fleet.trajectories, fleet.start_m, fleet.progress_m + flown)
