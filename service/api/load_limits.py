@@ -173,7 +173,4 @@ def _unzstd(body: bytes, limit: int) -> bytes:
 
 _REWRITTEN = (b"content-encoding", b"content-length", b"transfer-encoding")
 _PLAIN = ("", "identity")
-_DECODERS: dict[str, Callable[[bytes, int], bytes]] = {
-    "gzip": _gunzip,
-    "zstd": _unzstd,
-}
+_DECODERS: dict[str, Callable[[bytes, int], bytes]] = {"gzip": _gunzip, "zstd": _unzstd}

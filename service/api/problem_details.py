@@ -19,14 +19,7 @@ from shared.kit.validation_messages import problem_of
 from shared.planning.orders import Guidance, GuidanceAnswer, SensorWish
 from shared.wire.problem import Problem
 from shared.wire.readings import ReadingsRequest, SensorReading
-from shared.wire.schemas import (
-    BatchRequest,
-    DecideRequest,
-    FeedbackRequest,
-    MissionSpec,
-    PromptStyle,
-    SensorColumns,
-)
+from shared.wire.schemas import BatchRequest, DecideRequest, FeedbackRequest, MissionSpec, PromptStyle, SensorColumns
 from shared.world.scenario import Scenario
 
 log = logging.getLogger(__name__)
@@ -49,11 +42,7 @@ _RETRY_S = 1
 
 
 def problem_response(
-    status: int,
-    detail: str,
-    errors: Sequence[dict[str, str]] = (),
-    kind: str = "about:blank",
-    owner: str | None = None,
+    status: int, detail: str, errors: Sequence[dict[str, str]] = (), kind: str = "about:blank", owner: str | None = None
 ) -> Response:
     """An ``application/problem+json`` response of the type ``kind``, which never repeats the request's content."""
     body = Problem(

@@ -144,14 +144,12 @@ class Ingress:
 
 def _merged(path: str, answers: dict[str, Answer]) -> Response:
     """One answer for all edges; if all refuse the request, the first refusal."""
-    first = next(iter(answers.values()))
     if path == "/readyz":
-        return merged_readiness(answers.values(), None)
+        return merged_readiness(answers.values())
     good = {name: answer for name, answer in answers.items() if answer.status == 200}
     if not good:
-        return _passed_on(first)
-    own = next(iter(good.values()))
-    return merged_metrics(good, own) if path == "/metrics" else merged_missions(good.values(), own)
+        return _passed_on(next(iter(answers.values())))
+    return merged_metrics(good) if path == "/metrics" else merged_missions(good.values())
 
 
 def _passed_on(answer: Answer) -> Response:

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from itertools import chain, zip_longest
 
 from starlette.responses import Response
-from starlette.types import Message, Send
+from starlette.types import Message
 
-from service.cluster.gathered_metrics import gathered
 from shared.wire.missions import MissionLine, MissionList
 from shared.wire.schemas import Readiness
 
@@ -33,42 +32,30 @@ class Answer:
         else:
             self.body += message.get("body", b"")
 
-    async def forward(self, send: Send) -> None:
-        """Send it."""
-        await send({"type": "http.response.start", "status": self.status, "headers": self.headers})
-        await send({"type": "http.response.body", "body": self.body})
-
     def header(self, name: str) -> str | None:
         """The value of a header in lower case."""
         return next((value.decode("latin-1") for key, value in self.headers if key.lower() == name.encode()), None)
 
 
-def merged_metrics(answers: Mapping[str, Answer], own: Answer) -> Response:
-    """All samples, each with the name of its edge as a label; ``own`` is one of the answers."""
-    texts = {name: answer.body.decode() for name, answer in answers.items() if answer.status == 200}
-    return Response(gathered(texts), media_type=own.header("content-type"))
+def merged_metrics(answers: Mapping[str, Answer]) -> Response:
+    """All samples of answers with status 200, at least one, each with the name of its edge as a label."""
+    texts = {name: answer.body.decode() for name, answer in answers.items()}
+    return Response(gathered(texts), media_type=next(iter(answers.values())).header("content-type"))
 
 
-def merged_readiness(answers: Iterable[Answer], away: str | None) -> Response:
-    """Ready if all edges are; the LLM is ready if all have reached it.
-
-    Args:
-        away: what is missing, if anything; the cluster is not ready then.
-    """
+def merged_readiness(answers: Iterable[Answer]) -> Response:
+    """Ready if all edges are; the LLM is ready if all have reached it."""
     found = [Readiness.model_validate_json(a.body) for a in answers if a.status in (200, 503)]
     shown = min(found, key=lambda one: (one.ready, one.llm == "ready"))
-    if away is not None:
-        shown = shown.model_copy(update={"ready": False, "detail": away})
     return Response(shown.model_dump_json(), 200 if shown.ready else 503, media_type="application/json")
 
 
-def merged_missions(answers: Iterable[Answer], own: Answer) -> Response:
+def merged_missions(answers: Iterable[Answer]) -> Response:
     """All edges' missions, interleaved, from the edge that decided last on; each edge's stay in their order.
 
-    A mission that is only in the store may be in several lists.
+    A mission that is only in the store may be in several lists. All answers have status 200; there is at least one.
     """
-    listed = [answer for answer in answers if answer.status == 200]
-    listed.sort(key=lambda answer: -float(answer.header(DECIDED_AT) or 0.0))
+    listed = sorted(answers, key=lambda answer: -float(answer.header(DECIDED_AT) or 0.0))
     lists = [MissionList.model_validate_json(answer.body) for answer in listed]
     lines = dict[str, MissionLine]()
     for line in chain.from_iterable(zip_longest(*(one.missions for one in lists))):
@@ -76,7 +63,36 @@ def merged_missions(answers: Iterable[Answer], own: Answer) -> Response:
             lines[line.mission_id] = line
     more = sum(one.more for one in lists) + max(0, len(lines) - _MOST_LISTED)
     newest = next((one.newest for one in lists if one.newest is not None), None)
-    may_command = MissionList.model_validate_json(own.body).may_command
+    may_command = lists[0].may_command
     shown = list(lines.values())[:_MOST_LISTED]
     merged = MissionList(missions=shown, more=more, newest=newest, may_command=may_command)
     return Response(merged.model_dump_json(), media_type="application/json")
+
+
+def gathered(texts: Mapping[str, str]) -> str:
+    """Merge several processes' expositions in Prometheus's text format.
+
+    The samples of a metric follow each other after one HELP and one TYPE, as the format demands. An absent process has
+    no samples: the sum of rates over the others stays right, and its counters restart with it.
+    """
+    heads, samples = dict[str, list[str]](), dict[str, list[str]]()
+    for process, text in texts.items():
+        name = ""
+        for line in text.splitlines():
+            if line.startswith("# HELP "):
+                name = line.split(" ", 3)[2]
+                heads.setdefault(name, [])
+            if not line.startswith("#"):
+                samples.setdefault(name, []).append(_labelled(line, process))
+            elif line not in heads.setdefault(name, []) and len(heads[name]) < 2:
+                heads[name].append(line)
+    return "".join(f"{line}\n" for name in heads for line in (*heads[name], *samples.get(name, ())))
+
+
+def _labelled(sample: str, process: str) -> str:
+    """A sample with the label ``process``; no metric's name has a brace or a space."""
+    name, brace, rest = sample.partition("{")
+    if brace and " " not in name:
+        return f'{name}{{process="{process}",{rest}'
+    name, _, value = sample.partition(" ")
+    return f'{name}{{process="{process}"}} {value}'

@@ -68,39 +68,25 @@ def main(argv: list[str]) -> int:
     config = (tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
     command = tyro.cli(KeysOptions, prog="aicvds keys", args=argv, config=config).do
     try:
-        return (
-            _add(command)
-            if isinstance(command, Add)
-            else _list(command)
-            if isinstance(command, List)
-            else _remove(command)
-        )
+        match command:
+            case Add():
+                with editing(command.file) as known:
+                    shown = known.add(command.name, frozenset(command.scopes), command.per_minute)
+                print(f"Key {command.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
+                print(shown)
+            case List():
+                table = Table("name", "scopes", "a minute")
+                for key in KeyFile.read(command.file).keys:
+                    table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute))
+                Console().print(table)
+            case Remove():
+                with editing(command.file) as known:
+                    known.remove(command.name)
+                print(f"Key {command.name} is removed", file=sys.stderr)
+        return 0
     except BadKeys as error:
         print(f"aicvds keys: {error}", file=sys.stderr)
     except ValidationError as error:
         fault = error.errors()[0]
         print(f"aicvds keys: {fault['loc'][0]}: {problem_of(fault)}", file=sys.stderr)
     return 2
-
-
-def _add(command: Add) -> int:
-    with editing(command.file) as known:
-        shown = known.add(command.name, frozenset(command.scopes), command.per_minute)
-    print(f"Key {command.name}, shown this once; send it as `Authorization: Bearer KEY`:", file=sys.stderr)
-    print(shown)
-    return 0
-
-
-def _list(command: List) -> int:
-    table = Table("name", "scopes", "a minute")
-    for key in KeyFile.read(command.file).keys:
-        table.add_row(key.name, " ".join(sorted(key.scopes)), str(key.per_minute))
-    Console().print(table)
-    return 0
-
-
-def _remove(command: Remove) -> int:
-    with editing(command.file) as known:
-        known.remove(command.name)
-    print(f"Key {command.name} is removed", file=sys.stderr)
-    return 0

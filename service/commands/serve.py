@@ -76,8 +76,8 @@ def main(argv: list[str]) -> int:
     replicas = _bounds(args.replicas)
     if replicas is None:
         return _refused(f"--replicas {args.replicas}: give a number from 1 to 1000, or two such as 2-8")
-    if args.ray is not None and (fault := _fault_with_ray(settings)) is not None:
-        return _refused(fault)
+    if args.ray is not None and not settings.store.startswith("postgresql"):
+        return _refused("--ray: edges on several machines share a store only in PostgreSQL: set AICVDS_STORE")
     try:
         family = socket.AF_INET6 if ":" in args.host else socket.AF_INET
         listener = socket.create_server((args.host, args.port), family=family)
@@ -166,13 +166,6 @@ def _serve_cluster(listener: socket.socket, settings: Settings, ray: str, least:
     return 0
 
 
-def _fault_with_ray(settings: Settings) -> str | None:
-    """Why edges on Ray cannot have these settings."""
-    if not settings.store.startswith("postgresql"):
-        return "--ray: edges on several machines share a store only in PostgreSQL: set AICVDS_STORE"
-    return None
-
-
 def _bounds(replicas: str) -> tuple[int, int] | None:
     """The least and the most of ``--replicas``; None where it is malformed."""
     least, _, most = replicas.partition("-")
@@ -197,13 +190,10 @@ def _application(settings: Settings, url: str, loaded: Callable[[str], None]) ->
     except BadKeys as error:
         raise _Unusable(f"AICVDS_KEYS: {error}") from None
     except StoreUnusable as error:
-        raise _Unusable(_store_fault(error)) from None
+        fault = f"AICVDS_STORE: {error}. Give another (--store FILE), or `--store none` to store nothing"
+        raise _Unusable(fault) from None
     loaded(banner(settings, url, 0 if store is None else len(store.missions())))
     return app
-
-
-def _store_fault(error: Exception) -> str:
-    return f"AICVDS_STORE: {error}. Give another (--store FILE), or `--store none` to store nothing"
 
 
 class _Unusable(Exception):

@@ -13,11 +13,7 @@ _REACH_TOKENS = 16
 
 
 def prompt_tokens(
-    row_format: PromptFormat,
-    rows: int,
-    experiences: int,
-    features: Features = "paper",
-    demonstrations: str = "",
+    row_format: PromptFormat, rows: int, experiences: int, features: Features = "paper", demonstrations: str = ""
 ) -> int:
     """Upper bound of a prompt's length in the embedded model's tokens.
 

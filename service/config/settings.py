@@ -33,9 +33,7 @@ def _default_store() -> str:
 # not measured.
 _MOST_EMBEDDED_THREADS = 8
 # Variables of earlier versions, and what replaces them.
-_REMOVED = {
-    "AICVDS_PROCESSES": ": several edges share one PostgreSQL behind a load balancer, or start one with --ray",
-}
+_REMOVED = {"AICVDS_PROCESSES": ": several edges share one PostgreSQL behind a load balancer, or start one with --ray"}
 # Variables of `aicvds simulate`, `aicvds mqtt` and docker-compose.yml, often in the same .env file.
 _SIMULATORS = {
     f"AICVDS_{name}"

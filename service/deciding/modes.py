@@ -117,11 +117,8 @@ class LlmMode(PolicyMode):
         return Choice(answer, None, completion, completion.model)
 
 
-class LetterMode(PolicyMode):
+class LetterMode(LlmMode):
     """Mode ``llm`` with the compact prompt: the likeliest letter is the decision, once it has passed every check."""
-
-    def __init__(self, queries: LlmQueries) -> None:
-        self._queries = queries
 
     def question(self, state: AttendedState, task: DecisionTask) -> Question:
         """The candidates' prompt."""

@@ -21,7 +21,6 @@ from service.mission.mission import Mission
 from service.prompting.prompt import Prompt
 from service.prompting.token_accounting import TokenCounter
 from shared.kit.cores import usable_cores
-from shared.planning.orders import Guidance
 from shared.wire.schemas import Tokens
 from shared.world.actions import Action
 
@@ -79,7 +78,9 @@ class Pipeline:
             choice = choice.to(_without_llm(state))
         orders, decision_id = task.mission.guidance.orders, secrets.token_hex(16)
         if orders is not None:
-            choice = _enforce(orders, task.mission, choice)
+            # The operator may have confirmed orders since the mode's choice.
+            velocity = orders.nearest(choice.action.velocity, task.mission.scenario.max_velocity + 1)
+            choice = replace(choice, action=Action(choice.action.sensor_id, velocity))
         pending = state.pending(decision_id, choice.action)
         task.watch.ended.append(("check", perf_counter()))
         report = None if choice.advice is None else AdviserReport(choice.model or "", choice.advice)
@@ -130,9 +131,3 @@ def _without_llm(state: AttendedState) -> Action:
         # Other UAVs have reserved every reported sensor. An unreported sensor is worth a try, a reserved one is not.
         sensor = next((i for i in range(mission.scenario.sensors) if i not in reserved), sensor)
     return Action(sensor, velocity)
-
-
-def _enforce(orders: Guidance, mission: Mission, choice: Choice) -> Choice:
-    """The choice at a velocity that the operator's guidance allows, which may have been confirmed meanwhile."""
-    velocity = orders.nearest(choice.action.velocity, mission.scenario.max_velocity + 1)
-    return replace(choice, action=Action(choice.action.sensor_id, velocity))

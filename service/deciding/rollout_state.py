@@ -91,7 +91,9 @@ class RolloutState:
         guidance: Guidance = NO_GUIDANCE,
     ) -> RolloutState:
         """The state before this UAV's decision at this step; ``plans`` are the fleet's from this step on."""
-        horizon = _horizon(scenario, step)
+        # A fleet may continue past the scenario's last step.
+        left = scenario.steps - step
+        horizon = min(_HORIZON, left) if left > 0 else _HORIZON
         # Any subset of UAVs serves: their distances change within the horizon.
         others = [other for other in belief.present(step) if other != uav][: _MAX_UAVS - 1]
         flown = np.arange(horizon * scenario.max_velocity + 1) * scenario.step_s
@@ -128,12 +130,6 @@ class RolloutState:
             step=step,
             visited=visited,
         )
-
-
-def _horizon(scenario: Scenario, step: int) -> int:
-    left = scenario.steps - step
-    # A fleet may continue past the scenario's last step.
-    return min(_HORIZON, left) if left > 0 else _HORIZON
 
 
 def _after(

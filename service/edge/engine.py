@@ -32,14 +32,7 @@ from service.storage.journal import Journal, NullJournal
 from service.storage.store import Store
 from shared.wire.readings import ReadingsRequest, ReadingsResponse
 from shared.wire.reasons import Reason
-from shared.wire.schemas import (
-    BatchRequest,
-    DecideRequest,
-    DecideResponse,
-    FeedbackRequest,
-    FeedbackResponse,
-    Source,
-)
+from shared.wire.schemas import BatchRequest, DecideRequest, DecideResponse, FeedbackRequest, FeedbackResponse, Source
 
 # The longest wait of an answer for the disk; after that it is sent with `stored` false.
 _STORE_S = 1.0

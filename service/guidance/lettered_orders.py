@@ -11,11 +11,9 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from pydantic import ValidationError
-
 from service.guidance.note_numbers import LetteredNote, Number
-from service.guidance.note_orders import BadOrders
-from shared.planning.orders import Guidance, SensorWish
+from service.guidance.note_orders import BadOrders, guidance_of
+from shared.planning.orders import Guidance
 from shared.world.scenario import Scenario
 
 STATIC = "Orders of a note."
@@ -110,13 +108,7 @@ class _Orders:
         if self._others:
             for sensor in range(self._scenario.sensors):
                 self._wishes.setdefault(sensor, {"weight": 0.0})
-        try:
-            sensors = [SensorWish.model_validate({"sensor_id": own, **wish}) for own, wish in self._wishes.items()]
-            fields = {"sensors": sensors, **self._limits, "forbidden_velocities": sorted(set(self._forbidden))}
-            return Guidance.model_validate(fields)
-        except ValidationError as error:
-            first = error.errors()[0]
-            raise BadOrders(f"{first['loc'][-1] if first['loc'] else 'orders'}: {first['msg']}") from None
+        return guidance_of(self._wishes, self._limits, sorted(set(self._forbidden)))
 
     def _visit(self, words: list[str]) -> None:
         if words[-1] == "always":

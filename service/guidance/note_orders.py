@@ -11,10 +11,12 @@ import json
 import math
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 
 from pydantic import ValidationError
 
+from service.guidance.note_numbers import CARDINALS, ORDINALS
 from service.guidance.order_examples import EXAMPLES
 from shared.planning.orders import Guidance, SensorWish
 
@@ -33,17 +35,7 @@ _PATTERNS = {
     for words in (VISIT, WEIGHT, FASTEST, SLOWEST, FORBIDDEN)
 }
 
-# fmt: off
-_CARDINALS = [
-    "zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve",
-    "thirteen", "fourteen",
-]
-_ORDINALS = [
-    "zeroth", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth",
-    "eleventh", "twelfth",
-]
-# fmt: on
-_NUMBER_WORDS = {word: value for words in (_CARDINALS, _ORDINALS) for value, word in enumerate(words)}
+_NUMBER_WORDS = {word: value for words in (CARDINALS[:15], ORDINALS[:13]) for value, word in enumerate(words)}
 # "Every other step" is every second step. An ignored sensor, or one that is left out, counts 0 times.
 _NUMBER_WORDS |= {"twice": 2, "double": 2, "other": 2, "triple": 3, "ignore": 0, "ignored": 0, "leave": 0}
 _TOKEN = re.compile(r"[0-9]+|[a-z]+|m/s|:")
@@ -84,6 +76,13 @@ def parse_orders(text: str, note: str) -> Guidance:
     used = Counter([*wishes, *forbidden, *limits.values(), *(v for wish in wishes.values() for v in wish.values())])
     if invented := used - numbers_in(note):
         raise BadOrders(f"the orders use the number {next(iter(invented))} more often than the note")
+    return guidance_of(wishes, limits, forbidden)
+
+
+def guidance_of(
+    wishes: Mapping[int, Mapping[str, float]], limits: Mapping[str, int], forbidden: Sequence[int]
+) -> Guidance:
+    """The guidance of wishes by sensor, limits of velocity and forbidden velocities; raises :class:`BadOrders`."""
     try:
         sensors = [SensorWish.model_validate({"sensor_id": sensor, **wish}) for sensor, wish in wishes.items()]
         return Guidance.model_validate({"sensors": sensors, **limits, "forbidden_velocities": forbidden})

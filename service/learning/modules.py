@@ -23,6 +23,8 @@ from shared.wire.schemas import Features
 WIDTH = 32
 # Fewer sensors are scored in numpy, with an n x n array.
 _MANY = 64
+# The attention module's fields of `Parameters`.
+_ATTENTION = ("query", "key", "value", "score", "bias")
 
 
 class Sample(NamedTuple):
@@ -41,25 +43,6 @@ class Sample(NamedTuple):
     velocity: int
 
 
-class AttentionTensors(NamedTuple):
-    """``W_q``, ``W_k``, ``W_v`` ``(d', d)``, and the score's ``w`` ``(1, d')`` and ``b`` ``(1,)``."""
-
-    query: Tensor
-    key: Tensor
-    value: Tensor
-    score: Tensor
-    bias: Tensor
-
-
-class VelocityTensors(NamedTuple):
-    """``W_1``, ``b_1``, ``W_2``, ``b_2``."""
-
-    hidden: Tensor
-    hidden_bias: Tensor
-    out: Tensor
-    out_bias: Tensor
-
-
 class Parameters(NamedTuple):
     """The parameters of both modules, or their gradients, as numpy arrays in the modules' order.
 
@@ -76,24 +59,6 @@ class Parameters(NamedTuple):
     hidden_bias: Array
     out: Array
     out_bias: Array
-
-
-def attend(weights: AttentionTensors, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
-
-    Args:
-        admissible: ``(..., n)`` booleans; the results of the other sensors are meaningless. Default: all are
-            admissible.
-    """
-    # Only for four axes (batch, head, n, d') torch selects the kernel without an n x n tensor.
-    n, d = x.shape[-2:]
-    wide = x.reshape(-1, 1, n, d)
-    q = functional.linear(wide, weights.query)
-    k = functional.linear(wide, weights.key)
-    v = functional.linear(wide, weights.value)
-    mask = None if admissible is None else admissible.reshape(-1, 1, 1, n)
-    z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).reshape(*x.shape[:-1], -1)
-    return functional.linear(z, weights.score, weights.bias)[..., 0], z
 
 
 class Attended(NamedTuple):
@@ -115,22 +80,6 @@ def top_k(scores: Array, k: int) -> list[int]:
     return best
 
 
-def by_distance(weights: VelocityTensors, z: Tensor, distance: Tensor) -> Tensor:
-    """Values ``(..., levels)`` from the context ``(..., d')`` and the normalised distance ``(..., 1)``."""
-    return _values(weights, torch.cat([z, distance], dim=-1))
-
-
-def by_reach(weights: VelocityTensors, z: Tensor, levels: Tensor) -> Tensor:
-    """Values ``(..., levels)`` from the context ``(..., d')`` and the levels' features ``(..., levels, 4)``."""
-    context = z[..., None, :].expand(*levels.shape[:-1], z.shape[-1])
-    return _values(weights, torch.cat([context, levels], dim=-1))[..., 0]
-
-
-def _values(weights: VelocityTensors, x: Tensor) -> Tensor:
-    hidden = torch.relu(functional.linear(x, weights.hidden, weights.hidden_bias))
-    return functional.linear(hidden, weights.out, weights.out_bias)
-
-
 class Weights:
     """The parameters for decisions: an immutable copy.
 
@@ -149,10 +98,10 @@ class Weights:
     @property
     def attention(self) -> dict[str, Array]:
         """The attention module's parameters by name."""
-        return {name: getattr(self.parameters, name) for name in AttentionTensors._fields}
+        return {name: getattr(self.parameters, name) for name in _ATTENTION}
 
     def attend(self, features: Array) -> Attended:
-        """Scores and contexts of n sensors' features ``(n, d)``, as :func:`attend`."""
+        """Scores and contexts of n sensors' features ``(n, d)``, as :class:`Attention`."""
         return self._attend_few(features) if len(features) < _MANY else self._attend_many(features)
 
     def _attend_few(self, features: Array) -> Attended:
@@ -241,9 +190,18 @@ class Attention(nn.Module):
         self.score = nn.Linear(width, 1)
 
     def forward(self, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """As :func:`attend`."""
-        linear = self.query.weight, self.key.weight, self.value.weight
-        return attend(AttentionTensors(*linear, self.score.weight, self.score.bias), x, admissible)
+        """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
+
+        Args:
+            admissible: ``(..., n)`` booleans; the results of the other sensors are meaningless. Default: all are true.
+        """
+        # Only for four axes (batch, head, n, d') torch selects the kernel without an n x n tensor.
+        n, d = x.shape[-2:]
+        wide = x.reshape(-1, 1, n, d)
+        mask = None if admissible is None else admissible.reshape(-1, 1, 1, n)
+        z = functional.scaled_dot_product_attention(self.query(wide), self.key(wide), self.value(wide), attn_mask=mask)
+        z = z.reshape(*x.shape[:-1], -1)
+        return self.score(z)[..., 0], z
 
 
 class VelocityScorer(nn.Module):
@@ -255,8 +213,9 @@ class VelocityScorer(nn.Module):
         self.out = nn.Linear(width, levels)
 
     def forward(self, z: Tensor, distance: Tensor) -> Tensor:
-        """As :func:`by_distance`."""
-        return by_distance(_weights(self.hidden, self.out), z, distance)
+        """Values ``(..., levels)`` from the context ``(..., d')`` and the normalised distance ``(..., 1)``."""
+        values: Tensor = self.out(torch.relu(self.hidden(torch.cat([z, distance], dim=-1))))
+        return values
 
 
 class ReachVelocityScorer(nn.Module):
@@ -272,12 +231,10 @@ class ReachVelocityScorer(nn.Module):
         self.out = nn.Linear(width, 1)
 
     def forward(self, z: Tensor, levels: Tensor) -> Tensor:
-        """As :func:`by_reach`."""
-        return by_reach(_weights(self.hidden, self.out), z, levels)
-
-
-def _weights(hidden: nn.Linear, out: nn.Linear) -> VelocityTensors:
-    return VelocityTensors(hidden.weight, hidden.bias, out.weight, out.bias)
+        """Values ``(..., levels)`` from the context ``(..., d')`` and the levels' features ``(..., levels, 4)``."""
+        context = z[..., None, :].expand(*levels.shape[:-1], z.shape[-1])
+        values: Tensor = self.out(torch.relu(self.hidden(torch.cat([context, levels], dim=-1))))
+        return values[..., 0]
 
 
 class Modules(nn.Module):

@@ -180,13 +180,7 @@ def _softmax_gradient(x: Array, query: Array, p: Array, dp: Array) -> None:
 
 @compiled
 def _adam(
-    weights: Array,
-    mean: Array,
-    square: Array,
-    gradient: Array,
-    rate: np.float32,
-    root: np.float32,
-    after: Array,
+    weights: Array, mean: Array, square: Array, gradient: Array, rate: np.float32, root: np.float32, after: Array
 ) -> bool:
     """As :func:`adam_step`, with the correction of the mean in ``rate``, and the root of that of the square.
 

@@ -84,7 +84,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
     """The volatile part: counts, the fleet's belief of each sensor, and the operator's orders."""
     belief, scenario = mission.belief, mission.scenario
     step = belief.newest or 0
-    queue, rate = belief.queue(step), belief.arrivals.rate
+    queue, rate, orders = belief.queue(step), belief.arrivals.rate, mission.deadlines()
     return {
         "step": step,
         "made": mission.decisions,
@@ -92,7 +92,7 @@ def _moment(mission: Mission, watched: Watched) -> dict[str, Any]:
         "learner_updates": mission.learner.updates,
         "learner_loss": mission.learner.last_loss,
         "guidance": _guidance(mission),
-        "deadlines": _deadlines(mission),
+        "deadlines": {"met": sum(one.met for one in orders), "missed": sum(one.missed for one in orders)},
         **watched.totals(),
         "queue": np.round(queue, 1).tolist(),
         "urgency": np.round(urgency(queue, rate, scenario), 3).tolist(),
@@ -125,12 +125,6 @@ def _guidance(mission: Mission) -> dict[str, Any]:
             for wish in mission.guidance.confirmed.sensors
         ],
     }
-
-
-def _deadlines(mission: Mission) -> dict[str, int]:
-    """The deadlines of all visit orders so far."""
-    counts = mission.deadlines()
-    return {"met": sum(one.met for one in counts), "missed": sum(one.missed for one in counts)}
 
 
 def _curves(scenario: Scenario) -> list[Any]:

@@ -47,12 +47,7 @@ class LLMClient:
     """
 
     def __init__(
-        self,
-        base_url: str,
-        *,
-        api_key: str | None = None,
-        trust_env: bool = True,
-        session_header: str | None = None,
+        self, base_url: str, *, api_key: str | None = None, trust_env: bool = True, session_header: str | None = None
     ) -> None:
         self.base_url = base_url
         # Found once: aiohttp would look for a proxy at each call, in a thread.

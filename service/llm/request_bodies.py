@@ -51,18 +51,12 @@ def chat_body(
 
     Strict servers refuse unknown fields. So llama.cpp's ``cache_prompt`` goes only to a server that obeys ``grammar``.
     """
-    body: dict[str, Any] = {
-        "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
-        "temperature": 0,
-        "max_tokens": 32 if constraint == "json_schema" else 12,
-        "stream": False,
-        **constrain(constraint, sensor_ids, velocities),
-    }
-    if model:
-        body["model"] = model
+    fields = constrain(constraint, sensor_ids, velocities)
     if constraint == "grammar":
-        body["cache_prompt"] = True
-    return body
+        fields["cache_prompt"] = True
+    return _body(
+        model, [_message("system", system), _message("user", user)], 32 if constraint == "json_schema" else 12, fields
+    )
 
 
 def label_body(
@@ -82,24 +76,16 @@ def label_body(
     So several labels are drawn at a low temperature, nearly always the likeliest, which
     :meth:`TokenPosition.untempered` undoes.
     """
-    body: dict[str, Any] = {
-        "messages": [{"role": "system", "content": system}, {"role": "user", "content": user}],
-        "temperature": 0,
-        # A token for each label, and one for each end of a line between them.
-        "max_tokens": 2 * len(lists) - 1,
-        "stream": False,
-        **constrain_labels(constraint, lists),
-    }
-    if model:
-        body["model"] = model
+    fields = constrain_labels(constraint, lists)
     if constraint == "grammar":
-        body["cache_prompt"] = True
+        fields["cache_prompt"] = True
     if logprobs:
-        body |= {"logprobs": True, "top_logprobs": TOP_LOGPROBS}
+        fields |= {"logprobs": True, "top_logprobs": TOP_LOGPROBS}
         if constraint == "grammar":
-            body |= {"post_sampling_probs": True, "samplers": ["temperature"]}
-            body["temperature"] = 1.0 if len(lists) == 1 else SEVERAL_LABELS_TEMPERATURE
-    return body
+            fields |= {"post_sampling_probs": True, "samplers": ["temperature"]}
+            fields["temperature"] = 1.0 if len(lists) == 1 else SEVERAL_LABELS_TEMPERATURE
+    # A token for each label, and one for each end of a line between them.
+    return _body(model, [_message("system", system), _message("user", user)], 2 * len(lists) - 1, fields)
 
 
 def rewriting_body(
@@ -110,23 +96,12 @@ def rewriting_body(
     Args:
         constraint: the fields that constrain the server to the answer's form.
     """
-    examples = [
-        {"role": role, "content": content}
-        for example in wanted.examples
-        for role, content in zip(("user", "assistant"), example, strict=True)
-    ]
-    system = {"role": "system", "content": wanted.instruction}
-    body: dict[str, Any] = {
-        "messages": [system, *examples, {"role": "user", "content": wanted.text}],
-        "temperature": temperature,
-        "seed": seed,
-        "max_tokens": 128,
-        "stream": False,
-        **constraint,
-    }
-    if model:
-        body["model"] = model
-    return body
+    messages = [_message("system", wanted.instruction)]
+    for text, rewritten in wanted.examples:
+        messages += [_message("user", text), _message("assistant", rewritten)]
+    return _body(
+        model, [*messages, _message("user", wanted.text)], 128, {"temperature": temperature, "seed": seed, **constraint}
+    )
 
 
 def warm_up_body(model: str | None, first: WarmUp, constraint: Constraint, logprobs: bool) -> dict[str, Any]:
@@ -183,6 +158,18 @@ def json_schema(sensor_ids: list[int], velocities: list[int]) -> dict[str, Any]:
         "additionalProperties": False,
     }
     return {"type": "json_schema", "json_schema": {"name": "decision", "strict": True, "schema": schema}}
+
+
+def _message(role: str, content: str) -> dict[str, str]:
+    return {"role": role, "content": content}
+
+
+def _body(
+    model: str | None, messages: Sequence[dict[str, str]], max_tokens: int, fields: dict[str, Any]
+) -> dict[str, Any]:
+    """A request body, greedy unless the further fields differ."""
+    body: dict[str, Any] = {"messages": list(messages), "temperature": 0, "max_tokens": max_tokens, "stream": False}
+    return body | fields | ({"model": model} if model else {})
 
 
 def _alternatives(texts: Sequence[str]) -> str:

@@ -78,11 +78,7 @@ class LlmServer:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        warm_up: WarmUp,
-        on_open: Callable[[], None] = lambda: None,
-        embed: Embed = embedded,
+        self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None, embed: Embed = embedded
     ) -> None:
         self._settings = settings
         self._embed = embed

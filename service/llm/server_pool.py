@@ -37,11 +37,7 @@ class ServerPool:
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        warm_up: WarmUp,
-        on_open: Callable[[], None] = lambda: None,
-        embed: Embed = embedded,
+        self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None, embed: Embed = embedded
     ) -> None:
         self._each = [LlmServer(one, warm_up, on_open, embed) for one in settings.each_server()]
         self._hedge_s = settings.hedge_ms / 1e3 if settings.hedge_ms else None

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.mission.learned_world_status import learned_world
 from service.mission.mission import Mission
-from shared.wire.missions import MissionStatus
+from shared.belief.fleet_belief import FleetBelief
+from shared.wire.missions import LearnedWorld, MissionStatus
+
+# The least mean excess loss of a reported sensor, dB.
+_REPORTED_DB = 1.0
 
 
 def status_of(mission: Mission) -> MissionStatus:
@@ -35,4 +38,22 @@ def status_of(mission: Mission) -> MissionStatus:
         learned=learned_world(mission.belief),
         deadlines=mission.deadlines() or None,
         readings=mission.readings.merged or None,
+    )
+
+
+def learned_world(belief: FleetBelief) -> LearnedWorld | None:
+    """How the world differs from the scenario's formulas; None where nothing yet shows that it does."""
+    channel, dispersion = belief.channel, belief.arrivals.dispersion
+    if channel.by_formula and belief.drift.none and dispersion == 1.0:
+        return None
+    measured = channel.radio_map.measured_db()
+    east, north = belief.drift.wind.tolist()
+    return LearnedWorld(
+        offset_db=channel.radio_map.offset_db,
+        deviation_db=channel.radio_map.deviation_db,
+        rate_share=channel.share,
+        wind=[east, north],
+        dispersion=dispersion,
+        failed_radios=channel.failures.dead,
+        excess_db={sensor: excess for sensor, excess in measured.items() if abs(excess) > _REPORTED_DB},
     )

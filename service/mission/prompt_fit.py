@@ -32,14 +32,7 @@ def template_for(spec: ResolvedSpec, scenario: Scenario, weights: Weights) -> Te
     if spec.mode == "guided":
         return GuidedTemplate(scenario, rows=rows, experiences=experiences, ranked=ranked, note=note)
     examples = solved(spec, spec.features, scenario, weights, spec.top_k if spec.uses_attention else None)
-    return Template(
-        scenario,
-        spec.features,
-        demonstrations=examples,
-        experiences=experiences,
-        ranked=ranked,
-        note=note,
-    )
+    return Template(scenario, spec.features, demonstrations=examples, experiences=experiences, ranked=ranked, note=note)
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,9 +77,7 @@ class Metrics:
             "aicvds_llm_trust", "The LLM's weight among mode guided's advisers", registry=r, buckets=_SHARE_BUCKETS
         )
         self.evaluator_timeouts = Counter(
-            "aicvds_critic_timeouts",
-            "Decisions of mode guided whose rollout evaluator was late or failed",
-            registry=r,
+            "aicvds_critic_timeouts", "Decisions of mode guided whose rollout evaluator was late or failed", registry=r
         )
 
     def _add_outcomes(self) -> None:

@@ -24,10 +24,7 @@ _MEANINGS = {
     "age": "steps since its last visit",
     "distance": "metres from this UAV",
 }
-_REACH_MEANINGS = {
-    "best": "the best velocity for it",
-    "movable": "packets that can be collected at that velocity",
-}
+_REACH_MEANINGS = {"best": "the best velocity for it", "movable": "packets that can be collected at that velocity"}
 _NUMERALS = {5: "five", 7: "seven"}
 # The static block's description of an experience.
 EXPERIENCE_NOTE = (

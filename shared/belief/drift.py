@@ -55,10 +55,6 @@ class Drift:
         self._normal = _KEPT * self._normal + (1 - _KEPT) * np.eye(2) * _PRIOR_STEPS + np.outer(heading, heading)
         self._moment = _KEPT * self._moment + heading * share
 
-    def flown_step(self, path: Trajectory, start_m: float, still_m: float) -> float:
-        """The metres flown for one commanded distance."""
-        return float(self.flown(path, start_m, np.array([still_m]))[0])
-
     def flown(self, path: Trajectory, start_m: float, still_m: FloatArray) -> FloatArray:
         """The metres flown, shape ``(n,)``, for commanded ways ``(n,)`` from a progress on."""
         if self.none or not len(still_m):

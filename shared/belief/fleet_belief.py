@@ -200,7 +200,7 @@ class FleetBelief:
         start = last.progress_m
         if start is not None:
             path, still_m = self._paths[uav], velocity * self._scenario.step_s
-            last.progress_m = start + (still_m if self.drift.none else self.drift.flown_step(path, start, still_m))
+            last.progress_m = start + float(self.drift.flown(path, start, np.array([still_m]))[0])
             x, y = path.at(last.progress_m)
             last.position = float(x), float(y)
         base, since, visited = float(self.base[sensor]), int(self.since[sensor]), int(self.visited[sensor])

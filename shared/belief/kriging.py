@@ -33,12 +33,7 @@ _SAME_PLACE_M, _MOST_OF_PLACE = 10.0, 2
 
 @compiled
 def take_measurements(
-    of: Measurements,
-    links: LinkStatistics,
-    ids: IntArray,
-    east: float,
-    north: float,
-    excess: FloatArray,
+    of: Measurements, links: LinkStatistics, ids: IntArray, east: float, north: float, excess: FloatArray
 ) -> None:
     """Take one UAV's measurements of n sensors at its place, as :meth:`shared.belief.radio_map.RadioMap.measure` does.
 

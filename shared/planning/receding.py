@@ -179,8 +179,8 @@ class RecedingHorizon:
         def renamed(actions: IntArray) -> IntArray:
             return np.array([(index.get(sensor, nowhere), v) for sensor, v in actions.tolist()], dtype=np.int64)
 
-        # Other UAVs have reserved some sensors in this step.
-        usable = np.ones((horizon, len(kept) + 1), dtype=np.bool_)
+        # Sensors reserved in this step are barred, except those of the belief's decisions, which are fixed.
+        usable = np.ones((horizon, nowhere + 1), dtype=np.bool_)
         usable[0, :-1] = ~np.isin(kept, list(set(taken) - {sensor for sensor, _ in decided.values()}))
         links = self._links(present, kept, horizon)
         ahead = self._chances_ahead(present, kept, horizon) if self._joint else None

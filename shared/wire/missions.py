@@ -6,16 +6,7 @@ from typing import Literal
 
 from pydantic import ConfigDict, Field
 
-from shared.wire.schemas import (
-    Belief,
-    DecisionId,
-    Features,
-    Init,
-    MissionId,
-    Mode,
-    PromptStyle,
-    Wire,
-)
+from shared.wire.schemas import Belief, DecisionId, Features, Init, MissionId, Mode, PromptStyle, Wire
 from shared.world.scenario import Scenario
 
 

@@ -102,8 +102,7 @@ class SensorColumns(Received):
         Field(max_length=MAX_SENSORS, fail_fast=True, description="dB, minus the path loss"),
     ]
     last_seen: Annotated[
-        list[Step | None],
-        Field(max_length=MAX_SENSORS, fail_fast=True, description="step of the last beacon"),
+        list[Step | None], Field(max_length=MAX_SENSORS, fail_fast=True, description="step of the last beacon")
     ]
 
     @model_validator(mode="after")

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from pydantic import BaseModel, Field
 
 
-def _equal(off: Any) -> Callable[[Any], bool]:
-    """Whether a value is the one that a scenario's JSON leaves out.
-
-    An edge of a version without the field then accepts every scenario that does not use it.
-    """
-    return lambda value: bool(value == off)
-
-
 def _off(value: Any, **bounds: Any) -> Any:
-    return Field(value, exclude_if=_equal(value), **bounds)
+    """A field that a scenario's JSON omits at this value, so that an edge of a version without the field accepts it."""
+    return Field(value, exclude_if=lambda given: bool(given == value), **bounds)
 
 
 class Unmodelled(BaseModel):
