@@ -1,1 +1,1 @@
-"""What the edge service and the simulator must agree on, and nothing else."""
+"""Code and formats that the edge service and its clients share."""

@@ -32,17 +32,17 @@ from shared.world.channel import IntArray
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
 
-# The cumulative shares of the kinds of changes: another sensor at one step; one velocity for several steps; another
-# velocity at one step; the same with the opposite change at a later step; the rest exchange two sensors.
+# The cumulative shares of the kinds of changes: another sensor in one step; one velocity for several steps; another
+# velocity in one step; the same with the opposite change in a later step; the rest exchange two sensors.
 _SENSOR, _RUN, _SINGLE, _SHIFT = 0.4, 0.5, 0.65, 0.9
 # The cumulative shares of new velocities: any one; the highest one, because some sensors are reached only if every
 # velocity is the highest; the rest are one or two levels from the old one.
 _ANY_VELOCITY, _HIGHEST_VELOCITY, _NEAR_VELOCITY = 0.4, 0.6, 2
-# The share of changes of velocity that draw sensors anew which are still in reach, and the share of these sensors.
+# The share of velocity changes that redraw sensors still in reach, and the share of these sensors.
 _ANEW = 0.5
-# What a collected level of a queue is worth where it saves no loss: enough to choose, packets.
+# The value of a collected level of a queue that saves no loss, packets: enough to break ties.
 _PACKET = 1e-4
-# Changes of a run, of these at one temperature, and between two looks at the clock; the last temperature, packets.
+# Changes of a run, at one temperature, and between two checks of the clock; the final temperature, packets.
 _CHANGES, _SAME_TEMPERATURE, _AT_ONCE, _COLD = 5000, 32, 1000, 0.01
 
 
@@ -60,7 +60,7 @@ def _within(tables: Tables, new: Proposal, step: int, uav: int, j: int) -> bool:
 
 @inlined
 def _below(count: int) -> int:
-    """A number drawn from 0 to ``count - 1``."""
+    """A random number from 0 to ``count - 1``."""
     return int(np.random.random() * count)
 
 
@@ -68,9 +68,10 @@ def _below(count: int) -> int:
 def _redraw(
     tables: Tables, current: CurrentPlan, new: Proposal, step: int, uav: int, temperature: float, packet: float
 ) -> None:
-    """Draw the sensor of a UAV's step from all that it may collect from, as likely as at this temperature.
+    """Draw the sensor of a UAV's step from all admissible ones by their Boltzmann probabilities at this temperature.
 
-    Each has a Gumbel-distributed number added to its saving and to the price of its packets, and the highest sum wins.
+    This is the Gumbel-max method: each sensor's saving, with the price of its packets, gets Gumbel noise, and the
+    highest sum wins.
     """
     at = min(step, tables.moved.shape[1] - 1)
     place, nowhere = new.place[step, uav], len(tables.start) - 1
@@ -198,9 +199,9 @@ def _anneal(
     np.random.seed(seed)
     steps, uavs = current.sensor.shape
     temperature = hot * falls**first
-    for turn in range(first, last):
-        if turn % _SAME_TEMPERATURE == 0:
-            temperature = hot * falls**turn
+    for change in range(first, last):
+        if change % _SAME_TEMPERATURE == 0:
+            temperature = hot * falls**change
         uav, step = _below(uavs), _below(steps)
         if step < tables.fixed[uav]:
             continue
@@ -228,7 +229,7 @@ def _anneal(
 
 @compiled
 def _settle(tables: Tables, current: CurrentPlan, new: Proposal, best: IntArray) -> float:
-    """Let each step collect the most packets of what saves the same; write the sensors and return the plan's cost."""
+    """Of equal savings, collect the most packets in each step; write the sensors and return the plan's cost."""
     steps, uavs = current.sensor.shape
     for step in range(steps):
         for uav in range(uavs):
@@ -253,11 +254,11 @@ class Annealing:
         self._tables = Tables.of(problem)
 
     def priced(self, actions: IntArray) -> Found:
-        """What actions ``(H, I, 2)`` are expected to lose."""
-        current, _ = self._begun(actions)
+        """The expected loss of actions ``(H, I, 2)``."""
+        current, _ = self._start(actions)
         return Found(actions, float(current.cost.sum()))
 
-    def _begun(self, actions: IntArray) -> tuple[CurrentPlan, Proposal]:
+    def _start(self, actions: IntArray) -> tuple[CurrentPlan, Proposal]:
         current, new = CurrentPlan.empty(self._tables), Proposal.empty(self._tables)
         current.sensor[:], current.velocity[:] = actions[:, :, 0], actions[:, :, 1]
         begin(self._tables, current, new)
@@ -268,11 +269,11 @@ class Annealing:
 
         Args:
             start: shape ``(H, I, 2)``, beginning with the problem's fixed actions.
-            hot: the temperature at first, packets; at last it is 0.01.
-            number: of the run; each draws other changes.
+            hot: the initial temperature, packets; the final one is 0.01.
+            number: of the run, which seeds its changes.
             until: a time of ``time.perf_counter`` at which the run ends; its plan then depends on the machine.
         """
-        current, new = self._begun(start)
+        current, new = self._start(start)
         least, best = float(current.cost.sum()), start.copy()
         falls = (_COLD / hot) ** (1.0 / _CHANGES)
         for first in range(0, _CHANGES, _AT_ONCE):
@@ -280,7 +281,7 @@ class Annealing:
                 break
             last, seed = min(first + _AT_ONCE, _CHANGES), _CHANGES * number + first
             least = _anneal(self._tables, current, new, best, least, first, last, hot, falls, seed)
-        current, new = self._begun(best)
+        current, new = self._start(best)
         return Found(best, _settle(self._tables, current, new, best))
 
 

@@ -1,4 +1,4 @@
-"""What :mod:`shared.planning.annealing` computes with: arrays of one problem, of a plan and of a changed plan."""
+"""The arrays of :mod:`shared.planning.annealing`: of one problem, of the current plan and of a changed plan."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from shared.planning.fleet_problem import FleetProblem
 from shared.planning.queue_chains import Floats
 from shared.world.channel import IntArray
 
-# Levels of a queue, more than those of queue_chains.py, filled up with levels that no queue has: processors add 4, 8 or
-# 16 numbers at once.
+# Levels of a queue: those of queue_chains.py, padded with unused levels, because processors add 4, 8 or 16 numbers at
+# once.
 LEVELS = 32
 # Arrivals of a lower probability are left out.
 _NEXT_TO_NOTHING = 1e-7
@@ -36,7 +36,7 @@ class Tables(NamedTuple):
         chance: of the same shape, the probability that its link holds.
         start: shape ``(J, Q)``, the odds of each level before the first step.
         arrive: shape ``(H, J, Q)``, of a step's arrivals, in levels.
-        counted: shape ``(H, J)``, how many of these are more than next to nothing.
+        counted: shape ``(H, J)``, the number of these that are not negligible.
         fills: shape ``(H, J, Q)``, the probability that a step's arrivals fill the queue, by the level before them.
         top: shape ``()``, the level of a full queue.
         lost: shape ``(H, J, Q)``, the packets that a step is expected to lose.
@@ -102,7 +102,7 @@ class Tables(NamedTuple):
 
 
 class CurrentPlan(NamedTuple):
-    """A plan's actions, and what is expected of each sensor under them.
+    """The current plan's actions, and the expectations for each sensor under them.
 
     Attributes:
         sensor: shape ``(H, U)``; J - 1 is nowhere.
@@ -131,7 +131,7 @@ class CurrentPlan(NamedTuple):
 
     @classmethod
     def empty(cls, tables: Tables) -> Self:
-        """Room for a problem's plans."""
+        """Empty arrays for a problem's plans."""
         (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
         return cls(
             sensor=_numbers(steps, uavs),
@@ -148,7 +148,7 @@ class CurrentPlan(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """A changed plan, as far as it differs from the current plan: room that each change writes anew.
+    """A changed plan, as far as it differs from the current plan; each change overwrites it.
 
     Attributes:
         sensor, velocity, place: as of :class:`CurrentPlan`.
@@ -173,7 +173,7 @@ class Proposal(NamedTuple):
 
     @classmethod
     def empty(cls, tables: Tables) -> Self:
-        """Room for changes of a problem's plans."""
+        """Empty arrays for changes of a problem's plans."""
         (steps, sensors, width), uavs = tables.lost.shape, len(tables.fixed)
         return cls(
             sensor=_numbers(steps, uavs),
@@ -202,7 +202,7 @@ def _links(problem: FleetProblem, most: int) -> tuple[IntArray, Floats]:
 
 
 def listed(within: NDArray[np.bool_]) -> IntArray:
-    """The places of the true entries on the last axis, in their order, and after them -1; as many as the most have."""
+    """The indices of the true entries on the last axis, in order, padded with -1 to the largest count."""
     count = within.sum(axis=-1)
     order = np.argsort(~within, axis=-1, kind="stable")[..., : max(int(count.max()), 1)]
     return np.where(np.arange(order.shape[-1]) < count[..., None], order, -1)

@@ -1,4 +1,4 @@
-"""What a plan is expected to lose, compiled: the costs of :mod:`shared.planning.annealing`.
+"""The expected losses of a plan, compiled: the costs of :mod:`shared.planning.annealing`.
 
 Sensors lose packets independently of each other. So the odds of each sensor's queue before every step are kept, and the
 losses expected after every step, and a changed visit costs one product of the two.
@@ -46,7 +46,7 @@ def total(cost: Floats) -> float:
 
 @inlined
 def _serve(tables: Tables, new: Proposal, odds: Floats, levels: int, chance: np.float32) -> None:
-    """Change the odds ``(3 Q,)`` by a transfer of so many levels over a link of this chance."""
+    """Change the odds ``(3 Q,)`` by a transfer of this many levels over a link of this chance."""
     before, ahead = odds[LEVELS:], odds[LEVELS + levels :]
     emptied = dot(before, tables.emptied[levels], new.terms)
     for q in range(len(new.terms)):
@@ -98,7 +98,7 @@ def _arrive(tables: Tables, new: Proposal, step: int, j: int, odds: Floats, afte
 
 @inlined
 def _before_arrivals(tables: Tables, step: int, j: int, value: Floats, before: Floats) -> None:
-    """Write what the levels ``(Q,)`` before a step's arrivals are worth, and loses in it, from those after them."""
+    """Write the expected losses by the level ``(Q,)`` before a step's arrivals, from those after them."""
     arrive, lost, top = tables.arrive[step, j], tables.lost[step, j], tables.top[()]
     for q in range(top, len(value)):
         value[q] = value[top]
@@ -124,7 +124,7 @@ def _visitor(tables: Tables, sensor: IntArray, place: IntArray, step: int, j: in
 
 @inlined
 def lateness(tables: Tables, sensor: IntArray, place: IntArray, j: int) -> np.float32:
-    """The price of a sensor's lateness under some actions."""
+    """The price of a sensor's overdue visits under some actions."""
     late, total = tables.late, np.float32(0.0)
     for end in range(len(late)):
         price = late[0, end, j]
@@ -267,7 +267,7 @@ def gain(tables: Tables, current: CurrentPlan, new: Proposal) -> np.float32:
 
 @inlined
 def copy(current: CurrentPlan | Proposal, new: CurrentPlan | Proposal) -> None:
-    """Write actions over others."""
+    """Copy a plan's actions."""
     for step in range(current.sensor.shape[0]):
         for uav in range(current.sensor.shape[1]):
             new.sensor[step, uav] = current.sensor[step, uav]
@@ -277,7 +277,7 @@ def copy(current: CurrentPlan | Proposal, new: CurrentPlan | Proposal) -> None:
 
 @inlined
 def accept(tables: Tables, current: CurrentPlan, new: Proposal) -> None:
-    """Take a proposal whose costs are computed."""
+    """Make a proposal, whose costs are computed, the current plan."""
     copy(new, current)
     for j in range(len(tables.start) - 1):
         if new.last[j] >= 0:

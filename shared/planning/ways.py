@@ -1,4 +1,4 @@
-"""The ways from the places where a plan leaves the UAVs to the sensors."""
+"""The UAVs' ways to the sensors after a plan's last step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def steps_to(good: NDArray[np.bool_], stride: int, sums: int, fastest: int) -> I
         fastest: the velocity.
 
     Returns:
-        more steps than any way has, where no good place follows.
+        the steps; more than any way has if no good place follows.
     """
     count = len(good)
     place = np.where(good, np.arange(count)[:, None], _NOWHERE)

@@ -11,7 +11,7 @@ from shared.world.scenario import Scenario
 
 
 class LearnedWorld(Wire):
-    """How a fleet's reports show that its world differs from the scenario's formulas."""
+    """A fleet's learned differences of its world from the scenario's formulas."""
 
     offset_db: float = Field(description="excess of the path loss over the formula's that all links share, dB")
     deviation_db: float = Field(description="standard deviation of the excess loss of a link never measured, dB")
@@ -20,17 +20,17 @@ class LearnedWorld(Wire):
         min_length=2, max_length=2, description="east and north, as a share of the way that the velocity commands"
     )
     dispersion: float = Field(description="the variance of arrivals over a Poisson's, at least 1; 1: no bursts")
-    failed_radios: list[int] = Field(description="sensors whose transmissions fail although their links hold")
+    failed_radios: list[int] = Field(description="sensors whose transmissions fail over good links")
     excess_db: dict[int, float] = Field(
         description="sensor: mean of its latest measured excess losses, dB, where that is more than 1 dB off"
     )
 
 
 class VisitDeadline(Wire):
-    """How one order to visit a sensor at least once in any ``visit_every`` steps was kept.
+    """The deadlines of one order to visit a sensor at least once in any ``visit_every`` steps.
 
     A deadline ends in each step whose last ``visit_every`` steps were flown under the order, and is met if the sensor
-    was visited in one of them. The steps are those that are over. A visit counts until its outcome says that it failed.
+    was visited in one of them. Only completed steps count. A visit counts until its outcome says that it failed.
     """
 
     sensor_id: int
@@ -70,7 +70,7 @@ class MissionStatus(Wire):
     learned: LearnedWorld | None = Field(
         None,
         exclude_if=lambda value: value is None,
-        description="how the world differs from the scenario's formulas; omitted where nothing shows that it does",
+        description="how the world differs from the scenario's formulas; omitted without evidence that it does",
     )
     deadlines: list[VisitDeadline] | None = Field(
         None,

@@ -1,10 +1,10 @@
-"""Errors on the wire: what every answer of the edge outside 2xx has in its body."""
+"""Errors on the wire: the body of every answer of the edge outside 2xx."""
 
 from __future__ import annotations
 
 from pydantic import BaseModel, Field
 
-# The type of the problem that the edge does not hold the omitted part of a report: the client is to send it in full.
+# The type of a problem with an omitted part of a report that the edge does not have: the client is to send all of it.
 INCOMPLETE = "urn:aicvds:problem:incomplete"
 
 

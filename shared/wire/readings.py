@@ -16,7 +16,7 @@ ReadingResult = Literal["merged", "duplicate", "outdated", "early"]
 
 
 class SensorReading(Received):
-    """What one sensor said of itself; its time is an age, or a step of the mission."""
+    """One sensor's own reading; its time is an age or a step of the mission."""
 
     sensor_id: SensorId
     queue: float = Field(ge=0, le=100_000, description="packets waiting")
@@ -26,7 +26,7 @@ class SensorReading(Received):
     )
     step: Step | None = Field(None, description="the step at whose start the queue was such")
     message_id: Annotated[str, Field(pattern=r"^[\x21-\x7e]{1,64}$")] | None = Field(
-        None, description="of the message that brought it: the same message counts once, however often it is sent"
+        None, description="of the reading's message: a repeated message counts once"
     )
 
     @model_validator(mode="after")
@@ -50,11 +50,11 @@ class ReadingsRequest(Received):
 
 
 class ReadingsResponse(Wire):
-    """What became of each reading, in the order of the request."""
+    """The result of each reading, in the order of the request."""
 
     results: list[ReadingResult] = Field(
         description="`merged` into the fleet's belief; `duplicate`: its message was merged before; `outdated`: a "
         "beacon, a reading or a visit of its step or a later one is known; `early`: no UAV of the mission has reported "
-        "yet, so that no age can be placed: send it again"
+        "yet: send it again"
     )
     step: Step | None = Field(description="the mission's newest step; null before its first report")

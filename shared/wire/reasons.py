@@ -27,7 +27,7 @@ Reason = Literal[
 LLM_NOT_ASKED: frozenset[Reason] = frozenset(
     {"mode_value", "mode_policy", "no_candidate", "llm_loading", "llm_unavailable", "llm_busy"}
 )
-# The LLM gets a prompt and gives no usable answer. In the reasons of neither class its answer is usable but overridden.
+# The LLM gets a prompt and gives no usable answer. For reasons of neither class, its answer is usable but overridden.
 LLM_FAILURES: frozenset[Reason] = frozenset(
     {"llm_timeout", "llm_status", "llm_error", "answer_format", "answer_sensor", "answer_velocity"}
 )

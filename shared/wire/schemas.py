@@ -50,18 +50,18 @@ Uplink = Literal["full", "delta", "pruned"]
 
 
 class Wire(BaseModel):
-    """Strict: no coercion between types, no NaN or infinity, no unknown field."""
+    """Strict models: no type coercion, no NaN or infinity, no unknown fields."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class Received(Wire):
-    """A model of a request: an object with far too many names gives one error, not one for each name.
+    """A request's model: an object with far too many fields gives one error, not one for each field.
 
-    From Python, numpy's arrays and numbers are taken too.
+    In Python, numpy arrays and numbers are accepted too.
     """
 
-    # The one that is named last runs first.
+    # The last one runs first.
     _plain = model_validator(mode="before")(plain)
     _few_names = model_validator(mode="before")(few_names)
 
@@ -69,9 +69,9 @@ class Received(Wire):
 class SensorColumns(Received):
     """One UAV's knowledge of the sensors: parallel arrays of 1 to 2,000 entries, all of the same length.
 
-    ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last
-    beacon) are all ``null`` for a sensor never heard, and none is for a sensor that was heard. ``x`` and ``y`` may both
-    be omitted for sensors whose positions any UAV of the mission has sent. Only a report with a ``base`` may be empty.
+    ``queue`` packets, ``battery`` joules, ``channel_gain`` dB and ``last_seen`` (the step of the last beacon) are all
+    ``null`` for a sensor never heard, and all set for any other. ``x`` and ``y`` may both be omitted for sensors whose
+    positions any UAV of the mission has sent. Only a report with a ``base`` may be empty.
     """
 
     id: Annotated[list[SensorId], Field(max_length=MAX_SENSORS, fail_fast=True, description="no duplicates")]
@@ -133,7 +133,7 @@ class Outcome(Received):
     decision_id: DecisionId
     cost: float = Field(ge=0, le=10_000, description="c, 0 is best; the value regression's target is -c")
     failed: bool = Field(False, description="the transmission failed (f = 1)")
-    # Omitted where it is not set, so that a request repeated after an upgrade is still the same request.
+    # Omitted if not set, so that a request repeated after an upgrade is still the same request.
     round_trip_ms: float | None = Field(
         None,
         ge=0,
@@ -152,18 +152,18 @@ class UavState(Received):
     progress_m: float | None = Field(
         None, ge=0, le=1e9, description="m along its trajectory, from its first waypoint (a circle's: due east)"
     )
-    # Both are omitted where they are not set, for the same reason as an outcome's round trip.
+    # Both are omitted if not set, for the same reason as an outcome's round trip.
     base: DecisionId | None = Field(
         None,
         exclude_if=lambda value: value is None,
         description="this UAV's last decision in this mission: `sensors` then has only the rows that differ from the "
         "report which that decision answered, if any. 409 of type `" + INCOMPLETE + "` if the edge "
-        "does not hold that report (any more): send the whole report",
+        "does not have that report (any more): send the whole report",
     )
     uplink: Literal["delta"] | None = Field(
         None,
         exclude_if=lambda value: value is None,
-        description="`delta`: the edge is to hold this report, so that the UAV's next report may name the decision as "
+        description="`delta`: the edge is to keep this report, so that the UAV's next report may name the decision as "
         "its `base`; a `base` implies `delta`",
     )
     sensors: SensorColumns
@@ -178,7 +178,7 @@ class UavState(Received):
 
 
 class DecideRequest(UavState):
-    """``POST /decide``: which sensor, and how fast?"""
+    """``POST /decide``: one UAV's report, answered by its next sensor and velocity."""
 
     mission_id: MissionId = "default"
     step: Step
@@ -304,7 +304,7 @@ PromptFormat = Literal["csv", "compact"]
 
 
 class PromptStyle(Received):
-    """The prompt's form of the sensors.
+    """The form of the prompt.
 
     ``shuffled`` draws a new order of the rows for every step and UAV, from the mission's seed. Experiences are appended
     until there are too many; ``selection`` then chooses the ones that stay. ``demonstrations`` are worked examples in
@@ -332,8 +332,8 @@ class PromptStyle(Received):
 class MissionSpec(Received):
     """``PUT /missions/{id}``: the world that a fleet flies in and how it decides.
 
-    ``attention`` off is the paper's baseline: the prompt has every admissible sensor, in the request's
-    order. Mode ``value`` decides by attention alone, and always uses it.
+    ``attention`` off is the paper's baseline: the prompt has every admissible sensor, in the request's order. Mode
+    ``value`` always uses attention.
     """
 
     scenario: Annotated[str, Field(max_length=32)] | Scenario = Field(
@@ -373,14 +373,14 @@ class MissionSpec(Received):
 
 
 class Readiness(Wire):
-    """``GET /readyz``: whether the edge can decide, and its present decider."""
+    """``GET /readyz``: whether the edge can decide, and its present mode."""
 
     ready: bool
     decides: Source
     llm: Literal["loading", "ready", "degraded", "unavailable", "off"] = Field(
-        description="degraded: it answers, and its answers cannot be used"
+        description="degraded: its answers cannot be used"
     )
     model: str | None = None
     standing_by: int = Field(0, description="further healthy LLM servers")
-    constraint: str | None = Field(None, description="how the server holds the LLM to the answer's form")
+    constraint: str | None = Field(None, description="how the server constrains the LLM to the answer's form")
     detail: str | None = None

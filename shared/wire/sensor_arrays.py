@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from shared.wire.schemas import SensorColumns
 
 _KEPT = "arrays"
-# What stands for a beacon's queue, battery, gain and step where there was none.
+# Queue, battery, gain and step of a missing beacon.
 _NO_BEACON = np.array([[0.0], [0.0], [0.0], [-1.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorArrays:
-    """What a report says of n sensors; nothing may change the arrays.
+    """A report's data of n sensors; the arrays are read-only.
 
     ``ids`` ``(n,)``; ``places`` ``(n, 2)``, m; ``queue`` packets, ``battery`` J and ``gain`` dB ``(n,)``, 0 for a
     sensor never heard; ``beacon`` ``(n,)``, the step of the last beacon, -1 for none.
@@ -32,8 +32,8 @@ class SensorArrays:
 
 
 def arrays_of(sensors: SensorColumns) -> SensorArrays:
-    """The columns as arrays; they have to have positions, and no copy with other columns is made of them afterwards."""
-    # Beside the model's fields, as functools.cached_property would keep them: the wire's models are read without numpy.
+    """The columns as arrays. They need positions, and ``model_copy`` must not change them afterwards."""
+    # Cached in the instance's __dict__, as functools.cached_property does: the wire's models do not import numpy.
     known: SensorArrays | None = sensors.__dict__.get(_KEPT)
     if known is None:
         known = sensors.__dict__[_KEPT] = _arrays(sensors)

@@ -76,7 +76,7 @@ class Links:
     """Transfers at horizontal distances ``(...)``, metres, with the path loss ``(...)``, dB, computed once.
 
     ``share``, ``(...)`` or one number, is a link's own share of the rate, besides the scenario's ``link_share``; a link
-    without any share holds no transfer.
+    without any share moves no packets.
     """
 
     distance_m: FloatArray
@@ -150,7 +150,7 @@ def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.in
     """Whole packets that one step can move at that distance; 0 where the link fails."""
     d = np.asarray(distance_m, dtype=np.float64)
     packets = np.zeros(d.shape, dtype=np.int64)
-    # The path loss takes most of the time, and of many sensors most are out of radio range.
+    # Most of many sensors are out of radio range, and the path loss takes most of the time.
     near = d <= scenario.radio_radius_m
     packets[near] = Links.at(d[near], scenario).packets
     return packets

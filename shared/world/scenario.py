@@ -20,7 +20,7 @@ _MAX_ARRIVALS = 10_000_000
 
 
 class Scenario(Unmodelled):
-    """One world's numbers. The defaults are the scenario ``paper``.
+    """The parameters of one world. The defaults are the scenario ``paper``.
 
     Lengths are in metres, times in seconds unless a field says steps, powers in watts,
     energies in joules, path losses in dB (the channel gain is minus the path loss).

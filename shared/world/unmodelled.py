@@ -1,4 +1,4 @@
-"""How a world differs from the model that the edge plans with: fields of a scenario that only the simulator reads."""
+"""Differences of a world from the edge's planning model: fields of a scenario that only the simulator reads."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def _off(value: Any, **bounds: Any) -> Any:
 
 
 class Unmodelled(BaseModel):
-    """What the mean path loss, steady Poisson arrivals and ``velocity x step_s`` leave out; by default nothing.
+    """Deviations from the mean path loss, steady Poisson arrivals and ``velocity x step_s``; none by default.
 
-    The edge receives these fields with the scenario and must not read them: it has to learn from beacons, outcomes and
-    positions what they do.
+    The edge receives these fields with the scenario and must not read them: it has to learn their effects from beacons,
+    outcomes and positions.
     """
 
     shadowing_db: float = _off(

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from simulator.bound.solver import News, Plan
     from simulator.world.environment import PipelineWorld
 
-# Of each flight tried in wind: the steps of its plans (None: all that are left), and the deterministic seconds of each
-# search. Now the one, now the other loses fewer packets.
+# For each flight tried in wind: the steps of its plans (None: all remaining ones), and the deterministic seconds of
+# each search. Neither is always better.
 _CHASES = ((10, 0.3), (None, 3.0))
 
 
@@ -41,7 +41,7 @@ def clairvoyant(
 
     Raises:
         RuntimeError: the world lost another number of packets than the plan, so one of the two is wrong.
-        ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
+        ModuleNotFoundError: OR-Tools is not installed (extra ``bound``).
         Interrupted: by Ctrl-C, with the best plan so far.
     """
     from simulator.bound.solver import least_loss
@@ -91,7 +91,7 @@ def _reset(site: Site, seed: int) -> PipelineWorld:
 
 
 def _chased(world: PipelineWorld, steps: int | None, work: float) -> NDArray[np.int64]:
-    """Fly a world in wind with all of it known, each step by a plan of the next ones, and return the actions."""
+    """Fly a fully known world in wind, each step by a plan of the next ones, and return the actions."""
     from simulator.bound.solver import Budget, plan
 
     actions = []

@@ -5,12 +5,12 @@ from __future__ import annotations
 from simulator.records.summary import LossBound
 from simulator.sites.site import Site
 
-# UAVs x sensors x steps. Merely to write down a world of scenario `dense`, with 30,000, takes half a minute.
+# UAVs x sensors x steps. With 30,000, as in scenario `dense`, building the model already takes half a minute.
 MOST_CHOICES = 6_000
 
 
 def mission_bound(site: Site, seed: int, steps_flown: int, time_limit_s: float) -> LossBound | str:
-    """The fewest packets that a fleet could have lost in this world, or why that is not known.
+    """The fewest packets that a fleet could have lost in this world, or the reason why that is unknown.
 
     Args:
         site: the scenario, and its trace if it has one.

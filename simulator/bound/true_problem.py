@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from shared.planning.fleet_problem import FleetProblem
     from simulator.world.environment import PipelineWorld
 
-# The largest distance, in metres, between two places of one stretch of way whose links are compared.
+# The largest distance between two compared places of one stretch of way, metres.
 _SPACING_M = 5.0
 
 
 def true_problem(world: PipelineWorld, steps: int | None = None) -> FleetProblem:
     """The next steps, by default all that are left, from the world's present state.
 
-    Where the world differs from the model, ``links`` has the packets of the true links; a UAV that has left has none.
-    In wind the links are those at the places that the mean wind lets a UAV reach; gusts are left out, and
+    Where the world differs from the model, ``links`` has the packets of the true links; a UAV that has departed has
+    none. In wind the links are those at the places that the mean wind lets a UAV reach; gusts are left out, and
     :func:`velocities_towards` makes up for the next step's.
     """
     end = world.scenario.steps if steps is None else min(len(world.tally) + steps, world.scenario.steps)

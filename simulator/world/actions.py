@@ -12,7 +12,7 @@ from shared.world.scenario import Scenario
 
 
 def checked_actions(actions: Mapping[str, ArrayLike], agents: Mapping[str, int], scenario: Scenario) -> IntArray:
-    """The actions of all agents as ``(I, 2)`` integers: sensor, velocity; zeros for UAVs that are no longer there.
+    """The actions of all agents as ``(I, 2)`` integers: sensor, velocity; zeros for UAVs that have departed.
 
     ``agents`` has the UAV of each live agent.
 

@@ -1,4 +1,4 @@
-"""What fails during a mission: radios, UAVs, and a share of the links."""
+"""The faults of a mission: dead radios, departing UAVs, and a lower share of the links' rate."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Faults:
         return cls(scenario, dies_at, departs_at, np.asarray(drops_at))
 
     def present(self, instant: int) -> NDArray[np.bool_]:
-        """Whether each UAV is still there at that instant, ``(I,)`` or ``(B, I)``."""
+        """Whether each UAV is still in the mission at that instant, ``(I,)`` or ``(B, I)``."""
         return np.asarray(instant < self.departs_at)
 
     def share(self, instant: int) -> FloatArray | float:

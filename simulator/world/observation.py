@@ -1,4 +1,4 @@
-"""What a UAV observes of the world, and what a step of the fleet comes to."""
+"""A UAV's observation of the world, and the result of a step of the fleet."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class Sensors:
         return cls(positions, rates, queue, arrivals, queue.copy(), battery, lost)
 
     def copy(self) -> Self:
-        """The same sensors, to be served independently of these."""
+        """A copy of the sensors, to be served independently."""
         return replace(self, queue=self.queue.copy(), battery=self.battery.copy(), lost=self.lost.copy())
 
     def arrive(self, step: int, capacity: int) -> IntArray:

@@ -1,4 +1,4 @@
-"""Random numbers that belong to an instant of a world: the same whenever and in whatever order they are asked for."""
+"""Random numbers of an instant of a world, which do not depend on the time and order of the calls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How one world, or a batch of worlds, differs from the model that an edge plans with."""
+"""The differences of one world, or a batch of worlds, from an edge's planning model."""
 
 from __future__ import annotations
 

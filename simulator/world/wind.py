@@ -14,7 +14,7 @@ from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory
 from simulator.world.step_noise import StepNoise
 
-# Half of the chord, in metres, whose direction is that of the way.
+# Half of the chord that gives the direction of the way, metres.
 _HALF_CHORD_M = 0.5
 
 
@@ -51,7 +51,7 @@ class Wind:
         return np.asarray(still * self._stretch(along))
 
     def stretch(self, progress_m: FloatArray, paths: Sequence[Trajectory]) -> FloatArray:
-        """What the mean wind makes of a metre of way at a progress ``(..., I)``, 0..2."""
+        """The metres flown in the mean wind per metre in still air at a progress ``(..., I)``, 0..2."""
         return self._stretch(self.along_mps(progress_m, paths))
 
     def _stretch(self, along_mps: FloatArray) -> FloatArray:
