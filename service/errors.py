@@ -47,7 +47,7 @@ class Misdirected(Refused):
     """Another edge owns the mission: the client is to send the request there.
 
     Attributes:
-        owner: that edge's URL; None where it gave none.
+        owner: that edge's URL; None if it gave none.
         retry_s: seconds until its lease ends, unless it is renewed. After that any edge may take over the mission.
     """
 

@@ -98,7 +98,7 @@ class KeyFile(BaseModel):
         return shown
 
     def remove(self, name: str) -> None:
-        """Remove the key of that name; raises ``BadKeys`` where there is none."""
+        """Remove the key of that name; raises ``BadKeys`` if there is none."""
         left = [key for key in self.keys if key.name != name]
         if len(left) == len(self.keys):
             raise BadKeys(f"there is no key {name}")

@@ -31,7 +31,7 @@ def attention_of(mission: Mission) -> MissionAttention:
 
 
 def attention_response(mission: Mission, known_tags: str | None, encodings: str) -> Response:
-    """The mission's attention, or 304 where the client already has it.
+    """The mission's attention, or 304 if the client already has it.
 
     The ETag is a hash of the body. A count of updates would not do: after a crash it may recur with other weights.
 

@@ -81,7 +81,7 @@ class KeyAuthentication:
         await refusal(scope, receive, send)
 
     def _wait(self, key: ApiKey) -> int | None:
-        """Seconds until the key's next request is allowed; None where this one is, which then counts."""
+        """Seconds until the key's next request is allowed; None if this one is, which then counts."""
         limiter = self._limiters.get(key.per_minute)
         if limiter is None:
             window, quota = RateLimiterType.SLIDING_WINDOW.value, per_min(key.per_minute)
@@ -92,7 +92,7 @@ class KeyAuthentication:
 
 
 def _presented(headers: Sequence[tuple[bytes, bytes]]) -> str:
-    """The bearer token; empty where the request has none or several."""
+    """The bearer token; empty if the request has none or several."""
     given = [value for name, value in headers if name.lower() == b"authorization"]
     if len(given) != 1:
         return ""

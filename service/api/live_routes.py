@@ -31,7 +31,7 @@ STATIC = Path(live.__file__).parent / "static"
 _SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'; object-src 'none'",
-    # The browser validates each time, and gets 304 where nothing changed.
+    # The browser validates each time, and gets 304 if nothing changed.
     "Cache-Control": "no-cache",
 }
 _MOST_LISTED = 200
@@ -134,7 +134,7 @@ async def list_missions(engine: TheEngine, request: Request) -> MissionList:
 # Not in the schema: an endless stream, which its first event describes.
 @router.get("/missions/{mission_id}/events", include_in_schema=False, dependencies=[Depends(_listener)])
 async def events(mission_id: MissionId, engine: TheEngine, request: Request) -> EventStream:
-    """A mission's events: ``snapshot``, then ``update`` at most ten times a second; ``gone`` where it is deleted.
+    """A mission's events: ``snapshot``, then ``update`` at most ten times a second; ``gone`` if it is deleted.
 
     :mod:`service.live.snapshots` makes them. Comments are sent while there are no events; a slow listener gets a
     snapshot.

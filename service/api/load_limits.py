@@ -1,4 +1,4 @@
-"""Limits on requests: their number at once, and the time and the size of a body, before and after decompression."""
+"""Limits on requests: their concurrency, and the time and size of a body, before and after decompression."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Damaged(Exception):
 
 
 class RequestLimits:
-    """Pure ASGI middleware: bounds the requests at once, and reads their bodies.
+    """Pure ASGI middleware: limits concurrent requests, and reads their bodies.
 
     Past ``most`` concurrent requests it answers 503 with ``Retry-After``, without reading the body. Probes, metrics and
     the streams of pages do not count. A request counts until its answer begins, because a client may read slowly. It
@@ -123,7 +123,7 @@ class RequestLimits:
         return response
 
     async def _read(self, receive: Receive, content_length: bytes) -> bytes | None:
-        """The body; None where the client disconnected before its end."""
+        """The body; None if the client disconnected before its end."""
         if content_length.isdigit() and int(content_length) > self._limit:
             raise _TooLarge
         body = bytearray()

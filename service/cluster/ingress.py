@@ -40,7 +40,7 @@ class OwnersGone(Exception):
 
 
 class Owners(Protocol):
-    """The edges of a cluster; each method raises :class:`OwnersGone` where there is no answer in time."""
+    """The edges of a cluster; each method raises :class:`OwnersGone` if there is no answer in time."""
 
     async def ask(self, request: Exchanged, within_s: float) -> Answer:
         """The answer of the edge to which the mission's ID maps; of any edge without a mission."""

@@ -87,7 +87,7 @@ def main(argv: list[str]) -> int:
     host = f"[{args.host}]" if ":" in args.host else args.host
     url = f"http://{host}:{listener.getsockname()[1]}"
     try:
-        # The system queues requests from here on. /healthz answers at once, the other routes once torch is loaded.
+        # The system queues requests from here on. /healthz answers immediately, the other routes once torch is loaded.
         print(f"aicvds serve: listening on {url}, loading", file=sys.stderr, flush=True)
         # Nearly every object made while loading stays, and collecting garbage would take a tenth of the time.
         gc.disable()
@@ -167,7 +167,7 @@ def _serve_cluster(listener: socket.socket, settings: Settings, ray: str, least:
 
 
 def _bounds(replicas: str) -> tuple[int, int] | None:
-    """The least and the most of ``--replicas``; None where it is malformed."""
+    """The bounds of ``--replicas``; None if it is malformed."""
     least, _, most = replicas.partition("-")
     if not (least.isdecimal() and (most or least).isdecimal()):
         return None

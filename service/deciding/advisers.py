@@ -97,7 +97,7 @@ def look_ahead(state: State, reach: Reach, reserved: Collection[int], guidance: 
     the nearest.
 
     Args:
-        reach: of this state, as :meth:`State.reach_ahead` has it.
+        reach: of this state, by :meth:`State.reach_ahead`.
         reserved: sensors that other UAVs have in this step.
         guidance: adds to the worth; a velocity that it forbids is never flown.
 

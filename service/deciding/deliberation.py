@@ -51,7 +51,7 @@ class LlmAdvice:
     Attributes:
         prompt: of a query about several UAVs, this UAV's share of it; the first UAV's share has the static block and
             the experiences too, and the whole query's ``completion``.
-        probabilities: by action; None where the LLM gave none, for the ``reason``.
+        probabilities: by action; None if the LLM gave none, for the ``reason``.
         calibrated: whether the LLM's bias towards labels is known.
         model: the LLM's name, if it is known.
     """
@@ -64,7 +64,7 @@ class LlmAdvice:
     model: str | None
 
     def over(self, actions: Sequence[Action]) -> FloatArray | None:
-        """The probabilities of these actions, ``(n,)``; None where the LLM gave none for any of them.
+        """The probabilities of these actions, ``(n,)``; None if the LLM gave none for any of them.
 
         The probability of a velocity that is not among them goes to the sensor's nearest: the operator may have
         forbidden it since.
@@ -144,10 +144,10 @@ class Deliberation:
         calibrated: bool,
         reserved: Collection[int] = (),
     ) -> Conclusion | None:
-        """Weigh the advice; None where every candidate's sensor is reserved.
+        """Weigh the advice; None if every candidate's sensor is reserved.
 
         Args:
-            llm: the LLM's probabilities of the candidates, ``(n,)``; None where it gave none.
+            llm: the LLM's probabilities of the candidates, ``(n,)``; None if it gave none.
             calibrated: whether the LLM's bias towards labels is known.
             reserved: sensors that other UAVs have reserved meanwhile.
         """
@@ -209,7 +209,7 @@ class Deliberation:
 
 
 def template_of(mission: Mission) -> GuidedTemplate:
-    """The mission's prompt template; raises ``TypeError`` where it flies in another mode."""
+    """The mission's prompt template; raises ``TypeError`` if it flies in another mode."""
     if not isinstance(mission.template, GuidedTemplate):
         raise TypeError(f"mission {mission.mission_id} flies in mode {mission.mode}, not guided")
     return mission.template

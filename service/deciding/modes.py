@@ -41,7 +41,7 @@ class Mode(Protocol):
     """One mode of decision.
 
     Attributes:
-        plan_share: the share of the time left that the planner may take; None where the mode needs no plan.
+        plan_share: the share of the time left that the planner may take; None if the mode needs no plan.
         plan_first: whether the plan is one of the mode's advisers, so that the state is taken after it.
     """
 
@@ -205,7 +205,7 @@ class GuidedMode(PolicyMode):
 
 
 def _evaluation_of(result: asyncio.Future[Evaluation]) -> Evaluation | None:
-    """The evaluation; None where it is late or failed."""
+    """The evaluation; None if it is late or failed."""
     if not result.done() or result.cancelled():
         return None
     try:

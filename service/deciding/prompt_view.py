@@ -22,7 +22,7 @@ class PromptView:
     Attributes:
         state, reach: as the prompt shows them. The compact prompt has the orders in them, as queues; the reach is None
             where it is the state's own.
-        offered: the reach that the candidates' velocities are chosen by; None where it is the state's own.
+        offered: the reach by which the candidates' velocities are chosen; None if it is the state's own.
         guidance: the guidance for the candidates' velocities in this step.
         added: shape ``(J,)``, packets to add to the worth of each sensor as attention chooses the prompt's rows; None
             where there are no orders.

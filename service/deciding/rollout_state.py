@@ -36,11 +36,11 @@ class RolloutState:
         arrived, watched: shape ``(n,)``, shape and rate of the Gamma belief of the packets a step.
         dispersion: the variance of the packets of a step over a Poisson's.
         bursts: shape ``(horizon, n)``, packets above the rate that are expected in each step.
-        links: by UAV, shape ``(horizon x max_velocity + 1, n)``: the packets that the UAV can move over a link that
-            holds, by the sum of its velocities so far.
+        links: by UAV, shape ``(horizon x max_velocity + 1, n)``: the packets that the UAV can move over a working link,
+            by the sum of its velocities so far.
         margins: by UAV, of the same shape: the link's path loss below the threshold, in standard deviations of its
             uncertainty; empty if the links are certain.
-        holds: by UAV, of the same shape: the probability that the link holds; empty if the links are certain.
+        holds: by UAV, of the same shape: the probability that the link works; empty if the links are certain.
         alive: shape ``(n,)``, the probability that each sensor's radio works.
         decided: the velocities of the UAVs that already have a decision in this step.
         reserved: shape ``(n,)``, sensors that other UAVs have in this step.

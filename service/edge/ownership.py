@@ -19,7 +19,7 @@ from service.storage.store import cause
 
 log = logging.getLogger(__name__)
 
-# Leases are renewed so many times a term; after a failure sooner.
+# Renewals of the leases per term, and after a failure.
 _ROUNDS, _ROUNDS_FAILING = 3, 10
 
 
@@ -96,7 +96,7 @@ class LeasedOwnership:
         self._failure: str | None = None
         self._loop = asyncio.get_running_loop()
         self._ending = threading.Event()
-        # A daemon: the end of the edge does not wait for a database that hangs.
+        # A daemon: the end of the edge does not wait for a hanging database.
         threading.Thread(target=self._keep_renewing, name="leases", daemon=True).start()
 
     @property

@@ -186,7 +186,7 @@ class StoredMissions:
         log.warning("mission %s: another edge has taken it over", mission_id)
 
     async def _read(self, function: Callable[..., T], *args: Any) -> T:
-        """Run a function in the reader's thread; raises ``Unavailable`` where the store fails."""
+        """Run a function in the reader's thread; raises ``Unavailable`` if the store fails."""
         try:
             return await asyncio.get_running_loop().run_in_executor(self._reading, function, *args)
         except SQLAlchemyError as error:

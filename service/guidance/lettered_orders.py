@@ -31,7 +31,7 @@ class NoteReading:
     """What a note was read as.
 
     Attributes:
-        doubts: sentences about what may be wrong; empty where nothing is known to be.
+        doubts: sentences about what may be wrong; empty if nothing is known to be.
     """
 
     guidance: Guidance

@@ -20,7 +20,7 @@ class OperatorGuidance:
 
     Attributes:
         confirmed: the guidance that planner and scores follow; empty until the operator confirms one.
-        orders: the same; None where it orders nothing.
+        orders: the same; None if it orders nothing.
     """
 
     def __init__(self, note: str | None, scenario: Scenario) -> None:

@@ -76,8 +76,8 @@ def _grammar(orders: Sequence[str], available: Counter[int]) -> str:
     """GBNF in which no number is used more often than it is available, as ``parse_orders`` requires.
 
     Each rule is a state: the numbers that are left and the sensors that are already named. A breadth-first search finds
-    the states. Where a note has so many numbers that there would be too many rules, a fixed grammar allows more orders,
-    and ``parse_orders`` refuses the wrong ones.
+    the states. If a note has too many numbers for a limited number of rules, a fixed grammar allows more orders, and
+    ``parse_orders`` refuses the wrong ones.
     """
     start = _GrammarState(frozenset(available.items()))
     index = {start: 0}
@@ -112,7 +112,7 @@ class _GrammarState:
     sensors: frozenset[int] = frozenset()
 
     def after(self, order: str) -> _GrammarState | None:
-        """The state after one more order; None where the order uses a number too often."""
+        """The state after one more order; None if the order uses a number too often."""
         words, numbers = parse_order(order)
         sensors = frozenset(numbers[:1]) if words in (VISIT, WEIGHT) else frozenset[int]()
         # Several orders may name the same sensor, each with another property; its number is used once.

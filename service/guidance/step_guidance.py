@@ -22,7 +22,7 @@ class StepGuidance:
         allowed: shape ``(V,)``, whether the operator allows the level.
         due: shape ``(V, J)``, whether a visit of the sensor is due in this step, and the level brings it in reach.
         worth: shape ``(V, J)``, packets to add to the LLM-free policy's worth: ``(w_j - 1) U_j packets``, plus W where
-            due, which exceeds the worth of everything else in reach. ``-inf`` where the level is not allowed.
+            due, which exceeds the worth of everything else in reach. ``-inf`` if the level is not allowed.
     """
 
     allowed: NDArray[np.bool_]

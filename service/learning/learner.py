@@ -71,7 +71,7 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state; raises ``ValueError`` where it belongs to modules of another preset or other levels."""
+        """Restore a state; raises ``ValueError`` if it belongs to modules of another preset or other levels."""
         flat = self._layout.flat
         self.weights = Weights(self._layout, flat(list(state["weights"].values())))
         adam = [state["adam"][index] for index in sorted(state["adam"])]

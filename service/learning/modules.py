@@ -168,7 +168,7 @@ class Layout:
         return Parameters(*(flat[start:end].reshape(shape) for start, end, shape in places))
 
     def flat(self, parameters: Sequence[Array]) -> Array:
-        """The flat array of parameters in the modules' order; raises ``ValueError`` where they have other shapes."""
+        """The flat array of parameters in the modules' order; raises ``ValueError`` if they have other shapes."""
         if [p.shape for p in parameters] != list(self._shapes):
             raise ValueError(f"the parameters do not have the shapes of preset {self.preset} at these velocity levels")
         return np.concatenate([np.ravel(p) for p in parameters])

@@ -162,7 +162,7 @@ class Broadcaster:
         self.changed(mission.mission_id)
 
     def forget(self, mission_id: str) -> None:
-        """Forget a deleted mission, and tell its listeners."""
+        """Forget a deleted mission, and notify its listeners."""
         self.history.forget(mission_id)
         self._watch.forget(mission_id)
         if (stream := self._streams.pop(mission_id, None)) is not None:
@@ -181,7 +181,7 @@ class Broadcaster:
 
     @contextmanager
     def listener(self) -> Iterator[None]:
-        """A listener's slot; raises ``Unavailable`` where none is free."""
+        """A listener's slot; raises ``Unavailable`` if none is free."""
         if self._listeners >= MAX_LISTENERS or self._closing:
             raise Unavailable("mission_id", f"{MAX_LISTENERS} pages listen already: close one")
         self._listeners += 1
@@ -192,7 +192,7 @@ class Broadcaster:
 
     @asynccontextmanager
     async def sending(self) -> AsyncIterator[None]:
-        """The time limit around sending; raises ``TimeoutError`` where the listener does not read."""
+        """The time limit around sending; raises ``TimeoutError`` if the listener does not read."""
         async with asyncio.timeout(_LAST_S if self._closing else _STALLED_S) as limit:
             self._sending.add(limit)
             try:

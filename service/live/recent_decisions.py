@@ -89,7 +89,7 @@ class RecentDecisions:
         return [decision for decision in self._decisions.values() if decision.mission_id == mission_id]
 
     def find(self, mission_id: str, decision_id: str) -> RecentDecision | None:
-        """The mission's decision; None where it is unknown or forgotten."""
+        """The mission's decision; None if it is unknown or forgotten."""
         decision = self._decisions.get(decision_id)
         return decision if decision is not None and decision.mission_id == mission_id else None
 

@@ -51,7 +51,7 @@ class TokenPosition:
 
 
 def raised(probabilities: Mapping[str, float], exponent: float) -> dict[str, float]:
-    """``p ** exponent``, renormalised: above 1 nearer to a choice of the likeliest. Empty where all are 0."""
+    """``p ** exponent``, renormalised: above 1 nearer to a choice of the likeliest. Empty if all are 0."""
     powers = {token: p**exponent for token, p in probabilities.items()}
     total = sum(powers.values())
     return {token: p / total for token, p in powers.items()} if total else {}
@@ -63,7 +63,7 @@ class Completion:
 
     Attributes:
         prompt_tokens: of the server's ``usage``, as ``cached_tokens`` and ``completion_tokens``; None if missing.
-        positions: of the text's tokens; empty where the server gives no probabilities.
+        positions: of the text's tokens; empty if the server gives no probabilities.
         model: name of the model that answered.
     """
 

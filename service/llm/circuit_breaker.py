@@ -65,13 +65,13 @@ class SilenceCounter:
         self._silent_s = 0.0
         self.answered_at = self._counted_until = -math.inf
 
-    def cancelled(self, begun: float, now: float) -> bool:
+    def cancelled(self, started: float, now: float) -> bool:
         """Count a call that was cancelled while it waited; returns whether this completes a failure."""
-        if self.answered_at > begun:
+        if self.answered_at > started:
             return False
         if self.answered_at > self._counted_until:
             self._silent_s = 0.0
-        self._silent_s += now - max(begun, self._counted_until)
+        self._silent_s += now - max(started, self._counted_until)
         self._counted_until = now
         if self._silent_s < self._failure_s:
             return False

@@ -177,7 +177,7 @@ def _probabilities(likeliest: Any) -> dict[str, float]:
 
 
 def _proxy_to(url: str) -> dict[str, Any]:
-    """aiohttp's arguments for the proxy that the environment names for a URL; empty where it names none."""
+    """aiohttp's arguments for the proxy that the environment names for a URL; empty if it names none."""
     target = httpx.URL(url)
     proxies = getproxies()
     named = proxies.get(target.scheme) or proxies.get("all")

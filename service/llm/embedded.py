@@ -35,7 +35,7 @@ class EmbeddedServer:
             ends in ``+`` and the adapter's.
         orders: a LoRA adapter that is applied only to requests for notes.
         context: tokens, which the slots share evenly.
-        slots: requests served at once, each with its own prefix cache. With one slot, the static block and the
+        slots: requests served concurrently, each with its own prefix cache. With one slot, the static block and the
             experiences are one prefix for the whole fleet.
 
     Attributes:

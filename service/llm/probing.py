@@ -100,7 +100,7 @@ async def _answers_lists(client: LLMClient, model: str | None, constraint: Const
 
 
 async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
-    """The answer to a probe, None where it fails; raises :class:`Unreachable`."""
+    """The answer to a probe, None if it fails; raises :class:`Unreachable`."""
     try:
         return await client.complete(body)
     except Unreachable:

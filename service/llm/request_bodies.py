@@ -36,7 +36,7 @@ class WarmUp:
     """The first request: the server processes the static block before a decision has to wait for it.
 
     Attributes:
-        labels: labels of the answer; None where the answer is a sensor and a velocity.
+        labels: labels of the answer; None if the answer is a sensor and a velocity.
     """
 
     static: str

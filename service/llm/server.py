@@ -170,7 +170,7 @@ class LlmServer:
 
     async def _decide(self, mission_id: str, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
         """Call for a decision, and count its result; ``silence`` counts the wait of a cancelled call."""
-        begun = time.monotonic()
+        started = time.monotonic()
         try:
             with self._priority.decision():
                 answer = await self._ask(body, mission_id)
@@ -183,7 +183,7 @@ class LlmServer:
         except asyncio.CancelledError as cancelled:
             if silence is None or EARLIER_CALL_ANSWERED in cancelled.args:
                 raise
-            if silence.cancelled(begun, time.monotonic()):
+            if silence.cancelled(started, time.monotonic()):
                 self._failed("llm_timeout")
             raise
         if self._breaker.troubled:

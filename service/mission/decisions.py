@@ -25,7 +25,7 @@ class Pending(NamedTuple):
 
     Attributes:
         seen: the chosen sensor's row at the decision.
-        sample: the training sample; None where the modules had no part in the decision.
+        sample: the training sample; None if the modules had no part in the decision.
     """
 
     decision_id: str
@@ -94,11 +94,11 @@ class PendingDecisions:
         self.max_step_cost = float(scenario.uavs + scenario.sensors)
 
     def knows(self, decision_id: str) -> bool:
-        """Whether the decision waits for its outcome, or has it."""
+        """Whether the decision's outcome is pending or applied."""
         return decision_id in self._decisions or decision_id in self.applied
 
     def waits_for(self, step: int) -> bool:
-        """Whether a decision of the step waits for its outcome."""
+        """Whether a decision of the step has a pending outcome."""
         return any(pending.step == step for pending in self._decisions.values())
 
     def find(self, outcome: Outcome) -> Literal["pending", "applied"]:

@@ -218,7 +218,7 @@ class Mission:
         return sample
 
     def learn(self, sample: Sample, cost: float) -> float | None:
-        """Train on one sample; returns the loss before the update, None where the learner fails."""
+        """Train on one sample; returns the loss before the update, None if the learner fails."""
         try:
             return self.learner.update(sample, cost)
         except Exception:

@@ -42,7 +42,7 @@ def status_of(mission: Mission) -> MissionStatus:
 
 
 def learned_world(belief: FleetBelief) -> LearnedWorld | None:
-    """How the world differs from the scenario's formulas; None where nothing yet shows that it does."""
+    """How the world differs from the scenario's formulas; None if nothing yet shows that it does."""
     channel, dispersion = belief.channel, belief.arrivals.dispersion
     if channel.by_formula and belief.drift.none and dispersion == 1.0:
         return None

@@ -41,7 +41,7 @@ NEAREST = 1
 class Experience:
     """A past decision: its line in the prompt, its cost, and the chosen row's attention features ``(d,)``, each 0..1.
 
-    ``features`` is None where the modules had no part in the decision; `similar` ignores such an experience.
+    ``features`` is None if the modules had no part in the decision; `similar` ignores such an experience.
     """
 
     line: str

@@ -104,7 +104,7 @@ class GuidedTemplate(Template):
         def write(rows: Sequence[int], letters: str, options: Sequence[Sequence[int]]) -> str:
             text = ""
             for letter, cell, own in zip(letters, cells(state, rows), options, strict=True):
-                # Leaving out a slowest velocity of 0, as most rows have it, saves two tokens.
+                # Omitting a slowest velocity of 0, as in most rows, saves two tokens.
                 span = f"{own[0]}-{own[-1]}" if 0 < own[0] < own[-1] else own[-1]
                 text += f"{letter}{cell['queue']},{cell['age']},{span}\n"
             return text

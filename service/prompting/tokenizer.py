@@ -62,7 +62,7 @@ def encoding(cache_dir: Path) -> tiktoken.Encoding:
 
 
 def _unpacked(path: Path) -> dict[str, Any] | None:
-    """The file that :func:`encoding` packed; None where it is missing or damaged."""
+    """The file that :func:`encoding` packed; None if it is missing or damaged."""
     try:
         content = path.read_bytes()
     except OSError:

@@ -46,7 +46,7 @@ class _CommitState(Enum):
     PAUSING = "pausing"
     # `close` was called while a transaction ran. One that fails is tried once more.
     DRAINING = "draining"
-    # A transaction runs that began after `close` was called. If it fails, the queue is given up.
+    # A transaction runs that began after `close` was called. If it fails, the queue is abandoned.
     FINISHING = "finishing"
     # No further transaction begins.
     CLOSED = "closed"
@@ -73,7 +73,7 @@ class GroupCommit:
         self._added = self._written = 0
         # The changes of the transaction that runs, and its beginning.
         self._batch: list[tuple[int, Change]] = []
-        self._begun = 0.0
+        self._started_at = 0.0
         # Ends LINGERING or PAUSING.
         self._timer: asyncio.TimerHandle | None = None
         self._pause_s = _FIRST_PAUSE_S
@@ -164,7 +164,7 @@ class GroupCommit:
             checkpoint_bytes += len(entry[1].state) if isinstance(entry[1], Checkpoint) else 0
             if checkpoint_bytes > _MOST_BYTES:
                 break
-        self._begun = time.perf_counter()
+        self._started_at = time.perf_counter()
         try:
             self._writer.write([change for _, change in self._batch], self._written_or_failed)
         except Exception as error:
@@ -201,13 +201,13 @@ class GroupCommit:
 
     def _go_on_closing(self) -> None:
         assert self._closed is not None
-        given_up = self._failure is not None and self._state is _CommitState.FINISHING
-        if given_up and self._queue:
+        abandoned = self._failure is not None and self._state is _CommitState.FINISHING
+        if abandoned and self._queue:
             log.error(
                 "the last write to the store failed: %d changes are not on disk, no acknowledged outcome among them",
                 len(self._queue),
             )
-        if given_up or not self._queue or self._closed.done():
+        if abandoned or not self._queue or self._closed.done():
             self._end()
         else:
             self._begin(_CommitState.FINISHING)
@@ -225,7 +225,7 @@ class GroupCommit:
 
     def _succeed(self) -> None:
         """Take the durable changes from the queue."""
-        self._metrics.store_seconds.observe(time.perf_counter() - self._begun)
+        self._metrics.store_seconds.observe(time.perf_counter() - self._started_at)
         last = self._batch[-1][0]
         # `supersede` may have inserted a checkpoint among them, which is not durable yet.
         durable = {id(change) for _, change in self._batch}

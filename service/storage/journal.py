@@ -25,11 +25,11 @@ from shared.kit.bounded import BoundedDict
 
 log = logging.getLogger(__name__)
 
-# Events between two checkpoints of a mission: replaying so many takes a fraction of a second. A decision about many
+# Events between two checkpoints of a mission: replaying them takes a fraction of a second. A decision about many
 # sensors takes longer to replay, and counts for one more event every hundred sensors.
 _EVENTS = 512
 _SENSORS = 100
-# From so many sensors on, packing a checkpoint takes up to a second.
+# From this number of sensors on, packing a checkpoint takes up to a second.
 _LARGE = 1000
 # Lost leases that are remembered for requests in progress.
 _MOST_LOST = 10_000

@@ -93,7 +93,7 @@ class LeaseHolder:
 class Leases:
     """The leases of one owner; its methods may be called from any thread, and wait for the database.
 
-    Every method raises ``sqlalchemy.exc.SQLAlchemyError`` where the database fails.
+    Every method raises ``sqlalchemy.exc.SQLAlchemyError`` if the database fails.
     """
 
     def __init__(self, engine: sa.Engine) -> None:

@@ -39,7 +39,7 @@ def framed(message: Any) -> bytes:
 
 
 def identity(file: str) -> str:
-    """The device and the inode of a file; empty where there is none."""
+    """The device and the inode of a file; empty if there is none."""
     try:
         found = os.stat(file)
     except OSError:

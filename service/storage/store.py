@@ -106,7 +106,7 @@ class Store:
             return db.scalar(sa.select(missions.c.mission_id).where(missions.c.mission_id == mission_id)) is not None
 
     def load(self, mission_id: str) -> StoredMission | None:
-        """A stored mission, or None; raises ``ValueError`` where it is damaged."""
+        """A stored mission, or None; raises ``ValueError`` if it is damaged."""
         with self._engine.connect() as db:
             found = db.execute(sa.select(missions).where(missions.c.mission_id == mission_id)).first()
             if found is None:
@@ -165,7 +165,7 @@ class Store:
 
 
 def _version(db: sa.Connection) -> str | None:
-    """The schema's version, None for an empty database; raises ``StoreUnusable`` where this program cannot read it."""
+    """The schema's version, None for an empty database; raises ``StoreUnusable`` if this program cannot read it."""
     known = sa.inspect(db).has_table("alembic_version")
     version: str | None = db.scalar(sa.text("SELECT version_num FROM alembic_version")) if known else None
     if version is not None and version > SCHEMA:

@@ -39,7 +39,7 @@ class ThreadWriter:
         self._engine = engine
         self._connection: sa.PoolProxiedConnection | None = None
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        # A daemon: the end of the edge does not wait for a database that hangs.
+        # A daemon: the end of the edge does not wait for a hanging database.
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()
 

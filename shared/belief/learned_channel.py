@@ -16,7 +16,7 @@ from shared.world.scenario import Point, Scenario
 
 # Rings around a UAV whose links by the formula are computed once. In the scenarios, all but nine have equal links.
 _RINGS = 1024
-# A link that holds with at least this probability counts as one.
+# The least probability of working from which a link counts as one.
 LIKELY = 0.5
 # The rate share is the median of this many informative visits: with bursty arrivals, one visit proves nothing.
 _SHARE_VISITS = 5
@@ -39,8 +39,8 @@ class ExpectedLinks:
 
     Attributes:
         distance: horizontal, metres.
-        packets: that a step can move if the link holds; 0 where it is most unlikely to.
-        hold: the probability that each link holds, 0..1.
+        packets: that a step can move if the link holds; 0 if it is most unlikely to.
+        hold: the probability that each link works, 0..1.
         margin: how many standard deviations the path loss lies below the threshold; None: the loss is certain.
     """
 
@@ -61,7 +61,7 @@ class ExpectedLinks:
 
     @property
     def likely(self) -> IntArray:
-        """``packets`` where the link is likely to hold, else 0."""
+        """``packets`` if the link is likely to hold, else 0."""
         return np.asarray(np.where(self.hold >= LIKELY, self.packets, 0))
 
 
@@ -174,7 +174,7 @@ class LearnedChannel:
         return packets, margin
 
     def packets(self, position: Point, place: FloatArray, sensor: int, *, held: bool) -> int:
-        """Packets that a step moves from a sensor to a UAV here, if the link held or probably holds, else 0.
+        """Packets that a step moves from a sensor to a UAV here, if the link worked or probably works, else 0.
 
         0 too for a sensor of unknown position.
         """

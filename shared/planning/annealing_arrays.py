@@ -33,7 +33,7 @@ class Tables(NamedTuple):
 
     Attributes:
         moved: shape ``(U, 1 or H, C, J)``, the levels that a transfer moves.
-        chance: of the same shape, the probability that its link holds.
+        chance: of the same shape, the probability that its link works.
         start: shape ``(J, Q)``, the odds of each level before the first step.
         arrive: shape ``(H, J, Q)``, of a step's arrivals, in levels.
         counted: shape ``(H, J)``, the number of these that are not negligible.
@@ -47,7 +47,7 @@ class Tables(NamedTuple):
         fixed: shape ``(U,)``, the number of each UAV's first actions that stay.
         reached: shape ``(U, 1 or H, C, R)``, the sensors in reach, and after them -1.
         late: shape ``(H + 1, H + 1, J)``, or empty.
-        emptied: shape ``(Q, Q)``, 1 for the levels that a transfer of so many levels empties, which are not empty.
+        emptied: shape ``(Q, Q)``, by the levels of a transfer, 1 for the nonzero levels that it empties.
     """
 
     moved: IntArray
@@ -78,7 +78,7 @@ class Tables(NamedTuple):
         no_stages = np.zeros((problem.uavs, moved.shape[2], problem.sensors), dtype=np.int64)
         late = np.empty((0, 0, problem.sensors)) if problem.late is None else problem.late
         everywhere = np.ones((problem.horizon, problem.sensors), dtype=np.bool_)
-        # P(at least so many levels), and from the level before the arrivals the levels left.
+        # By the level before the arrivals: the probability that they fill the queue.
         at_least = chains.arrive[..., ::-1].cumsum(axis=-1, dtype=np.float64)
         counted = np.count_nonzero(at_least > _NEXT_TO_NOTHING, axis=-1)
         return cls(
@@ -190,7 +190,7 @@ class Proposal(NamedTuple):
 
 
 def _links(problem: FleetProblem, most: int) -> tuple[IntArray, Floats]:
-    """The levels that transfers move, at most so many, and their chances, ``(U, 1 or H, C, J)``."""
+    """The levels that transfers move, at most ``most``, and their chances, ``(U, 1 or H, C, J)``."""
     assert problem.chains is not None
     sums = np.arange(problem.horizon * problem.scenario.max_velocity + 1)
     same = problem.links is None or all(len(table) == 1 for table in problem.links)

@@ -232,7 +232,7 @@ class GuidanceStatus(Wire):
     origin: Literal["llm", "operator"] | None = Field(None, description="the author of the structure")
     model: str | None = Field(None, description="the LLM that compiled the note")
     failure: str | None = Field(None, description="why the note could not be compiled")
-    doubts: list[str] = Field([], description="what may be wrong with the LLM's reading; empty where it is certain")
+    doubts: list[str] = Field([], description="what may be wrong with the LLM's reading; empty if it is certain")
     begins: list[str] = Field([], description="the orders that begin when `guidance` is confirmed, each in words")
     ends: list[str] = Field([], description="the orders in force that end when `guidance` is confirmed, each in words")
     begun: list[str] = Field([], description="the orders that began when those in force last changed, each in words")

@@ -47,7 +47,7 @@ _NEGLIGIBLE = 0.003
 # By run of the search: from the better start (0) or the worse one, and its first temperature as a share of their loss.
 _RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
 # Packets: the least first temperature; the expected loss after the first run from which more runs are worth it; and the
-# better start's expected loss from which all runs begin at once.
+# better start's expected loss from which all runs start together.
 _LEAST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.1, 1.0
 
 

@@ -147,7 +147,7 @@ def rate_bps(distance_m: ArrayLike, scenario: Scenario) -> FloatArray:
 
 
 def packets_per_step(distance_m: ArrayLike, scenario: Scenario) -> NDArray[np.int64]:
-    """Whole packets that one step can move at that distance; 0 where the link fails."""
+    """Whole packets that one step can move at that distance; 0 if the link fails."""
     d = np.asarray(distance_m, dtype=np.float64)
     packets = np.zeros(d.shape, dtype=np.int64)
     # Most of many sensors are out of radio range, and the path loss takes most of the time.
