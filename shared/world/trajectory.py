@@ -14,6 +14,8 @@ from shared.world.scenario import Point, Scenario
 
 # The largest error of a reported position, metres: five standard deviations of a poor receiver.
 _POSITION_ERROR_M = 25.0
+# The largest distance from a trajectory that counts as on it, metres.
+_TOLERANCE_M = 10.0
 
 
 class Trajectory(Protocol):
@@ -121,18 +123,15 @@ def trajectories(scenario: Scenario) -> tuple[Trajectory, ...]:
     return tuple(Circle(centre, scenario.lap_radius_m) for centre in scenario.lap_centres)
 
 
-def progress_of(
-    trajectory: Trajectory, position: Point, reported_m: float | None = None, tolerance_m: float = 10.0
-) -> float | None:
+def progress_of(trajectory: Trajectory, position: Point, reported_m: float | None = None) -> float | None:
     """A UAV's progress along its trajectory, metres; ``None`` for a UAV off its trajectory.
 
     Args:
         position: metres.
         reported_m: the UAV's own report of its progress, which counts if the trajectory passes its position there, up
             to the error of a position. It decides between the ways there and back.
-        tolerance_m: the largest distance from the trajectory that counts as on it.
     """
     if reported_m is not None and math.dist(trajectory.at(reported_m), position) <= _POSITION_ERROR_M:
         return reported_m
     progress, gap = trajectory.locate(position)
-    return progress if gap <= tolerance_m else None
+    return progress if gap <= _TOLERANCE_M else None
