@@ -61,11 +61,8 @@ class AttendedState:
             watch: takes the times of the stages ``augment`` and ``attend``.
         """
         watch = watch or Stopwatch()
-        reserved, obeyed, scenario = (
-            mission.reservations.of_others(step, uav.uav_id),
-            mission.guidance.orders,
-            mission.scenario,
-        )
+        orders, scenario = mission.guidance.orders, mission.scenario
+        reserved = mission.reservations.of_others(step, uav.uav_id)
         state = augment(
             uav,
             step,
@@ -77,9 +74,9 @@ class AttendedState:
             belief=mission.belief if mission.belief_source == "fleet" else None,
         )
         guidance = None
-        if obeyed is not None:
+        if orders is not None:
             reach = state.reach_ahead(uav.uav_id, scenario)
-            guidance = StepGuidance.of(obeyed, state, reach, step, mission.records.visits, scenario)
+            guidance = StepGuidance.of(orders, state, reach, step, mission.records.visits, scenario)
         view = PromptView.of(mission, state, uav.uav_id, step, guidance)
         watch.ended.append(("augment", perf_counter()))
         admissible: list[int] = np.flatnonzero(state.admissible).tolist()

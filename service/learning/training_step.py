@@ -78,15 +78,8 @@ def _descend(
     width = weights.query.shape[0]
     scale = np.float32(1.0 / math.sqrt(width))
     p, dp = by_sensor[0], by_sensor[1]
-    q, wide, attended, h, dh, mixed, dz = (
-        by_width[0],
-        by_width[1],
-        by_width[2],
-        by_width[3],
-        by_width[4],
-        by_width[5],
-        by_width[6],
-    )
+    q, wide, attended, h = by_width[0], by_width[1], by_width[2], by_width[3]
+    dh, mixed, dz = by_width[4], by_width[5], by_width[6]
     # Forward, the chosen sensor's row: s = w z + b with z = W_v sum_i p_i x_i, p = softmax(q K^T / sqrt(d')).
     _product(weights.query, x[chosen], q)
     _transposed_product(weights.key, q, scale, mixed)

@@ -81,12 +81,8 @@ def _arrive(tables: Tables, new: Proposal, step: int, j: int, odds: Floats, afte
         then[q] = 0.0
     # Four terms at a time, so that the sums are read and written less often.
     for a in range(0, tables.counted[step, j], 4):
-        none, one, two, three = (
-            odds[LEVELS - a :],
-            odds[LEVELS - a - 1 :],
-            odds[LEVELS - a - 2 :],
-            odds[LEVELS - a - 3 :],
-        )
+        none, one = odds[LEVELS - a :], odds[LEVELS - a - 1 :]
+        two, three = odds[LEVELS - a - 2 :], odds[LEVELS - a - 3 :]
         p, r, s, t = arrive[a], arrive[a + 1], arrive[a + 2], arrive[a + 3]
         for q in range(len(arrive)):
             then[q] += (p * none[q] + r * one[q]) + (s * two[q] + t * three[q])
