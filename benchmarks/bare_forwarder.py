@@ -1,29 +1,18 @@
 """A minimal Python service: a FastAPI application that forwards JSON with httpx and returns the answer.
 
-python benchmarks/bare_forwarder.py --port 9010 --upstream http://127.0.0.1:9009/v1
+python -m benchmarks.bare_forwarder 9010 http://127.0.0.1:9009/v1
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import httpx
-import tyro
 import uvicorn
 from fastapi import FastAPI, Request
-
-
-@dataclass(frozen=True)
-class Forwarder:
-    """Serve until SIGTERM."""
-
-    port: int
-    """Port on loopback."""
-    upstream: str
-    """An OpenAI-compatible server, up to and including /v1."""
 
 
 def forwarder(upstream: str) -> FastAPI:
@@ -49,5 +38,4 @@ def forwarder(upstream: str) -> FastAPI:
 
 
 if __name__ == "__main__":
-    options = tyro.cli(Forwarder, description=__doc__)
-    uvicorn.run(forwarder(options.upstream), host="127.0.0.1", port=options.port, log_level="warning", access_log=False)
+    uvicorn.run(forwarder(sys.argv[2]), host="127.0.0.1", port=int(sys.argv[1]), log_level="warning", access_log=False)

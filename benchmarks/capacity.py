@@ -1,6 +1,6 @@
 """What a decision costs in processor time and commits, and what that predicts of several edges on one PostgreSQL.
 
-    python benchmarks/capacity.py
+    python -m benchmarks.capacity
 
 It starts a PostgreSQL and edges of mode ``value`` on it. One edge at full load shows what a decision costs the edge,
 the database and the client. From these costs it predicts the decisions a second of several edges at full load, where
@@ -21,28 +21,26 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import psycopg
-import tyro
-from fleet import UAVS, Flown, Radio, at_once, paced
-from processor_time import processor_s
-from ratios import ratio_of_medians, shown
-from rich.console import Console
-from rich.table import Table
 from sqlalchemy import create_engine
 
+from benchmarks.harness import ROOT, Cell, Goal, Options, Report, Server, edge, in_turn, instant_llm, processor_s, run
+from benchmarks.missions import UAVS, Flown, Radio, at_once, paced
+from lab.experiments.intervals import ratio_of_medians
 from service.storage.leases import Leases
-from shared.client.edge_client import EdgeClient
 from shared.kit.cores import usable_cores
-from simulator.flying.local_edge import HOST, edge_process, usable_port
 
+# Of a decision with the leases' fence to one without.
+GOAL_FENCE = 1.1
 # What `python` reads at its start: the same edge without the check of its leases in each transaction.
 _UNFENCED = """
 from service.storage.leases import Leases
@@ -54,8 +52,8 @@ _RENEWALS = 10
 
 
 @dataclass(frozen=True)
-class Capacity:
-    """Measure the costs, and hold the predictions against measurements."""
+class Capacity(Options):
+    """Measure the costs, and compare the predictions with measurements."""
 
     edges: tuple[int, ...] = (1, 2)
     """Numbers of edges at full load; the first one's costs predict the others' decisions a second."""
@@ -75,24 +73,6 @@ class Capacity:
     """Connections that commit small transactions at once."""
     leases: int = 3334
     """Leases that one edge renews."""
-    out: Path = Path("runs/capacity.json")
-    """Where to write."""
-
-
-@dataclass(frozen=True)
-class Used:
-    """Processor seconds by party, commits and bytes of PostgreSQL's log since the start, or between two times."""
-
-    seconds: float
-    edge_s: float
-    database_s: float
-    client_s: float
-    commits: float
-    log_bytes: float
-
-    def since(self, before: Used) -> Used:
-        """The difference."""
-        return Used(*(now - then for now, then in zip(asdict(self).values(), asdict(before).values(), strict=True)))
 
 
 class Database:
@@ -107,7 +87,7 @@ class Database:
         self.url = str(self._server.get_uri())
         if (process := self._server.get_pid()) is None:
             raise RuntimeError("PostgreSQL did not start")
-        self.process = process
+        self.process = psutil.Process(process)
 
     def counters(self) -> tuple[float, float]:
         """Commits, and bytes of the log."""
@@ -125,96 +105,93 @@ class Database:
             self._server.cleanup()
 
 
+Used = dict[str, float]
+
+
 class Site:
-    """Edges on one PostgreSQL, and their missions.
+    """Edges on one PostgreSQL; they import from the folder ``patch``, if there is one, before anything else."""
 
-    Args:
-        patch: a folder with a ``sitecustomize.py`` for the edges; None: as they are.
-    """
-
-    def __init__(
-        self, stack: ExitStack, folder: Path, database: Database, edges: int, patch: Path | None = None
-    ) -> None:
+    def __init__(self, stack: ExitStack, database: Database, edges: int = 1, patch: Path | None = None) -> None:
         self._database = database
-        settings = {"AICVDS_STORE": database.url, "AICVDS_MODE": "value", "AICVDS_LOG_LEVEL": "error"}
-        environment = {**os.environ, **settings, **({"PYTHONPATH": str(patch)} if patch else {})}
-        self.ports, self._processes = [], []
-        for _ in range(edges):
-            port = usable_port(0)
-            process = stack.enter_context(edge_process(port, folder / f"{port}.log", environment))
-            with EdgeClient(f"http://{HOST}:{port}", timeout_s=60) as client:
-                client.wait_ready(120)
-            self.ports.append(port)
-            self._processes.append(process.pid)
-
-    def missions(self, port: int, count: int) -> list[Flown]:
-        """New missions of one edge."""
-        radio = Radio(port, 0)
-        made = [Flown(f"{port}-{time.monotonic_ns()}-{number}") for number in range(count)]
-        for mission in made:
-            radio.post(f"/missions/{mission.name}", {"mode": "value"}, "PUT")
-        return made
+        settings = {"STORE": database.url, "MODE": "value", "LOG_LEVEL": "error"}
+        path = {"PYTHONPATH": os.pathsep.join(map(str, (patch, ROOT)))} if patch else {}
+        self.edges = [stack.enter_context(edge(settings, variables=path)) for _ in range(edges)]
 
     def used(self) -> Used:
-        """Since the start."""
+        """Seconds, processor seconds by party, commits and bytes of PostgreSQL's log, all since the start."""
         commits, log_bytes = self._database.counters()
-        edge = sum(processor_s(process) for process in self._processes)
-        database = processor_s(self._database.process)
-        return Used(time.perf_counter(), edge, database, time.process_time(), commits, log_bytes)
+        return {
+            "seconds": time.perf_counter(),
+            "edge_s": sum(edge.processor_s() for edge in self.edges),
+            "database_s": processor_s(self._database.process),
+            "client_s": time.process_time(),
+            "commits": commits,
+            "log_bytes": log_bytes,
+        }
+
+    def used_since(self, before: Used) -> Used:
+        """What was used between two times."""
+        return {name: now - before[name] for name, now in self.used().items()}
+
+
+def missions(edge: Server, count: int) -> list[Flown]:
+    """New missions of one edge."""
+    radio = Radio(edge, 0)
+    return [radio.made(f"{edge.port}-{time.monotonic_ns()}-{number}") for number in range(count)]
 
 
 def low_pace(site: Site, args: Capacity) -> dict[str, float]:
     """What one decision costs at a low pace, beyond what the parties use idle."""
-    (port,) = site.ports
-    radios, missions = [Radio(port, seed) for seed in range(4)], site.missions(port, args.missions)
-    paced(radios, missions, UAVS * args.missions, 4 * args.pace, True)
+    (edge,) = site.edges
+    radios, flown = [Radio(edge, seed) for seed in range(4)], missions(edge, args.missions)
+    paced(radios, flown, UAVS * args.missions, 4 * args.pace, True)
     # PostgreSQL reports its commits with a delay of up to a second.
     time.sleep(2.0)
     before = site.used()
     time.sleep(args.seconds)
-    idle = site.used()
+    calm, before = site.used_since(before), site.used()
     count = int(args.pace * args.seconds)
-    took = paced(radios, missions, count, args.pace, True)
+    took = paced(radios, flown, count, args.pace, True)
     time.sleep(2.0)
-    after = site.used()
-    calm, busy = idle.since(before), after.since(idle)
-    found = {"decisions": float(count), "p50_ms": float(np.median(took))}
-    for name, value in asdict(busy).items():
-        if name != "seconds":
-            found[name] = (value - asdict(calm)[name] * busy.seconds / calm.seconds) / count
-    return found
+    busy = site.used_since(before)
+    share = busy.pop("seconds") / calm["seconds"]
+    found = {name: (value - calm[name] * share) / count for name, value in busy.items()}
+    return {"decisions": float(count), "p50_ms": float(np.median(took)), **found}
 
 
 def full_load(site: Site, args: Capacity) -> dict[str, float]:
     """Decisions a second where every connection waits for nothing but its answers."""
-    share = len(site.ports)
-    fleets = {port: site.missions(port, args.missions // share) for port in site.ports}
-    radios = {port: [Radio(port, seed) for seed in range(max(1, args.connections // share))] for port in site.ports}
+    share = len(site.edges)
+    fleets = [missions(edge, args.missions // share) for edge in site.edges]
+    radios = [[Radio(edge, seed) for seed in range(max(1, args.connections // share))] for edge in site.edges]
     took: list[float] = []
-    ends = [0.0]
 
-    def fly(port: int) -> None:
-        while time.perf_counter() < ends[0]:
-            took.extend(at_once(radios[port], [partial(_decided, mission) for mission in fleets[port]]))
+    def fly(index: int, ends: float) -> None:
+        while time.perf_counter() < ends:
+            took.extend(at_once(radios[index], [partial(_decided, mission) for mission in fleets[index]]))
 
-    for warm in (True, False):
-        ends[0] = time.perf_counter() + (2.0 if warm else args.seconds)
+    for seconds in (2.0, args.seconds):
         took.clear()
-        before = site.used()
-        threads = [threading.Thread(target=fly, args=(port,)) for port in site.ports]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    used = site.used().since(before)
-    a_decision = {name: value / len(took) for name, value in asdict(used).items() if name != "seconds"}
+        before, ends = site.used(), time.perf_counter() + seconds
+        together([partial(fly, index, ends) for index in range(share)])
+    used = site.used_since(before)
+    lasted = used.pop("seconds")
     return {
-        "decisions_a_s": len(took) / used.seconds,
-        "cores_used": (used.edge_s + used.database_s + used.client_s) / used.seconds,
+        "decisions_a_s": len(took) / lasted,
+        "cores_used": (used["edge_s"] + used["database_s"] + used["client_s"]) / lasted,
         "p50_ms": float(np.median(took)),
         "p99_ms": float(np.percentile(took, 99)),
-        **a_decision,
+        **{name: value / len(took) for name, value in used.items()},
     }
+
+
+def together(work: Sequence[Callable[[], None]]) -> None:
+    """Do all of the work, each in a thread."""
+    threads = [threading.Thread(target=each) for each in work]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
 
 
 def _decided(mission: Flown, radio: Radio) -> float:
@@ -228,19 +205,17 @@ def predicted(cost: dict[str, float], edges: int, cores: int) -> float:
 
 def with_and_without_fence(folder: Path, database: Database, args: Capacity) -> dict[str, Any]:
     """Medians of a decision's milliseconds in blocks that follow each other, with the fence and without."""
-    patch = folder / "patch"
-    patch.mkdir()
-    (patch / "sitecustomize.py").write_text(_UNFENCED)
-    took: dict[str, list[float]] = {"fence": [], "none": []}
+    (folder / "sitecustomize.py").write_text(_UNFENCED)
+
+    def block(site: Site) -> Callable[[int], float]:
+        (edge,) = site.edges
+        fleet, radios = missions(edge, args.missions), [Radio(edge, seed) for seed in range(3)]
+        return lambda _: float(np.median(paced(radios, fleet, 150, args.pace, True)))
+
     with ExitStack() as stack:
-        sites = {"fence": Site(stack, folder, database, 1), "none": Site(stack, folder, database, 1, patch)}
-        fleets = {name: site.missions(site.ports[0], args.missions) for name, site in sites.items()}
-        radios = {name: [Radio(site.ports[0], seed) for seed in range(3)] for name, site in sites.items()}
-        for block in range(-1, args.rounds):
-            for name in sorted(took, reverse=bool(block % 2)):
-                found = paced(radios[name], fleets[name], 150, args.pace, True)
-                if block >= 0:
-                    took[name].append(float(np.median(found)))
+        variants = {"fence": block(Site(stack, database))}
+        variants["none"] = block(Site(stack, database, patch=folder))
+        took = in_turn(variants, args.rounds, warm_up=1, alternate=True)
     return {"p50_ms": took, "ratio": ratio_of_medians(took["fence"], took["none"])}
 
 
@@ -248,46 +223,26 @@ def modes(folder: Path, args: Capacity) -> dict[str, dict[str, float]]:
     """An edge's processor seconds a decision, by mode: flights in scenario ``paper`` with SQLite and an instant LLM."""
     found = {}
     for mode, planner in (("value", "on"), ("llm", "off"), ("llm", "on"), ("guided", "off"), ("guided", "on")):
-        name = f"{mode}, planner {planner}"
-        with _llm() as url, ExitStack() as stack:
-            port, edge = usable_port(0), folder / name
-            edge.mkdir()
-            settings = {"STORE": str(edge / "m.db"), "MODE": mode, "PLANNER": planner, "LLM_URL": url}
-            environment = {**os.environ, **{f"AICVDS_{key}": value for key, value in settings.items()}}
-            process = stack.enter_context(edge_process(port, edge / "log", environment))
-            command = [
-                sys.executable,
-                "-m",
-                "shared.kit.command_line",
-                "simulate",
-                "--edge",
-                f"http://{HOST}:{port}",
-                "--no-bound",
-            ]
+        with (
+            instant_llm() as llm,
+            edge({"MODE": mode, "PLANNER": planner, "LLM_URL": f"{llm.url}/v1", "LOG_LEVEL": "info"}) as server,
+        ):
+            program = [sys.executable, "-m", "shared.kit.command_line"]
+            command = [*program, "simulate", "--edge", server.url, "--no-bound", "--await-llm", "on"]
             used, began, decisions = 0.0, 0.0, 0
             # The first flight loads what is loaded late.
             for flight in range(args.flights + 1):
                 if flight == 1:
-                    used, began = -processor_s(process.pid), time.perf_counter()
-                options = ["--seed", str(flight), "--await-llm", "on", "--out", str(edge / str(flight))]
-                subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL)
-                summary = json.loads((edge / str(flight) / "summary.json").read_text())
-                decisions += summary["decisions"] if flight else 0
-            used += processor_s(process.pid)
-            found[name] = {"edge_s": used / decisions, "decisions_a_s": decisions / (time.perf_counter() - began)}
+                    used, began = server.processor_s(), time.perf_counter()
+                out = folder / f"{mode}-{planner}-{flight}"
+                subprocess.run(
+                    [*command, "--seed", str(flight), "--out", str(out)], check=True, stdout=subprocess.DEVNULL
+                )
+                decisions += json.loads((out / "summary.json").read_text())["decisions"] if flight else 0
+            edge_s = (server.processor_s() - used) / decisions
+            rate = decisions / (time.perf_counter() - began)
+            found[f"{mode}, planner {planner}"] = {"edge_s": edge_s, "decisions_a_s": rate}
     return found
-
-
-@contextmanager
-def _llm() -> Iterator[str]:
-    port = usable_port(0)
-    script = Path(__file__).with_name("instant_llm.py")
-    process = subprocess.Popen([sys.executable, str(script), "--port", str(port)], stdout=subprocess.DEVNULL)
-    try:
-        yield f"http://{HOST}:{port}/v1"
-    finally:
-        process.terminate()
-        process.wait()
 
 
 def commits(database: Database, writers: Sequence[int], seconds: float) -> dict[str, float]:
@@ -305,11 +260,7 @@ def commits(database: Database, writers: Sequence[int], seconds: float) -> dict[
                     db.execute("INSERT INTO small (content) VALUES (%s)", (content,))
                     done[index] += 1
 
-        threads = [threading.Thread(target=write, args=(index,)) for index in range(count)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        together([partial(write, index) for index in range(count)])
         found[str(count)] = sum(done) / seconds
     return found
 
@@ -328,21 +279,21 @@ def renewal(database: Database, count: int) -> dict[str, float]:
     return {"leases": count, "seconds": took / _RENEWALS, "database_s": used / _RENEWALS}
 
 
-def main(args: Capacity) -> int:
-    """Measure, print, write."""
-    console, cores = Console(), usable_cores()
-    found: dict[str, Any] = {"command": sys.argv, "cores": cores, "full": {}}
+def measure(args: Capacity) -> Report:
+    """Measure costs and loads on one PostgreSQL, then the modes."""
+    cores, full = usable_cores(), dict[int, dict[str, float]]()
+    found: dict[str, Any] = {"cores": cores, "full": full}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         database = Database(folder / "postgres")
         try:
             if args.pace:
                 with ExitStack() as stack:
-                    found["low"] = low_pace(Site(stack, folder, database, 1), args)
+                    found["low"] = low_pace(Site(stack, database), args)
             for edges in args.edges:
                 with ExitStack() as stack:
-                    found["full"][edges] = measured = full_load(Site(stack, folder, database, edges), args)
-                measured["predicted_a_s"] = predicted(found["full"][args.edges[0]], edges, cores)
+                    full[edges] = full_load(Site(stack, database, edges), args)
+                full[edges]["predicted_a_s"] = predicted(full[args.edges[0]], edges, cores)
             if args.pace and args.rounds:
                 found["lease"] = with_and_without_fence(folder, database, args)
             found["renewal"] = renewal(database, args.leases)
@@ -351,39 +302,33 @@ def main(args: Capacity) -> int:
             database.close()
         if args.flights:
             found["modes"] = modes(folder, args)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
-    _tell(console, found)
-    return 0
+    fence = "p50 of a decision with the leases' fence, to one without"
+    return Report(found, tables(found), [Goal(fence, found["lease"]["ratio"], GOAL_FENCE)] if "lease" in found else [])
 
 
-def _tell(console: Console, found: dict[str, Any]) -> None:
-    names = ("edge_s", "database_s", "client_s", "commits", "log_bytes")
-    table = Table("a decision costs", "edge ms", "database ms", "client ms", "commits", "log kB", title="Mode value")
+def tables(found: dict[str, Any]) -> dict[str, dict[str, dict[str, Cell]]]:
+    """For the reader."""
+    units = {"edge_s": 1e3, "database_s": 1e3, "client_s": 1e3, "commits": 1.0, "log_bytes": 1e-3}
+    names = ("edge ms", "database ms", "client ms", "commits", "log kB")
     loads = {"low pace": found["low"]} if "low" in found else {}
     loads |= {f"{edges} edges, full load": told for edges, told in found["full"].items()}
-    for load, told in loads.items():
-        scaled = [told[name] * (1e3 if name.endswith("_s") else 1e-3 if name == "log_bytes" else 1) for name in names]
-        table.add_row(load, *(f"{value:.2f}" for value in scaled))
-    console.print(table)
-    names = ("predicted_a_s", "decisions_a_s", "cores_used", "p50_ms", "p99_ms")
-    table = Table(
-        "edges", *(name.replace("_", " ") for name in names), title=f"Full load, {found['cores']} cores for all"
-    )
-    for edges, told in found["full"].items():
-        table.add_row(str(edges), *(f"{told[name]:.1f}" for name in names))
-    console.print(table)
-    if "lease" in found:
-        console.print(f"a decision with the leases' fence to one without, p50: {shown(found['lease']['ratio'])}")
-    told = ", ".join(f"{rate:.0f} with {writers}" for writers, rate in found["commits_a_s"].items())
-    console.print(f"small transactions a second, by connections: {told}")
-    renewed = found["renewal"]
-    console.print(
-        f"{renewed['leases']} leases renewed: {renewed['seconds']:.3f} s, {renewed['database_s']:.3f} processor s"
-    )
-    for mode, told in found.get("modes", {}).items():
-        console.print(f"mode {mode}: {1e3 * told['edge_s']:.1f} processor ms a decision")
+    rates = ("predicted_a_s", "decisions_a_s", "cores_used", "p50_ms", "p99_ms")
+    renewed = {"seconds": found["renewal"]["seconds"], "database s": found["renewal"]["database_s"]}
+    return {
+        "A decision costs, mode value": {
+            load: {name: told[key] * unit for name, (key, unit) in zip(names, units.items(), strict=True)}
+            for load, told in loads.items()
+        },
+        f"Full load, {found['cores']} cores for all": {
+            f"{edges} edges": {name: told[name] for name in rates} for edges, told in found["full"].items()
+        },
+        "Small transactions, by connections": {n: {"a second": rate} for n, rate in found["commits_a_s"].items()},
+        "Renewal": {f"{found['renewal']['leases']} leases": renewed},
+        "An edge's processor time": {
+            mode: {"ms a decision": 1e3 * told["edge_s"]} for mode, told in found.get("modes", {}).items()
+        },
+    }
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Capacity, description=__doc__)))
+    run(Capacity, measure)

@@ -1,7 +1,7 @@
 """One SHA-256 for each flight, to prove that a change of the code changes no decision and no loss.
 
-    python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/before.json
-    python benchmarks/flight_hashes.py --seeds 0 1 2 --out runs/after.json --against runs/before.json
+    python -m benchmarks.flight_hashes --seeds 0 1 2 --out runs/before.json
+    python -m benchmarks.flight_hashes --seeds 0 1 2 --out runs/after.json --against runs/before.json
 
 It starts `aicvds serve` with no LLM and a store of its own, and flies every scenario in modes `value`, `policy` and
 `guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order of the flight, each
@@ -20,15 +20,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
-import shutil
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,6 +30,7 @@ from typing import Any, NamedTuple
 import httpx
 import tyro
 
+from benchmarks.harness import edge
 from shared.client.edge_client import EdgeClient
 from simulator.commands.options import site_from_options
 from simulator.flying.flight import fly
@@ -51,6 +46,9 @@ MODES = ("value", "policy", "guided")
 ON_BOARD = ("eof", "wqcs", "mpc")
 FIELDS = ("step", "uav_id", "sensor_id", "velocity", "source", "reason", "failed", "cost", "lost_packets")
 DEADLINE_MS = 60_000
+# An answer waits for the store, and so for learning from its request's outcome. Without a store the next request may
+# overtake learning on a busy machine.
+SETTINGS = {"MODE": "value", "PLANNER_MS": "60000"}
 # Reasons of decisions that a clock caused.
 LATE = {"critic_timeout", "llm_timeout", "llm_busy", "edge_refused", "edge_protocol"}
 
@@ -97,11 +95,11 @@ def main(options: Hashes) -> int:
     flights: dict[str, dict[str, Any]] = {}
     differ = []
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    with serving() as url:
+    with edge(SETTINGS) as server:
         for seed in options.seeds:
             for course in chosen:
                 began = time.monotonic()
-                flight = flown(course, seed, options.steps, url)
+                flight = flown(course, seed, options.steps, server.url)
                 name = f"{course}, {flight.steps_flown} steps, seed {seed}"
                 flights[name] = told(flight, name)
                 took = time.monotonic() - began
@@ -156,39 +154,6 @@ def _over(url: str, course: Course, site: Site, seed: int) -> Flight:
     if not scenario.uplink_drop and any(decision.source == "onboard" for decision in flight.decisions):
         raise RuntimeError(f"{course}: the edge did not decide: {pilot.last_error}")
     return flight
-
-
-@contextmanager
-def serving() -> Iterator[str]:
-    """An edge as a process of its own, with nothing inherited that changes a decision; yields its URL."""
-    # An answer waits for the store, and so for learning from its request's outcome. Without a store the next request
-    # may overtake learning on a busy machine.
-    folder = tempfile.mkdtemp()
-    settings = {"MODE": "value", "STORE": f"{folder}/m.db", "PLANNER_MS": "60000", "LOG_LEVEL": "warning"}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "shared.kit.command_line", "serve", "--port", "0"],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=_environment(settings),
-    )
-    try:
-        assert process.stderr is not None
-        line = process.stderr.readline()
-        found = re.search(r"listening on (http://[\d.:]+)", line)
-        if found is None:
-            raise RuntimeError(f"the edge did not start: {line}{process.stderr.read()}")
-        with EdgeClient(found[1], timeout_s=60.0) as client:
-            client.wait_ready(120.0)
-        yield found[1]
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
-        shutil.rmtree(folder)
-
-
-def _environment(settings: Mapping[str, str]) -> dict[str, str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("AICVDS_") or k == "AICVDS_CACHE_DIR"}
-    return kept | {f"AICVDS_{name}": value for name, value in settings.items()}
 
 
 if __name__ == "__main__":

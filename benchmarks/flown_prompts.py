@@ -11,8 +11,7 @@ import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from paper_template import EXPERIENCES, Newest, PaperTemplate
-
+from lab.benchmarks.paper_template import EXPERIENCES, Newest, PaperTemplate
 from service.config.settings import Settings
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import candidates_of, template_of

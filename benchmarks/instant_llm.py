@@ -1,6 +1,6 @@
 """An LLM server that answers at once, so that a benchmark measures only the cost of asking.
 
-    python benchmarks/instant_llm.py --port 9009
+    python -m benchmarks.instant_llm 9009
 
 It serves chat completions as llama.cpp does, obeys a grammar by its first alternatives, and returns the last
 body at ``GET /last``. It is one plain ASGI application, to use as little of the machine as possible.
@@ -11,23 +11,14 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-from dataclasses import dataclass
+import sys
 
-import tyro
 import uvicorn
 from starlette.types import Receive, Scope, Send
 
 # `root ::= ("3" | "7") " " ("0" | "1")`: the first of each.
 _FIRST = re.compile(r'\("([^"]*)"')
 _USAGE = {"prompt_tokens": 400, "completion_tokens": 3, "total_tokens": 403}
-
-
-@dataclass(frozen=True)
-class Instant:
-    """Serve until SIGTERM."""
-
-    port: int
-    """Port on loopback."""
 
 
 class App:
@@ -62,19 +53,12 @@ async def _body(receive: Receive) -> bytes:
 
 def _completion(asked: bytes) -> dict[str, object]:
     text = " ".join(_FIRST.findall(json.loads(asked).get("grammar", ""))) or "0 0"
-    message = {"role": "assistant", "content": text}
-    choice = {"index": 0, "message": message, "finish_reason": "stop"}
-    return {
-        "id": "0",
-        "object": "chat.completion",
-        "created": 0,
-        "model": "instant",
-        "choices": [choice],
-        "usage": _USAGE,
-    }
+    choice = {"index": 0, "message": {"role": "assistant", "content": text}, "finish_reason": "stop"}
+    head = {"id": "0", "object": "chat.completion", "created": 0, "model": "instant"}
+    return {**head, "choices": [choice], "usage": _USAGE}
 
 
 if __name__ == "__main__":
-    port = tyro.cli(Instant, description=__doc__).port
+    port = int(sys.argv[1])
     config = uvicorn.Config(App(), host="127.0.0.1", port=port, log_level="warning", lifespan="off", access_log=False)
     asyncio.run(uvicorn.Server(config).serve())

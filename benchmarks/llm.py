@@ -1,7 +1,7 @@
 """The embedded LLM's time for a decision: by prefix cache, threads, busy neighbours, and concurrent UAVs.
 
-    python benchmarks/llm.py
-    python benchmarks/llm.py --rounds 15    # narrower intervals
+    python -m benchmarks.llm
+    python -m benchmarks.llm --rounds 15    # narrower intervals
 
 The prompts are a mission's own, in their order, in modes `guided` (scoring: one forward pass, whose answer is the
 probabilities of single-token labels) and `llm` (generating: a sensor and a velocity under a grammar).
@@ -14,27 +14,22 @@ seconds are this process's, and other work on the machine changes them least.
 
 from __future__ import annotations
 
-import json
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
-from flown_prompts import GUIDED, LLM, Asked, Scribe, Together, flown
-from local_llm import Answered, LocalLLM
-from ratios import ratio_of_medians, shown
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
+from benchmarks.flown_prompts import GUIDED, LLM, Asked, Scribe, Together, flown
+from benchmarks.harness import Cell, Options, Report, in_turn, run
+from lab.benchmarks.local_llm import Answered, LocalLLM
+from lab.experiments.intervals import ratio_of_medians
 from service.config.settings import Settings
 from shared.kit.cores import usable_cores
 from shared.world.scenario import Scenario, scenario_named
@@ -45,7 +40,7 @@ ROW, CALL, QUEUE, SLOTS = "one after the other", "one call about all", "at once,
 
 
 @dataclass(frozen=True)
-class Llm:
+class Llm(Options):
     """Measure the embedded LLM's time for an answer."""
 
     rounds: int = 5
@@ -60,8 +55,6 @@ class Llm:
     """Policy of that mission: the planner, or the rule that is faster to compute."""
     limit_s: float = 20.0
     """The longest wait for an answer in seconds; a later answer counts as this long."""
-    out: Path = Path("runs/llm.json")
-    """Where to write the figures."""
 
 
 @dataclass
@@ -85,64 +78,64 @@ class Line:
         return self.llm.ask(self.body, self.limit_s, cache_prompt=False)
 
 
-def main(args: Llm) -> int:
-    """Fly, ask, print, write."""
-    torch.set_num_threads(1)
-    console, scenario = Console(), scenario_named("paper")
-    if args.steps is not None:
-        scenario = scenario.model_copy(update={"steps": args.steps})
-    scribe = flown(scenario, args.seed, args.policy)
-    alone = decisions(scribe, scenario, args, console)
-    fleet = fleets(scribe, scenario, args, console)
-    found = {
-        "command": sys.argv,
-        "cores": usable_cores(),
-        "rounds": args.rounds,
-        "limit_s": args.limit_s,
-        **alone,
-        "fleet": fleet,
-    }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
-    tell(found, console)
-    console.print(f"Wrote {args.out}")
-    return 0
-
-
 Times = dict[str, list[Answered]]
 
 
-def decisions(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
+def measure(args: Llm) -> Report:
+    """Fly, then ask for one UAV and for the fleet."""
+    torch.set_num_threads(1)
+    scenario = scenario_named("paper")
+    if args.steps is not None:
+        scenario = scenario.model_copy(update={"steps": args.steps})
+    scribe = flown(scenario, args.seed, args.policy)
+    alone, fleet = decisions(scribe, scenario, args), fleets(scribe, scenario, args)
+    found = {"cores": usable_cores(), "rounds": args.rounds, "limit_s": args.limit_s, **alone, "fleet": fleet}
+    tables: dict[str, dict[str, dict[str, Cell]]] = {
+        "Time to a decision": alone["times"],
+        "Ratios [95% interval]": {name: {"ratio": ratio} for name, ratio in alone["ratios"].items()},
+        "A fleet's step, mode guided": fleet,
+    }
+    return Report(found, tables)
+
+
+def decisions(scribe: Scribe, scenario: Scenario, args: Llm) -> dict[str, Any]:
     """One UAV's decisions in every condition: ``<way> <cold|cached> <threads> <quiet|busy>``."""
     # From this decision on the block of experiences is full.
     asked = scribe.asked[len(scribe.asked) // 3 :]
     if len(asked) < 2 * args.rounds + 1:
         raise SystemExit(f"--rounds: the mission has decisions for {(len(asked) - 1) // 2} at most")
-    times: Times = {}
+    context, levels = Settings().llm_context, scenario.max_velocity + 1
+    first: Times = {}
+    variants: dict[str, Callable[[int], Answered]] = {}
     with ExitStack() as stack:
         lines = {
             (way, threads): Line(
-                way,
-                stack.enter_context(LocalLLM(threads, Settings().llm_context)),
-                iter(asked),
-                scenario.max_velocity + 1,
-                args.limit_s,
+                way, stack.enter_context(LocalLLM(threads, context)), iter(asked), levels, args.limit_s
             )
             for threads in args.threads
             for way in (GUIDED, LLM)
         }
-        loads = [line.llm.load_s for line in lines.values()]
         for line in lines.values():
             # The first request to a server with an empty cache.
-            times.setdefault(f"{line.way} first", []).append(line.ask())
-        for _ in track(range(args.rounds), "Asking", console=console):
-            for load in (QUIET, BUSY):
-                with neighbours(load):
-                    for (way, threads), line in lines.items():
-                        times.setdefault(f"{way} cached {threads} {load}", []).append(line.ask())
-                        if load == QUIET:
-                            times.setdefault(f"{way} cold {threads} {load}", []).append(line.ask_cold())
-    return {"load_s_median": statistics.median(loads), "times": summed(times), "ratios": ratios(times, args.threads)}
+            first.setdefault(f"{line.way} first", []).append(line.ask())
+        for load in (QUIET, BUSY):
+            for (way, threads), line in lines.items():
+                variants[f"{way} cached {threads} {load}"] = asking(line.ask, load)
+                if load == QUIET:
+                    variants[f"{way} cold {threads} {load}"] = asking(line.ask_cold, load)
+        times = first | in_turn(variants, args.rounds)
+        load_s = statistics.median(line.llm.load_s for line in lines.values())
+    return {"load_s_median": load_s, "times": summed(times), "ratios": ratios(times, args.threads)}
+
+
+def asking(ask: Callable[[], Answered], load: str) -> Callable[[int], Answered]:
+    """A request in a round, with such neighbours."""
+
+    def asked(_: int) -> Answered:
+        with neighbours(load):
+            return ask()
+
+    return asked
 
 
 @contextmanager
@@ -200,40 +193,37 @@ def ratios(times: Times, threads: Sequence[int]) -> dict[str, list[float]]:
     return found
 
 
-def fleets(scribe: Scribe, scenario: Scenario, args: Llm, console: Console) -> dict[str, Any]:
+def fleets(scribe: Scribe, scenario: Scenario, args: Llm) -> dict[str, Any]:
     """The decisions of all UAVs of a step, in mode ``guided``, by the default number of threads: seconds to the last.
 
     Each way has a server of its own, so that each has the step before in its cache.
     """
     steps = whole_steps(scribe, scenario)[-args.rounds - 1 :]
-    threads, uavs = Settings().embedded_threads, scenario.uavs
-    seconds: dict[str, list[float]] = {}
-    cpu: dict[str, list[float]] = {}
-    new: dict[str, list[int]] = {}
+    threads, uavs, context = Settings().embedded_threads, scenario.uavs, Settings().llm_context
     with ExitStack() as stack, ThreadPoolExecutor(uavs) as pool:
-        context = Settings().llm_context
-        models = {
-            name: stack.enter_context(LocalLLM(threads, context, slots=uavs if name == SLOTS else 1))
-            for name in (ROW, CALL, QUEUE, SLOTS)
-        }
-        for number, (bodies, together) in enumerate(track(steps, "Asking for the fleet", console=console)):
-            for name in models:
+
+        def step(name: str) -> Callable[[int], tuple[float, float, int]]:
+            llm = stack.enter_context(LocalLLM(threads, context, slots=uavs if name == SLOTS else 1))
+
+            def asked(number: int) -> tuple[float, float, int]:
                 began, cpu_began = time.perf_counter(), time.process_time()
-                answers = ask_fleet(name, models[name], bodies, together, args.limit_s, pool)
+                answers = ask_fleet(name, llm, *steps[number + 1], args.limit_s, pool)
                 took, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
-                # The first step has an empty cache.
-                if number:
-                    seconds.setdefault(name, []).append(took)
-                    cpu.setdefault(name, []).append(cpu_s)
-                    new.setdefault(name, []).append(sum(one.new for one in answers))
+                return took, cpu_s, sum(one.new for one in answers)
+
+            return asked
+
+        # The first step has an empty cache.
+        found = in_turn({name: step(name) for name in (ROW, CALL, QUEUE, SLOTS)}, len(steps) - 1, warm_up=1)
+    seconds = {name: [took for took, _, _ in told] for name, told in found.items()}
     return {
         name: {
-            "seconds_median": statistics.median(took),
-            "cpu_s_median": statistics.median(cpu[name]),
-            "new_mean": statistics.fmean(new[name]),
-            "to_one_after_the_other": ratio_of_medians(took, seconds[ROW]),
+            "seconds_median": statistics.median(seconds[name]),
+            "cpu_s_median": statistics.median(cpu_s for _, cpu_s, _ in told),
+            "new_mean": statistics.fmean(new for _, _, new in told),
+            "to_one_after_the_other": ratio_of_medians(seconds[name], seconds[ROW]),
         }
-        for name, took in seconds.items()
+        for name, told in found.items()
     }
 
 
@@ -266,25 +256,5 @@ def whole_steps(scribe: Scribe, scenario: Scenario) -> list[tuple[list[dict[str,
     return found
 
 
-def tell(found: dict[str, Any], console: Console) -> None:
-    """Print the figures."""
-    table = Table(
-        "", "s", "first token", "processor", "newly read", "written", "late", title="Time to a decision, medians"
-    )
-    for name, row in found["times"].items():
-        seconds = [f"{row[column]:.3f}" for column in ("seconds_median", "first_token_s_median", "cpu_s_median")]
-        table.add_row(name, *seconds, f"{row['new_mean']:.0f}", f"{row['written_mean']:.1f}", f"{row['late']:.0f}")
-    console.print(table)
-    for name, ratio in found["ratios"].items():
-        console.print(f"{name}: {shown(ratio)}", highlight=False)
-    fleet = Table("", "s", "processor", "newly read", "to one after the other", title="A fleet's step, mode guided")
-    for name, row in found["fleet"].items():
-        ratio = shown(row["to_one_after_the_other"])
-        fleet.add_row(
-            name, f"{row['seconds_median']:.3f}", f"{row['cpu_s_median']:.3f}", f"{row['new_mean']:.0f}", ratio
-        )
-    console.print(fleet)
-
-
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Llm, description=__doc__)))
+    run(Llm, measure)

@@ -1,18 +1,15 @@
 """The smoothness of the mission page: the time between frames in headless Chromium, with 100 sensors and 10 UAVs.
 
-    python benchmarks/page.py --seconds 20
+    python -m benchmarks.page --seconds 20
 
 It starts an edge, opens its page, and asks for ten UAVs' decisions ten times a second. The browser reports the times
 between its frames, and between its updates of the page. It measures the same page before, without updates, and prints
-both.
+both. Without Chromium it measures nothing and exits with 1.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import dataclass
@@ -20,11 +17,9 @@ from typing import Any
 
 import httpx
 import numpy as np
-import tyro
 from playwright.sync_api import CDPSession, Page, sync_playwright
-from rich.console import Console
 
-from simulator.flying.local_edge import HOST, usable_port
+from benchmarks.harness import Options, Report, edge, run
 
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 UPDATES_A_SECOND = 10
@@ -43,7 +38,7 @@ FRAMES = """seconds => new Promise(done => {
 
 
 @dataclass(frozen=True)
-class Smoothness:
+class Smoothness(Options):
     """Measure the page's frames."""
 
     seconds: float = 20.0
@@ -54,7 +49,7 @@ class Smoothness:
     """UAVs that get a decision at every update."""
 
 
-def report(step: int, sensors: int, uavs: int) -> dict[str, Any]:
+def reported(step: int, sensors: int, uavs: int) -> dict[str, Any]:
     """The body of a batch: UAVs that fly east over a grid of sensors."""
     side = int(np.ceil(np.sqrt(sensors)))
     columns = {
@@ -71,23 +66,12 @@ def report(step: int, sensors: int, uavs: int) -> dict[str, Any]:
     return {"mission_id": "many", "step": step, "uavs": states}
 
 
-def until_up(client: httpx.Client) -> None:
-    """Wait for the edge, at most a minute."""
-    for _ in range(600):
-        try:
-            client.get("/healthz")
-            return
-        except httpx.ConnectError:
-            time.sleep(0.1)
-    raise TimeoutError("the edge does not start")
-
-
 def fly(url: str, options: Smoothness, stop: threading.Event) -> None:
     """Ask for the fleet's decisions, at most ten times a second."""
     with httpx.Client(base_url=url, timeout=60) as client:
         began, step = time.monotonic(), 1
         while not stop.is_set():
-            client.post("/decide/batch", json=report(step, options.sensors, options.uavs)).raise_for_status()
+            client.post("/decide/batch", json=reported(step, options.sensors, options.uavs)).raise_for_status()
             time.sleep(max(0.0, began + step / UPDATES_A_SECOND - time.monotonic()))
             step += 1
 
@@ -98,8 +82,8 @@ def main_thread_s(session: CDPSession) -> float:
     return found["TaskDuration"]
 
 
-def told(name: str, page: Page, seconds: float) -> str:
-    """Measure; returns the result as a line."""
+def watched(page: Page, seconds: float) -> dict[str, float]:
+    """Frames and updates a second, milliseconds from frame to frame, and the share that the page's thread computes."""
     session = page.context.new_cdp_session(page)
     session.send("Performance.enable", {"timeDomain": "threadTicks"})
     before = main_thread_s(session)
@@ -107,54 +91,39 @@ def told(name: str, page: Page, seconds: float) -> str:
     busy = (main_thread_s(session) - before) / seconds
     session.detach()
     gaps = np.diff(measured["frames"])
-    drawn = len(measured["drawn"]) / seconds
-    p50, p95, p99 = np.percentile(gaps, (50, 95, 99))
-    return (
-        f"{name}: {len(gaps) / seconds:.0f} frames and {drawn:.1f} updates a second; from frame to frame "
-        f"{p50:.1f} ms (p50), {p95:.1f} (p95), {p99:.1f} (p99), {gaps.max():.0f} at most; "
-        f"the page's thread computes {100 * busy:.0f}% of the time"
-    )
+    p50, p95, p99 = np.percentile(gaps, (50, 95, 99)).tolist()
+    rates = {"frames a second": len(gaps) / seconds, "updates a second": len(measured["drawn"]) / seconds}
+    return {**rates, "p50 ms": p50, "p95 ms": p95, "p99 ms": p99, "most ms": float(gaps.max()), "busy": busy}
 
 
-def main() -> int:
-    """Measure the page; returns the exit code."""
-    options = tyro.cli(Smoothness, description=__doc__)
-    console = Console()
+def measure(options: Smoothness) -> Report:
+    """Watch the page without updates and with them."""
     chromium = shutil.which("chromium")
     if chromium is None:
-        console.print("this needs a browser: apt-get install --no-install-recommends chromium")
-        return 2
-    port = usable_port(0)
-    url = f"http://{HOST}:{port}"
-    environment = {**os.environ, "AICVDS_MODE": "value", "AICVDS_STORE": "none", "AICVDS_LOG_LEVEL": "warning"}
-    edge = subprocess.Popen(
-        [sys.executable, "-m", "shared.kit.command_line", "serve", "--host", HOST, "--port", str(port)], env=environment
-    )
-    stop = threading.Event()
-    flying = threading.Thread(target=fly, args=(url, options, stop))
-    try:
+        raise SystemExit("this needs a browser: apt-get install --no-install-recommends chromium")
+    stop, found = threading.Event(), dict[str, dict[str, float]]()
+    with edge({"MODE": "value", "STORE": "none"}) as server:
+        flying = threading.Thread(target=fly, args=(server.url, options, stop))
         spec = {"scenario": {"name": "many", "sensors": options.sensors, "uavs": options.uavs}}
-        with httpx.Client(base_url=url, timeout=60) as client:
-            until_up(client)
+        with httpx.Client(base_url=server.url, timeout=60) as client:
             client.put("/missions/many", json=spec).raise_for_status()
-            client.post("/decide/batch", json=report(0, options.sensors, options.uavs)).raise_for_status()
-        with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-            page = browser.new_page(viewport={"width": 1280, "height": 900})
-            page.goto(f"{url}/?mission=many")
-            page.wait_for_selector("#mission:not([hidden])")
-            console.print(told("nothing happens", page, options.seconds))
-            flying.start()
-            console.print(told(f"{options.sensors} sensors, {options.uavs} UAVs", page, options.seconds))
-            browser.close()
-    finally:
-        stop.set()
-        if flying.ident is not None:
-            flying.join()
-        edge.terminate()
-        edge.wait(timeout=30)
-    return 0
+            client.post("/decide/batch", json=reported(0, options.sensors, options.uavs)).raise_for_status()
+        try:
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
+                page = browser.new_page(viewport={"width": 1280, "height": 900})
+                page.goto(f"{server.url}/?mission=many")
+                page.wait_for_selector("#mission:not([hidden])")
+                found["nothing happens"] = watched(page, options.seconds)
+                flying.start()
+                found[f"{options.sensors} sensors, {options.uavs} UAVs"] = watched(page, options.seconds)
+                browser.close()
+        finally:
+            stop.set()
+            if flying.ident is not None:
+                flying.join()
+    return Report({"frames": found}, {"The mission page": found})
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(Smoothness, measure)

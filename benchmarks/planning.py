@@ -1,7 +1,7 @@
 """The time of a decision with the planner on, in modes ``policy`` and ``guided``, beside another commit's.
 
-    python benchmarks/planning.py
-    python benchmarks/planning.py --before DIR --worlds 30
+    python -m benchmarks.planning
+    python -m benchmarks.planning --before DIR --rounds 30
 
 It flies every world on `aicvds serve` in a process of its own, with missions in memory and an LLM that draws a letter
 at once, so that the LLM's time does not count. ``--before`` names another checkout of this repository with its virtual
@@ -14,40 +14,34 @@ took 14 s on average.
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from overhead import edge_of
-from processor_time import processor_s
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 
+from benchmarks.harness import Options, Report, Rows, Server, edge, in_turn, run
 from lab.experiments.intervals import interval, paired
 from lab.experiments.stand_ins import answering, drawn
 from shared.client.edge_client import EdgeClient
 from shared.wire.schemas import Mode
 from simulator.commands.options import site_from_options
 from simulator.flying.flight import fly
-from simulator.flying.local_edge import HOST
 from simulator.flying.pilots import EdgePilot
 
 QUANTITIES = {"p50_ms": "p50, ms", "p95_ms": "p95, ms", "cpu_ms": "processor ms a decision", "lost": "lost packets"}
 # No clock ends a search: how much a plan loses is not to depend on the machine.
-SETTINGS = {"AICVDS_STORE": "none", "AICVDS_LOG_LEVEL": "warning", "AICVDS_PLANNER_MS": "30000"}
+SETTINGS = {"STORE": "none", "PLANNER_MS": "30000"}
 PATIENCE_S = 60.0
 
 
 @dataclass(frozen=True)
-class Planning:
+class Planning(Options):
     """Time decisions with the planner on."""
 
-    worlds: int = 10
+    rounds: int = 10
     """Worlds of each scenario: seeds --first to --first + N - 1."""
     first: int = 0
     """The first seed."""
@@ -57,16 +51,13 @@ class Planning:
     """Modes of the missions."""
     before: Path | None = None
     """Another checkout, whose edge flies the same worlds."""
-    out: Path = Path("runs/planning.json")
-    """Where to write the figures."""
 
 
-def flown(edge: tuple[int, int], scenario: str, mode: Mode, seed: int) -> dict[str, float]:
-    """One mission's quantities, on the edge of this process and port; raises ``SystemExit`` where it left one out."""
-    process, port = edge
+def flown(edge: Server, scenario: str, mode: Mode, seed: int) -> dict[str, float]:
+    """One mission's quantities; raises ``SystemExit`` where the edge left one out."""
     site, name = site_from_options(scenario, None), f"{scenario}-{mode}-{seed}"
-    busy_s = processor_s(process)
-    with EdgeClient(f"http://{HOST}:{port}", timeout_s=PATIENCE_S) as client:
+    busy_s = edge.processor_s()
+    with EdgeClient(edge.url, timeout_s=PATIENCE_S) as client:
         pilot = EdgePilot(client, name, site.scenario, seed)
         pilot.spec = pilot.spec.model_copy(update={"mode": mode})
         client.put_mission(name, pilot.spec)
@@ -75,7 +66,7 @@ def flown(edge: tuple[int, int], scenario: str, mode: Mode, seed: int) -> dict[s
     if len(took_ms) < len(flight.decisions):
         raise SystemExit(f"{name}: the edge did not answer every request: {pilot.last_error}")
     p50, p95 = np.percentile(took_ms, [50, 95]).tolist()
-    cpu = (processor_s(process) - busy_s) * 1e3 / len(took_ms)
+    cpu = (edge.processor_s() - busy_s) * 1e3 / len(took_ms)
     lost = float(sum(step.lost_packets for step in flight.tally))
     return {"p50_ms": p50, "p95_ms": p95, "cpu_ms": cpu, "lost": lost}
 
@@ -96,43 +87,38 @@ def rows_of(scenario: str, mode: Mode, found: dict[str, list[dict[str, float]]])
     return rows
 
 
-def tell(rows: list[dict[str, Any]], console: Console) -> None:
-    """Print the rows."""
-    table = Table("scenario", "mode", "edge", *QUANTITIES.values())
+def table(rows: list[dict[str, Any]]) -> Rows:
+    """Each edge's means, and its ratios to the other commit's."""
+    found: dict[str, dict[str, Any]] = {}
     for row in rows:
-        cells = []
-        for quantity in QUANTITIES:
-            ratio = next((row[key] for key in row if key.startswith(f"{quantity} to ")), None)
-            cell = f"{row[quantity]['mean']:.1f}"
-            cells.append(cell if ratio is None else f"{cell} = {ratio[0]:.2f} [{ratio[1]:.2f}, {ratio[2]:.2f}]")
-        table.add_row(row["scenario"], row["mode"], row["edge"], *cells)
-    console.print(table)
+        name = f"{row['scenario']}, {row['mode']}, {row['edge']}"
+        found[name] = {label: row[quantity]["mean"] for quantity, label in QUANTITIES.items()}
+        ratios = {label: row.get(f"{quantity} to before") for quantity, label in QUANTITIES.items()}
+        found |= {f"{name} to before": ratios} if all(ratios.values()) else {}
+    return found
 
 
-def main(options: Planning) -> None:
-    """Fly, print, write."""
-    console, rows = Console(), []
-    checkouts = {} if options.before is None else {"before": options.before.absolute()}
+def measure(options: Planning) -> Report:
+    """Fly every world on each edge."""
+    rows = []
+    checkouts = {} if options.before is None else {"before": options.before}
     with ExitStack() as stack:
-        settings = {**SETTINGS, "AICVDS_LLM_URL": stack.enter_context(answering(drawn))}
-        edges = {name: edge_of(settings, stack, folder) for name, folder in {**checkouts, "this": None}.items()}
-        progress = stack.enter_context(Progress(console=console))
-        every = len(options.scenarios) * len(options.modes) * options.worlds * len(edges)
-        task = progress.add_task("flying", total=every)
+        settings = {**SETTINGS, "LLM_URL": stack.enter_context(answering(drawn))}
+        edges = {name: stack.enter_context(edge(settings, at)) for name, at in {**checkouts, "this": None}.items()}
         for scenario in options.scenarios:
             for mode in options.modes:
-                found: dict[str, list[dict[str, float]]] = {name: [] for name in edges}
-                for seed in range(options.first, options.first + options.worlds):
-                    for name, edge in edges.items():
-                        found[name].append(flown(edge, scenario, mode, seed))
-                        progress.advance(task)
-                rows += rows_of(scenario, mode, found)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(
-        json.dumps({"worlds": options.worlds, "first": options.first, "rows": rows}, indent=2) + "\n"
-    )
-    tell(rows, console)
+                rows += rows_of(scenario, mode, worlds(edges, scenario, mode, options))
+    return Report({"worlds": options.rounds, "first": options.first, "rows": rows}, {"Decisions": table(rows)})
+
+
+def worlds(edges: dict[str, Server], scenario: str, mode: Mode, options: Planning) -> dict[str, list[dict[str, float]]]:
+    """The quantities of each world by edge."""
+
+    def flying(edge: Server) -> Callable[[int], dict[str, float]]:
+        return lambda number: flown(edge, scenario, mode, options.first + number)
+
+    return in_turn({name: flying(edge) for name, edge in edges.items()}, options.rounds)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Planning, description=__doc__))
+    run(Planning, measure)

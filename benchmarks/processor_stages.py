@@ -1,6 +1,6 @@
 """Where the edge's processor time of a decision goes, by stage.
 
-    python benchmarks/processor_stages.py
+    python -m benchmarks.processor_stages
 
 Before an LLM server that answers at once there is `aicvds serve` in mode ``llm`` with everything on, as in
 ``overhead.py``: 3 UAVs send their next request, with an outcome, after each answer. A timer of the process's own
@@ -15,29 +15,22 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import FrameType
 
-import httpx
 import numpy as np
 import psutil
-import tyro
-from overhead import EDGE, FLEET, HERE, Target, Uav, load, make_missions, running
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 
-from simulator.flying.local_edge import HOST, usable_port
+from benchmarks.harness import Goal, Options, Report, edge, in_turn, instant_llm, run
+from benchmarks.load import EDGE, FLEET, Target, Uav, load, made_key, make_missions
 
-# The first argument of the sampled process; a file and the port follow.
+# The first argument of the sampled process; a file and `serve`'s options follow.
 SAMPLED = "sampled"
 # Folders of the package `service`, and libraries whose frames have none of `service` beneath them.
 STAGES = {
@@ -57,19 +50,19 @@ STAGES = {
     "fastapi": "HTTP",
     "aiohttp": "LLM client",
 }
+# Of all stages together.
+GOAL_MS = 0.8
 OTHER, WRITER = "event loop and others", "the process that writes SQLite"
 
 
 @dataclass(frozen=True)
-class ProcessorStages:
+class ProcessorStages(Options):
     """Sample the edge's processor time under load."""
 
     rounds: int = 5
     """Rounds."""
     seconds: float = 8.0
     """Seconds of load in each round."""
-    out: Path = Path("runs/processor_stages.json")
-    """Where to write the figures."""
 
 
 def stage(frame: FrameType | None) -> str:
@@ -86,7 +79,7 @@ def stage(frame: FrameType | None) -> str:
     return library
 
 
-def serve_sampled(out: str, port: str) -> None:
+def serve_sampled(out: str, *options: str) -> None:
     """Serve; SIGUSR1 begins to count samples, and the next one writes them."""
     counted: Counter[str] = Counter()
     sampling = False
@@ -107,46 +100,29 @@ def serve_sampled(out: str, port: str) -> None:
     signal.signal(signal.SIGPROF, sample)
     signal.signal(signal.SIGUSR1, switch)
     (serve,) = entry_points(group="aicvds.commands", name="serve")
-    serve.load()(["--host", HOST, "--port", port])
+    serve.load()(list(options))
 
 
-def measure(options: ProcessorStages, console: Console) -> list[dict[str, float]]:
+def sampled(options: ProcessorStages) -> list[dict[str, float]]:
     """Milliseconds of processor time a decision, by stage, of each round."""
-    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
-        folder = Path(name)
-        llm, port = usable_port(0), usable_port(0)
-        upstream, keys = f"http://{HOST}:{llm}/v1", folder / "keys.json"
-        instant = [sys.executable, str(HERE / "instant_llm.py"), "--port", str(llm)]
-        stack.enter_context(running(instant, f"{upstream}/models"))
-        add = ["keys", "add", "load", "--file", str(keys), "--scopes", "decide", "admin", "--per-minute", "1000000"]
-        made = subprocess.run(
-            [sys.executable, "-m", "shared.kit.command_line", *add], check=True, capture_output=True, text=True
-        )
-        key = made.stdout.split()[-1]
-        settings = {"LLM_URL": upstream, "KEYS": str(keys), "STORE": str(folder / "missions.db")}
-        environment = {**EDGE, **{f"AICVDS_{name}": value for name, value in settings.items()}}
-        edge = [sys.executable, __file__, SAMPLED, str(folder / "samples.json"), str(port)]
-        process = stack.enter_context(running(edge, f"http://{HOST}:{port}/healthz", environment))
-        while httpx.get(f"http://{HOST}:{port}/readyz", timeout=60).json()["llm"] != "ready":
-            time.sleep(0.1)
-        target = Target("edge", process, port, "/decide", lambda uav: uav.report(outcomes=True), key)
-        uavs = [Uav(number) for number in range(FLEET)]
-        make_missions(target, uavs)
-        load(target, uavs, 2.0)
-        rounds = range(options.rounds)
-        return [
-            _round(target, uavs, folder / "samples.json", options.seconds)
-            for _ in track(rounds, "sampling", console=console)
-        ]
+    with tempfile.TemporaryDirectory() as name, instant_llm() as llm:
+        keys, samples = Path(name) / "keys.json", Path(name) / "samples.json"
+        key, settings = made_key(keys), {**EDGE, "LLM_URL": f"{llm.url}/v1", "KEYS": keys}
+        with edge(settings, serve=("benchmarks.processor_stages", SAMPLED, str(samples))) as server:
+            target = Target("edge", server, lambda uav: uav.report(outcomes=True), key)
+            uavs = [Uav(number) for number in range(FLEET)]
+            make_missions(target, uavs)
+            load(target, uavs, 2.0)
+            return in_turn({0: lambda _: _round(target, uavs, samples, options.seconds)}, options.rounds)[0]
 
 
 def _round(target: Target, uavs: list[Uav], samples: Path, seconds: float) -> dict[str, float]:
-    first, (writer,) = psutil.Process(target.process), psutil.Process(target.process).children()
-    before, steps = _busy_s(first), sum(uav.step for uav in uavs)
-    written = _busy_s(writer)
-    os.kill(target.process, signal.SIGUSR1)
+    first = target.server.process
+    (writer,) = first.children()
+    before, written, steps = _busy_s(first), _busy_s(writer), sum(uav.step for uav in uavs)
+    os.kill(first.pid, signal.SIGUSR1)
     load(target, uavs, seconds)
-    os.kill(target.process, signal.SIGUSR1)
+    os.kill(first.pid, signal.SIGUSR1)
     busy_ms, written_ms = 1e3 * (_busy_s(first) - before), 1e3 * (_busy_s(writer) - written)
     while not samples.exists():
         time.sleep(0.01)
@@ -163,28 +139,25 @@ def _busy_s(process: psutil.Process) -> float:
     return float(times.user + times.system)
 
 
-def main(options: ProcessorStages) -> None:
-    """Measure, print, write."""
-    console = Console()
-    rounds = measure(options, console)
+def measure(options: ProcessorStages) -> Report:
+    """Sample, and take means over rounds."""
+    rounds = sampled(options)
     random = np.random.default_rng(0)
-    rows = {}
+    stages = {}
     for name in [name for name in rounds[0] if name != "samples"]:
         values = np.array([each[name] for each in rounds])
         means = values[random.integers(0, len(values), (2000, len(values)))].mean(1)
         low, high = np.percentile(means, [2.5, 97.5])
-        rows[name] = [round(float(value), 3) for value in (values.mean(), low, high)]
-    table = Table("stage", "processor ms a decision [95%]", title=f"{sum(r['samples'] for r in rounds)} samples")
-    for name, (mean, low, high) in sorted(rows.items(), key=lambda row: -row[1][0]):
-        table.add_row(name, f"{mean:.3f} [{low:.3f}, {high:.3f}]")
-    table.add_row("all", f"{sum(mean for mean, _, _ in rows.values()):.3f}")
-    console.print(table)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps({"rounds": rounds, "stages": rows}, indent=2) + "\n")
+        stages[name] = [round(float(value), 3) for value in (values.mean(), low, high)]
+    whole, column = sum(mean for mean, _, _ in stages.values()), "processor ms a decision [95%]"
+    rows = {name: {column: told} for name, told in sorted(stages.items(), key=lambda row: -row[1][0])}
+    title = f"{sum(each['samples'] for each in rounds):.0f} samples"
+    goals = [Goal("processor ms a decision", whole, most=GOAL_MS)]
+    return Report({"rounds": rounds, "stages": stages}, {title: rows}, goals)
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == [SAMPLED]:
         serve_sampled(*sys.argv[2:])
     else:
-        main(tyro.cli(ProcessorStages, description=__doc__))
+        run(ProcessorStages, measure)

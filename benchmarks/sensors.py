@@ -1,6 +1,6 @@
 """The growth of the edge's own share of a decision, its memory and its requests with the number of sensors J.
 
-    python benchmarks/sensors.py
+    python -m benchmarks.sensors
 
 It flies missions of 10 to 2,000 sensors in turn against real edges with a store: one of mode ``value``, which has no
 LLM, and one of mode ``llm`` whose LLM (``instant_llm.py``) answers at once. The share is the edge's own time,
@@ -18,27 +18,18 @@ the bytes of the attention weights and the scoring on board. It prints tables an
 from __future__ import annotations
 
 import gzip
-import json
-import os
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
 
 import httpx
 import numpy as np
-import psutil
-import tyro
 import zstandard
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 
+from benchmarks.harness import Cell, Goal, Options, Report, Server, edge, in_turn, instant_llm, run
 from shared.client.edge_client import EdgeClient
 from shared.client.pruned_reports import PrunedReports
 from shared.client.report_encoders import DeltaReports
@@ -46,16 +37,15 @@ from shared.wire.missions import MissionAttention
 from shared.wire.schemas import DecideRequest, MissionSpec, Mode, Outcome, Uplink
 from shared.world.scenario import Scenario
 from simulator.flying.flight import fly
-from simulator.flying.local_edge import HOST, edge_process, usable_port
 from simulator.flying.pilots import EdgePilot, PilotChoice
 from simulator.sites.site import Site
 from simulator.world.observation import Observation
 
-GOALS = {"share_1000_to_10": 2.0, "share_2000_to_10": 4.0, "memory_mb": 200.0}
+# The highest ratio of the shares, by the number of sensors, to that with the fewest; and the most memory.
+GOALS, GOAL_MB = {1000: 2.0, 2000: 4.0}, 200.0
 UAVS = 3
 # The longest time for learning from one outcome.
 NO_LESSON_S = 5.0
-MODES: tuple[Mode, ...] = ("value", "llm")
 ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
     "plain": lambda body: body,
     "gzip": lambda body: gzip.compress(body, 6, mtime=0),
@@ -64,7 +54,7 @@ ENCODINGS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @dataclass(frozen=True)
-class Sensors:
+class Sensors(Options):
     """Measure the edge's share, memory and wire by the number of sensors."""
 
     sensors: tuple[int, ...] = (10, 100, 1000, 2000)
@@ -73,30 +63,32 @@ class Sensors:
     """Steps of a mission, at least 2; three UAVs decide at each."""
     rounds: int = 3
     """Missions of each J and mode, in turn."""
-    out: Path = Path("runs/sensors.json")
-    """Where to write."""
 
 
 @dataclass
-class Edge:
-    """A process, and the times of its decisions: by J, one dict of milliseconds for each decision."""
+class Timed:
+    """An edge, and the times of its decisions: by J, one dict of milliseconds for each decision."""
 
     mode: Mode
-    url: str
-    process: psutil.Process
+    server: Server
     took: dict[int, list[dict[str, float]]] = field(default_factory=dict)
     left_out: int = 0
 
+    @property
+    def url(self) -> str:
+        """The edge's."""
+        return self.server.url
+
     def peak_mb(self) -> float:
         """The peak of the process's resident memory."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        status = Path(f"/proc/{self.server.process.pid}/status").read_text()
         return float(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 1e3
 
 
 class Pilot(EdgePilot):
     """Asks after every earlier learning step has ended, and stores the requests."""
 
-    def __init__(self, client: EdgeClient, edge: Edge, scenario: Scenario, mission_id: str) -> None:
+    def __init__(self, client: EdgeClient, edge: Timed, scenario: Scenario, mission_id: str) -> None:
         super().__init__(client, mission_id, scenario, 0, mode=edge.mode)
         self._status = f"{edge.url}/missions/{mission_id}"
         self._untaught = 0
@@ -118,32 +110,7 @@ class Pilot(EdgePilot):
         return super().decide(uav, observation, taken)
 
 
-@contextmanager
-def instant_llm() -> Iterator[str]:
-    """Run an LLM that answers at once as a process; yields its base URL."""
-    port = usable_port(0)
-    script = Path(__file__).with_name("instant_llm.py")
-    with subprocess.Popen([sys.executable, str(script), "--port", str(port)]) as process:
-        try:
-            yield f"http://{HOST}:{port}/v1"
-        finally:
-            process.terminate()
-
-
-@contextmanager
-def edge_of(mode: Mode, folder: Path, llm: str) -> Iterator[Edge]:
-    """A real edge with a store."""
-    port = usable_port(0)
-    url = f"http://{HOST}:{port}"
-    settings = {"AICVDS_MODE": mode, "AICVDS_STORE": str(folder / f"{mode}.db"), "AICVDS_LOG_LEVEL": "error"}
-    settings |= {"AICVDS_LLM_URL": llm} if mode == "llm" else {}
-    with edge_process(port, folder / f"{mode}.log", {**os.environ, **settings}) as process:
-        with EdgeClient(url, timeout_s=60) as client:
-            client.wait_ready(120)
-        yield Edge(mode, url, psutil.Process(process.pid))
-
-
-def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest]:
+def flown(edge: Timed, sensors: int, steps: int, name: str) -> list[DecideRequest]:
     """Fly one mission, note the times of its decisions, and delete it; returns its requests."""
     scenario = Scenario(sensors=sensors, steps=steps)
     with EdgeClient(edge.url, timeout_s=60) as client:
@@ -161,14 +128,14 @@ def flown(edge: Edge, sensors: int, steps: int, name: str) -> list[DecideRequest
     return pilot.requests
 
 
-def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) -> dict[str, Any]:
+def wire(url: str, now: DecideRequest, before: DecideRequest, repeats: int) -> dict[str, Any]:
     """Bytes and milliseconds of one request on each uplink, after an earlier one, by encoding."""
     name = f"wire-{len(now.sensors.id)}"
     unknown = Outcome(decision_id="0" * 32, cost=0.0)
     before = before.model_copy(update={"mission_id": name, "outcome": None})
     now = now.model_copy(update={"mission_id": name, "outcome": unknown})
     delta, pruned = DeltaReports(), PrunedReports()
-    with EdgeClient(edge.url, timeout_s=60) as client, httpx.Client(base_url=edge.url, timeout=60) as http:
+    with EdgeClient(url, timeout_s=60) as client, httpx.Client(base_url=url, timeout=60) as http:
         scenario = Scenario(sensors=len(now.sensors.id), steps=now.step + 1)
         pruned.store(now.uav_id, now.step, client.put_mission(name, MissionSpec(scenario=scenario)), None)
         weights = http.get(f"/missions/{name}/attention", headers={"Accept-Encoding": "identity"}).content
@@ -204,44 +171,48 @@ def wire(edge: Edge, now: DecideRequest, before: DecideRequest, repeats: int) ->
     return found
 
 
-def main(args: Sensors) -> int:
-    """Measure, print, write."""
-    console = Console()
+def measure(args: Sensors) -> Report:
+    """Fly missions of every number of sensors on both edges in turn."""
     peaks: dict[int, float] = {}
-    found_wire: dict[int, dict[str, Any]] = {}
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack, Progress(console=console) as progress:
+    wires: dict[str, dict[str, Any]] = {}
+    with ExitStack() as stack:
         llm = stack.enter_context(instant_llm())
-        edges = [stack.enter_context(edge_of(mode, Path(folder), llm)) for mode in MODES]
-        flying = progress.add_task("flying", total=args.rounds * len(args.sensors) * len(edges))
-        for edge in edges:
-            flown(edge, args.sensors[0], args.steps, "warm-up")
-            edge.took.clear()
-            edge.left_out = 0
-        for number in range(args.rounds):
-            for sensors in args.sensors:
-                for edge in edges:
-                    requests = flown(edge, sensors, args.steps, f"{sensors}-{number}")
-                    progress.advance(flying)
-                    if edge.mode == "value" and number == 0:
-                        peaks[sensors] = edge.peak_mb()
-                        found_wire[sensors] = wire(edge, requests[-1], requests[-1 - UAVS], repeats=20)
-        took = {edge.mode: {str(sensors): _summary(edge.took[sensors]) for sensors in args.sensors} for edge in edges}
-    first = peaks[args.sensors[0]]
-    found = {
-        "command": sys.argv,
+        backed: dict[Mode, dict[str, str]] = {"value": {}, "llm": {"LLM_URL": f"{llm.url}/v1"}}
+        edges = []
+        for mode, more in backed.items():
+            server = stack.enter_context(edge({"MODE": mode, "LOG_LEVEL": "error", **more}))
+            edges.append(Timed(mode, server))
+            flown(edges[-1], args.sensors[0], args.steps, "warm-up")
+            edges[-1].took, edges[-1].left_out = {}, 0
+
+        def flying(timed: Timed, sensors: int) -> Callable[[int], None]:
+            def flight(number: int) -> None:
+                requests = flown(timed, sensors, args.steps, f"{sensors}-{number}")
+                if timed.mode == "value" and number == 0:
+                    peaks[sensors] = timed.peak_mb()
+                    wires[str(sensors)] = wire(timed.url, requests[-1], requests[-1 - UAVS], repeats=20)
+
+            return flight
+
+        in_turn({(sensors, e.mode): flying(e, sensors) for sensors in args.sensors for e in edges}, args.rounds)
+    took = {e.mode: {str(sensors): _summary(e.took[sensors]) for sensors in args.sensors} for e in edges}
+    found: dict[str, Any] = {
         "decisions_each": UAVS * args.steps * args.rounds,
-        "left_out": {edge.mode: edge.left_out for edge in edges},
+        "left_out": {e.mode: e.left_out for e in edges},
         "took_ms": took,
         "share_ratio": {mode: _ratios(took[mode], "share") for mode in took},
         "round_trip_ratio": {mode: _ratios(took[mode], "round_trip") for mode in took},
-        "peak_memory_growth_mb": {str(sensors): round(peak - first, 1) for sensors, peak in peaks.items()},
-        "wire": {str(sensors): told for sensors, told in found_wire.items()},
-        "goals": GOALS,
+        "peak_memory_growth_mb": {str(j): round(peak - peaks[args.sensors[0]], 1) for j, peak in peaks.items()},
+        "wire": wires,
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
-    _tell(console, found, args)
-    return 0
+    grown = max(found["peak_memory_growth_mb"].values())
+    goals = [
+        Goal(f"share, mode {mode}, {j} sensors to {args.sensors[0]}", ratios[str(j)], most=most)
+        for mode, ratios in found["share_ratio"].items()
+        for j, most in GOALS.items()
+        if j in args.sensors
+    ]
+    return Report(found, _tables(found), [*goals, Goal("growth of memory, MB", grown, most=GOAL_MB)])
 
 
 def _summary(took: list[dict[str, float]]) -> dict[str, Any]:
@@ -256,40 +227,33 @@ def _ratios(by_sensors: dict[str, Any], what: str) -> dict[str, float]:
     return {sensors: round(value / first, 2) for sensors, value in p50.items()}
 
 
-def _tell(console: Console, found: dict[str, Any], args: Sensors) -> None:
-    stages = Table("J", "mode", "share p50 ms", "ratio", "p95", "round trip", "ratio", "most of it", "memory MB")
-    for sensors in map(str, args.sensors):
-        for mode in found["took_ms"]:
-            p50 = found["took_ms"][mode][sensors]["p50"]
+def _tables(found: dict[str, Any]) -> dict[str, dict[str, dict[str, Cell]]]:
+    stages, sizes, pruned = {}, {}, {}
+    for mode, by_sensors in found["took_ms"].items():
+        for sensors, told in by_sensors.items():
+            p50 = told["p50"]
             own = {s: v for s, v in p50.items() if s not in ("total", "share", "round_trip", "llm")}
-            most = sorted(own, key=lambda s: -own[s])[:3]
-            stages.add_row(
-                f"{int(sensors):,}",
-                mode,
-                f"{p50['share']:.2f}",
-                f"{found['share_ratio'][mode][sensors]:.1f}",
-                f"{found['took_ms'][mode][sensors]['share_p95']:.2f}",
-                f"{p50['round_trip']:.2f}",
-                f"{found['round_trip_ratio'][mode][sensors]:.1f}",
-                ", ".join(f"{s} {own[s]:.1f}" for s in most),
-                f"+{found['peak_memory_growth_mb'][sensors]:.0f}" if mode == "value" else "",
-            )
-    console.print(stages)
-    encodings = Table("J", "rows", *(f"{encoding} {what}" for encoding in ENCODINGS for what in ("bytes", "ms")))
+            stages[f"J = {sensors}, {mode}"] = {
+                "share p50 ms": p50["share"],
+                "ratio": found["share_ratio"][mode][sensors],
+                "p95": told["share_p95"],
+                "round trip": p50["round_trip"],
+                "its ratio": found["round_trip_ratio"][mode][sensors],
+                "most of it": ", ".join(f"{s} {own[s]:.1f}" for s in sorted(own, key=lambda s: -own[s])[:3]),
+                "memory MB": found["peak_memory_growth_mb"][sensors] if mode == "value" else "",
+            }
     for sensors, payloads in found["wire"].items():
-        for name, told in payloads.items():
-            cells = [
-                f"{told[e][what]:,.{places}f}" for e in ENCODINGS for what, places in (("bytes", 0), ("read_ms", 2))
-            ]
-            encodings.add_row(f"{int(sensors):,}", f"{name} {told['sensors']:,}", *cells)
-    console.print(encodings)
-    for sensors, payloads in found["wire"].items():
-        extra = payloads["pruned"]
-        weights = ", ".join(f"{size:,} {encoding}" for encoding, size in extra["weights_bytes"].items())
-        console.print(f"pruned, J = {int(sensors):,}: {extra['onboard_ms']:.1f} ms on board; weights {weights} bytes")
-    console.print(f"goals: share at 1,000 to 10 at most {GOALS['share_1000_to_10']:g}, at 2,000 at most", end=" ")
-    console.print(f"{GOALS['share_2000_to_10']:g}; memory under {GOALS['memory_mb']:g} MB. Wrote {args.out}")
+        for uplink, told in payloads.items():
+            sizes[f"J = {sensors}, {uplink}, {told['sensors']} rows"] = {
+                f"{e} {label}": told[e][what]
+                for e in ENCODINGS
+                for what, label in (("bytes", "bytes"), ("read_ms", "ms"))
+            }
+        told = payloads["pruned"]
+        weights = {f"weights, {encoding}": size for encoding, size in told["weights_bytes"].items()}
+        pruned[f"J = {sensors}"] = {"ms on board": told["onboard_ms"], **weights}
+    return {"Share of a decision": stages, "A request": sizes, "Uplink pruned": pruned}
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Sensors, description=__doc__)))
+    run(Sensors, measure)

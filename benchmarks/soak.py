@@ -1,6 +1,6 @@
 """A long flight of 200 missions against one edge: do its memory, tasks, connections and files stay bounded?
 
-    python benchmarks/soak.py --minutes 60
+    python -m benchmarks.soak --minutes 60
 
 It starts an edge with its embedded LLM and a store, and flies 198 missions of mode ``value`` and 2 of mode ``guided``
 at the same time, with outcomes, request keys, retries and sometimes a deleted mission. A mission's memory is bounded,
@@ -15,32 +15,24 @@ as JSON. ``--guided 0`` shows the edge without the LLM's own memory.
 
 from __future__ import annotations
 
-import json
-import os
 import random
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 import uuid
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
-import psutil
-import tyro
-from rich.console import Console
 from rich.progress import Progress
 from scipy import stats
 
-from shared.client.edge_client import EdgeClient
-from simulator.flying.local_edge import HOST, usable_port
+from benchmarks.harness import Goal, Options, Report, Server, edge, run
+from benchmarks.load import SENSORS, heard
 
-MISSIONS, UAVS, SENSORS = 200, 3, 10
+MISSIONS, UAVS = 200, 3
 # Outcomes of each mission before the measurement, by mode.
 WARM = {"value": 900, "guided": 300}
 # Seconds at the measurement's pace before the measurement, in which memory freed by the slower pace is used again.
@@ -51,7 +43,7 @@ DELETED_ONE_IN = 2000
 
 
 @dataclass(frozen=True)
-class Soak:
+class Soak(Options):
     """Fly 200 missions and watch the edge's memory."""
 
     minutes: float = 10.0
@@ -60,8 +52,6 @@ class Soak:
     """Seconds in which every mission flies a step during the measurement; 0: full speed."""
     guided: int = 2
     """Missions of mode guided, with the embedded LLM; 0 loads no LLM."""
-    out: Path = Path("runs/soak.json")
-    """Where to write the figures."""
 
 
 @dataclass
@@ -84,24 +74,6 @@ class Sample:
     tasks: float
     connections: int
     files: int
-
-
-def report(mission: Mission, uav: int, random_: random.Random) -> dict[str, Any]:
-    """A UAV that hears its ten sensors."""
-    return {
-        "uav_id": uav,
-        "position": [500.0 + 10 * uav, 450.0],
-        "sensors": {
-            "id": list(range(SENSORS)),
-            "x": [100.0 * i for i in range(SENSORS)],
-            "y": [90.0 * i for i in range(SENSORS)],
-            "queue": [random_.randrange(60) for _ in range(SENSORS)],
-            "battery": [40.0] * SENSORS,
-            "channel_gain": [-90.0] * SENSORS,
-            "last_seen": [mission.step] * SENSORS,
-        },
-        "outcome": mission.owed.get(uav),
-    }
 
 
 class Worker(threading.Thread):
@@ -138,7 +110,7 @@ class Worker(threading.Thread):
         body = {
             "mission_id": mission.name,
             "step": mission.step,
-            "uavs": [report(mission, uav, self._random) for uav in range(UAVS)],
+            "uavs": [self._state(mission, uav) for uav in range(UAVS)],
         }
         key = {"Idempotency-Key": uuid.uuid4().hex}
         for _ in range(1 + (self._random.randrange(20) == 0)):
@@ -150,18 +122,22 @@ class Worker(threading.Thread):
             mission.told[told["source"]] += 1
         mission.step += 1
 
+    def _state(self, mission: Mission, uav: int) -> dict[str, Any]:
+        sensors = heard(mission.step, [self._random.randrange(60) for _ in range(SENSORS)])
+        owed = mission.owed.get(uav)
+        return {"uav_id": uav, "position": [500.0 + 10 * uav, 450.0], "sensors": sensors, "outcome": owed}
 
-def sample(url: str, process: psutil.Process, began: float) -> Sample:
-    """The process's present resources."""
-    lines = httpx.get(f"{url}/metrics", timeout=30).text.splitlines()
+
+def sample(edge: Server, began: float) -> Sample:
+    """The edge's present resources."""
+    lines = httpx.get(f"{edge.url}/metrics", timeout=30).text.splitlines()
     tasks = next(float(line.split()[1]) for line in lines if line.startswith("aicvds_tasks "))
     return Sample(
         at_s=time.monotonic() - began,
-        # With the process that writes its store.
-        resident_mb=sum(each.memory_info().rss for each in (process, *process.children())) / 1e6,
+        resident_mb=edge.resident_bytes() / 1e6,
         tasks=tasks,
-        connections=len(process.net_connections("tcp")),
-        files=process.num_fds(),
+        connections=len(edge.process.net_connections("tcp")),
+        files=edge.process.num_fds(),
     )
 
 
@@ -176,23 +152,29 @@ def slope(samples: list[Sample]) -> tuple[float, float]:
     return float(fit.slope), float(stats.t.ppf(0.975, len(parts) - 2) * fit.stderr)
 
 
-def main() -> int:
-    """Run the soak test; returns 0 if nothing grows."""
-    options, console = tyro.cli(Soak, description=__doc__), Console()
+def measure(options: Soak) -> Report:
+    """Fly; the report's goals say whether anything grows."""
     missions = [Mission(f"soak{n}", "guided" if n < options.guided else "value") for n in range(MISSIONS)]
-    with tempfile.TemporaryDirectory() as folder:
-        port = usable_port(0)
-        url = f"http://{HOST}:{port}"
-        settings = {"AICVDS_STORE": f"{folder}/missions.db", "AICVDS_LOG_LEVEL": "error"}
-        if not options.guided:
-            settings["AICVDS_MODE"] = "value"
-        command = [sys.executable, "-m", "shared.kit.command_line", "serve", "--host", HOST, "--port", str(port)]
-        with subprocess.Popen(command, env={**os.environ, **settings}) as edge:
-            try:
-                samples = _fly(url, edge.pid, missions, options, console)
-            finally:
-                edge.terminate()
-    return _tell(samples, missions, options, console)
+    with edge({"LOG_LEVEL": "error", **({} if options.guided else {"MODE": "value"})}) as server:
+        samples = _fly(server, missions, options)
+    grown, half = slope(samples)
+    figures: dict[str, Any] = {
+        "minutes": options.minutes,
+        "missions": MISSIONS,
+        "pace_s": options.pace_s,
+        "decisions": sum(mission.told.total() for mission in missions),
+        "guided": dict(sum((mission.told for mission in missions if mission.mode == "guided"), Counter[str]())),
+        "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
+        "slope_mb_an_hour": [round(value, 2) for value in (grown, grown - half, grown + half)],
+    }
+    goals = [Goal("memory, MB an hour, lower bound", grown - half, most=1.0)]
+    tenth = max(1, len(samples) // 10)
+    for name in ("tasks", "connections", "files"):
+        counts = [getattr(s, name) for s in samples]
+        first, last = figures[name] = [max(counts[:tenth]), max(counts[-tenth:])]
+        goals.append(Goal(f"growth of the {name}", last - first, most=5))
+    rows = {name: {"measured": str(figure)} for name, figure in figures.items()}
+    return Report(figures, {"Soak": rows}, goals)
 
 
 def _settle(workers: list[Worker], progress: Progress, seconds: float) -> None:
@@ -204,19 +186,17 @@ def _settle(workers: list[Worker], progress: Progress, seconds: float) -> None:
     progress.update(settling, completed=seconds)
 
 
-def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Console) -> list[Sample]:
-    with EdgeClient(url, timeout_s=30) as waiting:
-        waiting.wait_ready(300)
-    with httpx.Client(base_url=url, timeout=300) as client:
+def _fly(edge: Server, missions: list[Mission], options: Soak) -> list[Sample]:
+    with httpx.Client(base_url=edge.url, timeout=300) as client:
         for mission in missions:
             client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
     guided, others = missions[: options.guided], missions[options.guided :]
     shares = [share for share in (guided, *(others[n::WORKERS] for n in range(WORKERS))) if share]
-    workers = [Worker(url, share, seed) for seed, share in enumerate(shares)]
+    workers = [Worker(edge.url, share, seed) for seed, share in enumerate(shares)]
     for worker in workers:
         worker.start()
-    process, samples = psutil.Process(pid), list[Sample]()
-    with Progress(console=console) as progress:
+    samples = list[Sample]()
+    with Progress() as progress:
         warming = progress.add_task("warming up", total=1.0)
         while (least := min(UAVS * mission.step / WARM[mission.mode] for mission in missions)) < 1.0:
             progress.update(warming, completed=least)
@@ -231,7 +211,7 @@ def _fly(url: str, pid: int, missions: list[Mission], options: Soak, console: Co
         began = time.monotonic()
         measuring = progress.add_task("measuring", total=options.minutes * 60)
         while time.monotonic() < began + options.minutes * 60:
-            samples.append(sample(url, process, began))
+            samples.append(sample(edge, began))
             progress.update(measuring, completed=samples[-1].at_s)
             _check(workers)
             time.sleep(SAMPLE_S)
@@ -247,29 +227,5 @@ def _check(workers: list[Worker]) -> None:
         raise SystemExit(f"soak: {faults[0]}")
 
 
-def _tell(samples: list[Sample], missions: list[Mission], options: Soak, console: Console) -> int:
-    tenth = max(1, len(samples) // 10)
-    grown, half = slope(samples)
-    figures: dict[str, Any] = {
-        "minutes": options.minutes,
-        "missions": MISSIONS,
-        "pace_s": options.pace_s,
-        "decisions": sum(mission.told.total() for mission in missions),
-        "guided": dict(sum((mission.told for mission in missions if mission.mode == "guided"), Counter[str]())),
-        "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
-        "slope_mb_an_hour": [round(grown, 2), round(grown - half, 2), round(grown + half, 2)],
-    }
-    for name in ("tasks", "connections", "files"):
-        counts = [getattr(s, name) for s in samples]
-        figures[name] = [max(counts[:tenth]), max(counts[-tenth:])]
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(figures, indent=2) + "\n")
-    for name, figure in figures.items():
-        console.print(f"{name:>18}  {figure}")
-    grew = [name for name in ("tasks", "connections", "files") if figures[name][1] > figures[name][0] + 5]
-    console.print("grows: " + ", ".join(grew) if grew else "no count grows")
-    return 1 if grew or grown - half > 1.0 else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(0 if run(Soak, measure) else 1)

@@ -1,6 +1,6 @@
 """The time to start: `aicvds serve` beside the imports of its parts, and `--help` of every command.
 
-    python benchmarks/startup.py --rounds 10
+    python -m benchmarks.startup --rounds 10
 
 A round measures by the clock, from the start of a process: `python -c "import torch, fastapi"`; `aicvds serve`
 in its ordinary configuration (SQLite, mode guided, planner, the embedded LLM loading) until /healthz answers 200;
@@ -12,8 +12,6 @@ compiles, fills the disk's cache and makes the store, so the benchmark measures 
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import subprocess
 import sys
@@ -28,13 +26,9 @@ from pathlib import Path
 
 import httpx
 import numpy as np
-import tyro
-from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
-from scipy.stats import bootstrap
 
+from benchmarks.harness import Goal, Options, Report, environment, in_turn, run
+from lab.experiments.intervals import ratio_of_medians
 from service.api.openapi_examples import REQUESTS
 
 GOAL_RATIO, GOAL_HELP_S = 1.5, 0.3
@@ -43,64 +37,48 @@ IMPORTS, HEALTHZ, DECIDE, HELP = "import torch, fastapi", "serve: /healthz", "se
 
 
 @dataclass(frozen=True)
-class Startup:
+class Startup(Options):
     """Start everything repeatedly, in turns."""
 
     rounds: int = 10
     """Measured starts of each."""
-    out: Path = Path("runs/startup.json")
-    """Where to write."""
 
 
-def main(args: Startup) -> int:
-    """Measure, print, write."""
-    console = Console()
+def measure(args: Startup) -> Report:
+    """Start everything in turn; raises ``SystemExit`` without the embedded LLM."""
     with tempfile.TemporaryDirectory() as folder:
-        env = _ordinary(Path(folder) / "missions.db")
-        timed = _timed(env)
-        if (llm := _llm(env)) not in ("loading", "ready"):
-            console.print(f"[red]The embedded LLM is {llm}: run `aicvds model fetch` first.")
-            return 1
-        seconds: dict[str, list[float]] = {name: [] for name in timed}
-        for counted in track([False] + [True] * args.rounds, "Starting", console=console):
-            for name, run in timed.items():
-                took = run()
-                if counted:
-                    seconds[name].append(took)
-    healthz, decide = (_ratio(seconds[name], seconds[IMPORTS]) for name in (HEALTHZ, DECIDE))
+        # What is timed is one request, which makes its mission.
+        env = environment({"STORE": f"{folder}/missions.db", "CREATE_ON_DECIDE": "on"})
+        with _edge(env) as (client, _):
+            if (llm := client.get("/readyz").json()["llm"]) not in ("loading", "ready"):
+                raise SystemExit(f"The embedded LLM is {llm}: run `aicvds model fetch` first.")
+        seconds = in_turn(_timed(env), args.rounds, warm_up=1)
+    ratios = {name: ratio_of_medians(seconds[name], seconds[IMPORTS]) for name in (HEALTHZ, DECIDE)}
+    medians = {name: float(np.median(took)) for name, took in seconds.items()}
     found = {
         "rounds": args.rounds,
-        "command": sys.argv,
-        "median_s": {name: round(float(np.median(took)), 3) for name, took in seconds.items()},
+        "median_s": {name: round(median, 3) for name, median in medians.items()},
         "seconds": {name: [round(one, 4) for one in took] for name, took in seconds.items()},
-        "healthz_to_imports": healthz,
-        "decide_to_imports": decide,
-        "goal_ratio": GOAL_RATIO,
-        "goal_help_s": GOAL_HELP_S,
+        "healthz_to_imports": dict(zip(("ratio", "low", "high"), ratios[HEALTHZ], strict=True)),
+        "decide_to_imports": dict(zip(("ratio", "low", "high"), ratios[DECIDE], strict=True)),
     }
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
-    console.print(_table(seconds, healthz, decide))
-    return 0
+    rows = {
+        name: {"median s": medians[name], "least": min(took), "most": max(took), "to the imports": ratios.get(name, "")}
+        for name, took in seconds.items()
+    }
+    goals = [Goal(f"{HEALTHZ}, to the imports", ratios[HEALTHZ], most=GOAL_RATIO)]
+    return Report(found, {"Starts": rows}, [*goals, Goal(f"aicvds {HELP}, s", medians[HELP], most=GOAL_HELP_S)])
 
 
-def _ordinary(store: Path) -> dict[str, str]:
-    """This environment without its settings, except the model's folder, and with a store of its own."""
-    env = {name: value for name, value in os.environ.items() if not name.startswith(("AICVDS_", "OTEL_"))}
-    env |= {name: os.environ[name] for name in ("AICVDS_CACHE_DIR",) if name in os.environ}
-    # What is timed is one request, which makes its mission.
-    return env | {"AICVDS_STORE": str(store), "AICVDS_CREATE_ON_DECIDE": "on"}
-
-
-def _timed(env: dict[str, str]) -> dict[str, Callable[[], float]]:
+def _timed(env: dict[str, str]) -> dict[str, Callable[[int], float]]:
     """The starts of a round, in order; each returns seconds."""
     commands = sorted(entry.name for entry in entry_points(group="aicvds.commands"))
     helps = [[HELP], *([command, HELP] for command in commands)]
     return {
-        IMPORTS: lambda: _ended([sys.executable, "-c", IMPORTS], env),
-        HEALTHZ: lambda: _served(env, lambda client: client.get("/healthz")),
-        DECIDE: lambda: _served(env, lambda client: client.post("/decide", json=_request())),
-        **{" ".join(words): lambda words=words: _ended([AICVDS, *words], env) for words in helps},  # type: ignore[misc]
+        IMPORTS: lambda _: _ended([sys.executable, "-c", IMPORTS], env),
+        HEALTHZ: lambda _: _served(env, lambda client: client.get("/healthz")),
+        DECIDE: lambda _: _served(env, lambda client: client.post("/decide", json=_request())),
+        **{" ".join(words): lambda _, words=words: _ended([AICVDS, *words], env) for words in helps},  # type: ignore[misc]
     }
 
 
@@ -121,12 +99,6 @@ def _served(env: dict[str, str], ask: Callable[[httpx.Client], httpx.Response]) 
     with _edge(env) as (client, began):
         ask(client).raise_for_status()
         return time.perf_counter() - began
-
-
-def _llm(env: dict[str, str]) -> str:
-    """The state of an edge's LLM."""
-    with _edge(env) as (client, _):
-        return str(client.get("/readyz").json()["llm"])
 
 
 @contextmanager
@@ -150,31 +122,5 @@ def _edge(env: dict[str, str]) -> Iterator[tuple[httpx.Client, float]]:
                 process.stderr.read()
 
 
-def _ratio(above: list[float], below: list[float]) -> dict[str, float]:
-    """Ratio of medians, and its 95% percentile bootstrap interval over rounds."""
-
-    def ratio(a: NDArray[np.float64], b: NDArray[np.float64], axis: int = -1) -> NDArray[np.float64]:
-        return np.asarray(np.median(a, axis=axis) / np.median(b, axis=axis))
-
-    rounds = (np.array(above), np.array(below))
-    told = {"ratio": float(ratio(*rounds))}
-    if len(above) > 1:
-        interval = bootstrap(rounds, ratio, paired=True, method="percentile", rng=0).confidence_interval
-        told |= {"low": float(interval.low), "high": float(interval.high)}
-    return {name: round(value, 3) for name, value in told.items()}
-
-
-def _table(seconds: dict[str, list[float]], healthz: dict[str, float], decide: dict[str, float]) -> Table:
-    table = Table("", "median s", "least", "most", "to the imports", "goal", title=f"{len(seconds[HELP])} rounds")
-    ratios = {HEALTHZ: healthz, DECIDE: decide}
-    goals = {HEALTHZ: f"< {GOAL_RATIO}", HELP: f"< {GOAL_HELP_S} s"}
-    for name, took in seconds.items():
-        ratio = ratios.get(name, {})
-        told = f"{ratio['ratio']:.2f} [{ratio.get('low', 0):.2f}, {ratio.get('high', 0):.2f}]" if ratio else ""
-        row = (name, f"{np.median(took):.2f}", f"{min(took):.2f}", f"{max(took):.2f}", told, goals.get(name, ""))
-        table.add_row(*row)
-    return table
-
-
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Startup, description=__doc__)))
+    run(Startup, measure)

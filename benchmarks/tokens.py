@@ -1,41 +1,32 @@
-"""Tokens of a decision beside the paper's own template, their cost in time and quality, and a compressor's.
+"""Tokens of a decision beside the paper's own template, and their cost in time and quality.
 
-    python benchmarks/tokens.py
-    python benchmarks/tokens.py --seeds 30 --asked 3    # more decisions for the LLM: narrower intervals
+    python -m benchmarks.tokens
+    python -m benchmarks.tokens --seeds 30 --asked 3    # more decisions for the LLM: narrower intervals
 
 It flies missions by a planner and makes the prompts of every decision in several forms: those of the edge's modes, and
-the paper's, with all sensors in words and 30 experiences (`paper_template.py` says which parts of it are known). It
-counts whole prompts in tiktoken's o200k_base and in the embedded model's own tokens, and the newly read tokens of a
-server that has the prompt before in its cache. The embedded model answers some decisions from the middle of each
-mission: the benchmark measures time, the server's own account of its cache, and the answers' quality by the edge's
-rollout evaluator. Last, it measures whether a compressor of LLMLingua-2's size pays. Intervals are 95% bootstrap
-intervals over missions (tokens), decisions (quality) or pairs (times).
+the paper's, with all sensors in words and 30 experiences (`lab/benchmarks/paper_template.py` says which parts of it are
+known). It counts whole prompts in tiktoken's o200k_base and in the embedded model's own tokens, and the newly read
+tokens of a server that has the prompt before in its cache. The embedded model answers some decisions from the middle of
+each mission: the benchmark measures time, the server's own account of its cache, and the answers' quality by the edge's
+rollout evaluator. Intervals are 95% bootstrap intervals over missions (tokens), decisions (quality) or pairs (times).
 """
 
 from __future__ import annotations
 
-import json
 import statistics
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
-import tyro
-from compressors import KEPT, LARGE, SMALL, TINY, WINDOW, Compressor, Size, attention_s
-from flown_prompts import CONTEXT, GUIDED, LLM, LLM_ALL, PAPER, WAYS, Asked, flown
-from local_llm import Answered, LocalLLM
-from paper_template import STATED_STATE_TOKENS
-from ratios import ratio_of_medians, shown
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from lab.experiments.intervals import interval, paired
+from benchmarks.flown_prompts import CONTEXT, GUIDED, LLM, PAPER, WAYS, Asked, flown
+from benchmarks.harness import Cell, Goal, Options, Report, run
+from lab.benchmarks.local_llm import Answered, LocalLLM
+from lab.benchmarks.paper_template import STATED_STATE_TOKENS
+from lab.experiments.intervals import interval, paired, ratio_of_medians
 from service.config.settings import Settings
 from service.deciding.rollout_evaluator import evaluate
 from service.llm.answers import NoDecision, check_answer
@@ -48,15 +39,13 @@ GOAL_PROMPT, GOAL_NEW = 0.5, 0.15
 JUDGED = (GUIDED, LLM, PAPER)
 # The comparisons of the answers: uniform draws among all sensors of a prompt, and among those that attention keeps.
 _DRAWN, _DRAWN_KEPT = "drawn", "drawn_among_kept"
-# Prefill speeds, tokens a second, for which the benchmark computes whether compression pays.
-SPEEDS = (50, 200, 1_000, 10_000)
 _COUNTS = ("o200k", "own", "new")
 # By o200k_base: the whole prompt and its blocks, as the edge's token accounting calls them.
 _BLOCKS = {"o200k": "prompt", "o200k_static": "static", "o200k_experiences": "experiences", "o200k_state": "state"}
 
 
 @dataclass(frozen=True)
-class Tokens:
+class Tokens(Options):
     """Count tokens, time them, and compare with the paper's template."""
 
     seeds: int = 6
@@ -72,51 +61,39 @@ class Tokens:
     steps: int | None = None
     """Steps of each mission; by default the scenario's."""
     threads: int = 1
-    """Threads of the embedded LLM and of the compressor."""
-    encoders: Literal["real", "tiny"] = "real"
-    """Sizes of the compressors; `tiny` only shows that the benchmark runs."""
-    repeats: int = 3
-    """Repetitions of a compressor's window."""
-    out: Path = Path("runs/tokens.json")
-    """Where to write the figures."""
+    """Threads of the embedded LLM."""
 
 
-def main(args: Tokens) -> int:
-    """Fly, count, ask, compress; print and write."""
-    torch.set_num_threads(args.threads)
-    console, scenario = Console(), scenario_named(args.scenario)
+def measure(args: Tokens) -> Report:
+    """Fly, count, ask."""
+    scenario = scenario_named(args.scenario)
     if args.steps is not None:
         scenario = scenario.model_copy(update={"steps": args.steps})
     seeds = range(args.first, args.first + args.seeds)
-    flights = [flown(scenario, seed, args.policy).asked for seed in track(seeds, "Flying", console=console)]
+    flights = [flown(scenario, seed, args.policy).asked for seed in track(seeds, "Flying")]
     with LocalLLM(args.threads, CONTEXT) as llm:
-        counts = counted(flights, llm, console)
-        name = llm.name
-    answers = put(flights, scenario, args, console)
+        tokens, name = token_figures(counted(flights, llm)), llm.name
     found: dict[str, Any] = {
-        "command": sys.argv,
-        "options": {**asdict(args), "out": str(args.out)},
+        "options": asdict(args),
         "model": name,
         "decisions": [len(flight) for flight in flights],
-        "tokens": token_figures(counts),
+        "tokens": tokens,
         "state_tokens_stated_by_the_paper": STATED_STATE_TOKENS,
-        "asked": asked_figures(answers, scenario),
-        "goal": {"prompt": GOAL_PROMPT, "new": GOAL_NEW},
+        "asked": asked_figures(put(flights, scenario, args), scenario),
     }
-    window, read_s = compressing(flights[-1][-1], scenario, args, console)
-    found["compression"] = compression_figures(found["tokens"], window, read_s, attention_s(scenario, 200))
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(found, indent=1) + "\n")
-    tell(found, console)
-    console.print(f"Wrote {args.out}")
-    return 0
+    goals = []
+    for way in (GUIDED, LLM):
+        ratio = tokens[way]["ratio"]
+        goals.append(Goal(f"{WAYS[way]}: tokens to the paper's", ratio["own"], most=GOAL_PROMPT))
+        goals.append(Goal(f"{WAYS[way]}: newly read to the paper's whole", ratio["new_to_whole"], most=GOAL_NEW))
+    return Report(found, tables(found), goals)
 
 
-def counted(flights: Sequence[Sequence[Asked]], llm: LocalLLM, console: Console) -> dict[str, dict[str, list[float]]]:
+def counted(flights: Sequence[Sequence[Asked]], llm: LocalLLM) -> dict[str, dict[str, list[float]]]:
     """By form and count one mean for each mission: tokens by o200k_base, by the model, and not in the prompt before."""
     counter = TokenCounter(Settings().cache_dir)
     means: dict[str, dict[str, list[float]]] = {way: {count: [] for count in (*_COUNTS, *_BLOCKS)} for way in WAYS}
-    for flight in track(flights, "Counting", console=console):
+    for flight in track(flights, "Counting"):
         for way in WAYS:
             prompts = [asked.ways[way].prompt for asked in flight]
             own = [llm.tokens(prompt) for prompt in prompts]
@@ -165,16 +142,14 @@ class Told:
     reckoned: int | None
 
 
-def put(
-    flights: Sequence[Sequence[Asked]], scenario: Scenario, args: Tokens, console: Console
-) -> dict[str, list[Told]]:
+def put(flights: Sequence[Sequence[Asked]], scenario: Scenario, args: Tokens) -> dict[str, list[Told]]:
     """Ask the embedded LLM for decisions in each form of ``JUDGED``, side by side, each with a server of its own."""
     middles = [(i > 0, asked) for flight in flights for i, asked in enumerate(middle(flight, args.asked + 1))]
     answers: dict[str, list[Told]] = {way: [] for way in JUDGED}
     before: dict[str, list[int]] = {}
     with ExitStack() as stack:
         models = {way: stack.enter_context(LocalLLM(args.threads, CONTEXT)) for way in JUDGED}
-        for warm, asked in track(middles, "Asking", console=console):
+        for warm, asked in track(middles, "Asking"):
             for way, llm in models.items():
                 now = llm.tokens(asked.ways[way].prompt)
                 answered = llm.ask(asked.ways[way].body(scenario.max_velocity + 1))
@@ -242,101 +217,29 @@ def action(way: str, asked: Asked, answered: Answered, levels: int) -> Action | 
         return None
 
 
-def compressing(
-    last: Asked, scenario: Scenario, args: Tokens, console: Console
-) -> tuple[dict[str, list[float]], list[float]]:
-    """Seconds of a window by compressor, and the embedded LLM's seconds to read a token, measured side by side."""
-    sizes: Sequence[Size] = (SMALL, LARGE) if args.encoders == "real" else (TINY,)
-    encoders = {size.label: Compressor(size) for size in sizes}
-    window: dict[str, list[float]] = {label: [] for label in encoders}
-    read_s: list[float] = []
-    body = last.ways[PAPER].body(scenario.max_velocity + 1)
-    # About one window: the static block, and little more.
-    body["messages"] = [body["messages"][0], {"role": "user", "content": "Current state: none"}]
-    with LocalLLM(args.threads, CONTEXT) as llm:
-        for _ in track(range(args.repeats), "Compressing", console=console):
-            for label, encoder in encoders.items():
-                window[label].append(encoder.window_s(WINDOW))
-            answered = llm.ask(body, cache_prompt=False, max_tokens=1)
-            read_s.append(answered.seconds / max(1, answered.new))
-    return window, read_s
-
-
-def compression_figures(
-    tokens: dict[str, Any], window: dict[str, list[float]], read_s: Sequence[float], attention: Sequence[float]
-) -> dict[str, Any]:
-    """Seconds spent to seconds saved, and the prefill speed below which compression pays.
-
-    An encoder's time is measured on one window; a prompt's time is proportional to it.
-    """
-    prompt, speed = tokens[PAPER]["own"]["mean"], 1 / statistics.median(read_s)
-    reckoned_s = {f"{way}, cached": tokens[way]["new"]["mean"] / speed for way in (GUIDED, LLM, PAPER)}
-    reckoned_s |= {f"{PAPER}, whole": prompt / speed}
-    compressors = {}
-    for label, took in window.items():
-        median = statistics.median(took)
-        reckoned_s[f"{PAPER}, halved by {label}"] = median * prompt / WINDOW + KEPT * prompt / speed
-        compressors[label] = {
-            "window_s_median": median,
-            "spent_to_saved_embedded": ratio_of_medians(took, [s * WINDOW * (1 - KEPT) for s in read_s]),
-            "spent_to_saved_at_speed_reckoned": {str(at): median / WINDOW * at / (1 - KEPT) for at in SPEEDS},
-            "pays_below_tokens_per_s": WINDOW * (1 - KEPT) / median,
+def tables(found: dict[str, Any]) -> dict[str, dict[str, dict[str, Cell]]]:
+    """For the reader."""
+    ratios = {"own": "to paper's: whole", "new": "newly read", "new_to_whole": "to its whole"}
+    tokens = {
+        label: {
+            **{count: found["tokens"][way][count]["mean"] for count in _COUNTS},
+            **{title: found["tokens"][way]["ratio"][name] for name, title in ratios.items()},
         }
-    saved = tokens[LLM_ALL]["new"]["mean"] - tokens[LLM]["new"]["mean"]
-    return {
-        "kept": KEPT,
-        "embedded_prefill_tokens_per_s": speed,
-        "seconds_to_read_reckoned": reckoned_s,
-        "compressors": compressors,
-        "attention": {
-            "ms_median": statistics.median(attention) * 1e3,
-            "ms_p99": float(np.quantile(attention, 0.99)) * 1e3,
-            "tokens_saved": saved,
-            "pays_below_tokens_per_s": saved / statistics.median(attention),
-        },
+        for way, label in WAYS.items()
     }
-
-
-def tell(found: dict[str, Any], console: Console) -> None:
-    """Print the figures."""
-    table = Table(
-        "", "o200k", "own", "newly read", "to paper's: whole", "newly read", "to its whole", title="Tokens a decision"
-    )
-    for way, label in WAYS.items():
-        row = found["tokens"][way]
-        means = [f"{row[count]['mean']:.0f}" for count in _COUNTS]
-        ratios = [shown(row["ratio"][name]) for name in ("own", "new", "new_to_whole")]
-        table.add_row(label, *means, *ratios)
-    console.print(table)
     told = found["asked"]
-    for way in JUDGED:
-        one, lost = told[way], told["lost_packets_above_best"][way]
-        console.print(
-            f"{WAYS[way]}: {one['seconds_median']:.2f} s, {shown(one['to_paper_seconds'])} times the paper's; "
-            f"expected to lose {lost['mean']:.2f} [{lost['low']:.2f}, {lost['high']:.2f}] packets above the best",
-            highlight=False,
-        )
-    for name in (_DRAWN, _DRAWN_KEPT):
-        drawn = told["lost_packets_above_best"][name]
-        console.print(f"{name}: {drawn['mean']:.2f} [{drawn['low']:.2f}, {drawn['high']:.2f}]", highlight=False)
+    above, to_paper = "lost packets above the best", {"difference": "difference to paper", "ratio": "ratio to paper"}
+    quality: dict[str, dict[str, Cell]] = {}
+    for way, lost in told["lost_packets_above_best"].items():
+        quality[WAYS.get(way, way)] = {above: [lost["mean"], lost["low"], lost["high"]]}
+        if way in told:
+            row = {"s": told[way]["seconds_median"], "to the paper's": told[way]["to_paper_seconds"]}
+            quality[WAYS[way]] = row | quality[WAYS[way]]
     for pair in told["compared"]:
-        console.print(f"{pair['scheme']} - paper, {pair['kind']}: {shown([pair['mean'], pair['low'], pair['high']])}")
-    for label, one in found["compression"]["compressors"].items():
-        console.print(
-            f"{label}: {shown(one['spent_to_saved_embedded'])} times what halving saves the embedded LLM; "
-            f"pays below {one['pays_below_tokens_per_s']:.0f} tokens/s",
-            highlight=False,
-        )
-    for label, seconds in found["compression"]["seconds_to_read_reckoned"].items():
-        console.print(f"reading {label}: {seconds:.2f} s, computed", highlight=False)
-    attention = found["compression"]["attention"]
-    console.print(
-        f"attention: {attention['ms_median']:.3f} ms for {attention['tokens_saved']:.1f} tokens; pays below "
-        f"{attention['pays_below_tokens_per_s']:.0f} tokens/s (embedded: "
-        f"{found['compression']['embedded_prefill_tokens_per_s']:.0f})",
-        highlight=False,
-    )
+        row = quality[WAYS.get(pair["scheme"], pair["scheme"])]
+        row[to_paper[pair["kind"]]] = [pair["mean"], pair["low"], pair["high"]]
+    return {"Tokens a decision": tokens, "The embedded LLM's answers": quality}
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Tokens, description=__doc__)))
+    run(Tokens, measure)

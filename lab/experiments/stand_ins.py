@@ -79,7 +79,9 @@ class _Handler(BaseHTTPRequestHandler):
     answer: Answer
 
     def do_GET(self) -> None:
-        self._answer(200, {"object": "list", "data": [{"id": NAMES[type(self).answer], "object": "model"}]})
+        self._answer(
+            200, {"object": "list", "data": [{"id": NAMES.get(type(self).answer, "stand-in"), "object": "model"}]}
+        )
 
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers.get("Content-Length", 0))))

@@ -25,7 +25,7 @@ NOTHING = "nothing"
 SEPARATOR = ", "
 MOST_ORDERS = 6
 # The examples in the prompt. With 8 of them a model of 135M parameters compiles 22 of 30 held-out notes correctly. The
-# orders of the most similar example with the note's numbers are correct for 17 (benchmarks/notes.py).
+# orders of the most similar example with the note's numbers are correct for 17 (lab/benchmarks/notes.py).
 _EXAMPLES_SHOWN = 8
 
 VISIT, WEIGHT = "visit sensor # every # steps", "sensor # counts # times"

@@ -1,4 +1,4 @@
-"""Runs a benchmark as its docstring says, as a process of its own."""
+"""Runs a benchmark or a study as its docstring says, as a process of its own."""
 
 import json
 import subprocess
@@ -9,9 +9,9 @@ from typing import Any
 from tests.support.places import ROOT
 
 
-def figures(name: str, *options: str, out: Path) -> Any:
+def figures(module: str, *options: str, out: Path) -> Any:
     """What it wrote."""
-    command = [sys.executable, f"benchmarks/{name}.py", *options, "--out", str(out)]
+    command = [sys.executable, "-m", module, *options, "--out", str(out)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(out.read_text())

@@ -11,7 +11,9 @@ pytestmark = pytest.mark.long
 
 def test_it_tells_costs_and_predicts_from_them(tmp_path: Path) -> None:
     little = ("--edges", "1", "--missions", "2", "--connections", "2", "--seconds", "1", "--writers", "1")
-    found = figures("capacity", *little, "--pace", "0", "--flights", "0", "--leases", "5", out=tmp_path / "c.json")
+    found = figures(
+        "benchmarks.capacity", *little, "--pace", "0", "--flights", "0", "--leases", "5", out=tmp_path / "c.json"
+    )
     told = found["full"]["1"]
     spent = told["edge_s"] + told["database_s"] + told["client_s"]
     assert told["edge_s"] > told["database_s"] > 0 and told["log_bytes"] > 0

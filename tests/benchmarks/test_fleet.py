@@ -11,8 +11,8 @@ pytestmark = pytest.mark.long
 
 def test_it_tells_decisions_a_second_memory_and_what_learning_costs(tmp_path: Path) -> None:
     little = ("--missions", "1", "3", "--decisions", "9", "--each", "6", "--veterans", "1", "--lifetime", "9")
-    paced = ("--pace", "50", "--block", "5", "--blocks", "1")
-    found = figures("fleet", *little, *paced, out=tmp_path / "fleet.json")
+    paced = ("--pace", "50", "--block", "5", "--rounds", "1")
+    found = figures("benchmarks.fleet", *little, *paced, out=tmp_path / "fleet.json")
     for rate in found["rates"].values():
         assert rate["decisions_a_s"] > 0
         assert 0 < rate["p50_ms"] <= rate["p99_ms"]

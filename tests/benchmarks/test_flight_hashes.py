@@ -20,6 +20,6 @@ SHORT = r"^(paper|pipeline) (eof|wqcs|value full)|^paper (value|policy|guided) (
 
 def test_seeds_fly_as_they_flew(tmp_path: Path) -> None:
     found = figures(
-        "flight_hashes", "--seeds", "0", "1", "--steps", "3", "--only", SHORT, out=tmp_path / "flights.json"
+        "benchmarks.flight_hashes", "--seeds", "0", "1", "--steps", "3", "--only", SHORT, out=tmp_path / "flights.json"
     )
     assert found == json.loads(RECORDED.read_text())

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_round_of_every_condition(tmp_path: Path) -> None:
     options = ("--rounds", "1", "--threads", "1", "--steps", "2", "--policy", "eof", "--limit-s", "120")
-    found = figures("llm", *options, out=tmp_path / "llm.json")
+    found = figures("benchmarks.llm", *options, out=tmp_path / "llm.json")
     times = found["times"]
     for way in ("guided", "llm"):
         cold, cached = times[f"{way} cold 1 quiet"], times[f"{way} cached 1 quiet"]

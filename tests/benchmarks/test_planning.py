@@ -14,8 +14,8 @@ pytestmark = pytest.mark.long
 
 def test_an_edge_beside_itself_loses_the_same(tmp_path: Path) -> None:
     same = ROOT
-    options = ("--worlds", "1", "--scenarios", "paper", "--modes", "policy", "--before", str(same))
-    found = figures("planning", *options, out=tmp_path / "planning.json")
+    options = ("--rounds", "1", "--scenarios", "paper", "--modes", "policy", "--before", str(same))
+    found = figures("benchmarks.planning", *options, out=tmp_path / "planning.json")
     before, this = found["rows"]
     assert (before["edge"], this["edge"]) == ("before", "this")
     assert this["lost"]["values"] == before["lost"]["values"]

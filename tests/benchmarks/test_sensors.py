@@ -11,7 +11,7 @@ pytestmark = pytest.mark.long
 
 def test_it_tells_the_share_by_stage_the_memory_and_the_wire(tmp_path: Path) -> None:
     smallest = ("--sensors", "5", "40", "--steps", "2", "--rounds", "1")
-    found = figures("sensors", *smallest, out=tmp_path / "sensors.json")
+    found = figures("benchmarks.sensors", *smallest, out=tmp_path / "sensors.json")
     for mode in ("value", "llm"):
         assert found["share_ratio"][mode]["5"] == 1
         p50 = found["took_ms"][mode]["40"]["p50"]

@@ -15,7 +15,7 @@ SMALLEST = ("--seeds", "1", "--steps", "4", "--asked", "1", "--policy", "eof", "
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return figures("tokens", *SMALLEST, out=tmp_path_factory.mktemp("tokens") / "tokens.json")
+    return figures("benchmarks.tokens", *SMALLEST, out=tmp_path_factory.mktemp("tokens") / "tokens.json")
 
 
 @pytest.mark.timeout(600)

@@ -1,7 +1,7 @@
 """The way of one `POST /decide` through the code: its files, its functions, and its changes of file.
 
-    python benchmarks/decision_path.py
-    python benchmarks/decision_path.py --modes guided --list
+    python -m lab.benchmarks.decision_path
+    python -m lab.benchmarks.decision_path --modes guided --list
 
 It runs `aicvds serve` in a process of its own for each mode and round, in the main thread, with a SQLite store, a
 planner, and an LLM that answers at once from a thread of the same process. After four decisions it counts two requests
@@ -15,12 +15,8 @@ search, rollout evaluator) count apart, and the process that writes SQLite does 
 part of the way, and so are the limits on headers, the startup gate and the client of the LLM. The number of a
 coroutine's resumptions depends a little on timing, so each mode is measured several times, and the result is the
 median. It prints a table and writes JSON.
-
-Commit 15f1f40, mode guided, with an outcome: 77 files (57 service, 20 shared), 323 functions, 374 changes of file;
-without: 74, 288, 355. Mode llm: 68 files, 252 functions, 221 changes; without: 65, 221, 193. The commit after which the
-belief is copied for the other threads: guided 48, 232, 200 and 45, 201, 178; llm 45, 200, 157 and 41, 172, 134. Commit
-9785990: guided 49, 211, 174 and 46, 180, 149; llm 46, 185, 135 and 42, 157, 112. A busy machine adds 5 changes where
-the store's timer begins a commit in the midst of the decision, and 2 where a request's body comes after its head.
+A busy machine adds 5 changes where the store's timer begins a commit in the midst of the decision, and 2 where a
+request's body comes after its head.
 """
 
 from __future__ import annotations
@@ -28,7 +24,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import socket
 import statistics
 import subprocess
 import sys
@@ -37,7 +32,6 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -49,6 +43,10 @@ import tyro
 import uvicorn.protocols.http.httptools_impl as uvicorn_http
 from rich.console import Console
 from rich.table import Table
+
+from lab.experiments.stand_ins import answering
+from shared.client.edge_client import EdgeClient
+from simulator.flying.local_edge import HOST, usable_port
 
 PACKAGES = ("service", "shared")
 # Writes each part of an answer to the connection.
@@ -126,56 +124,36 @@ def counts(calls: Calls) -> dict[str, Any]:
     }
 
 
-class _Llm(BaseHTTPRequestHandler):
-    """An LLM server that answers with the first text that the grammar allows."""
-
-    protocol_version = "HTTP/1.1"
-
-    def do_GET(self) -> None:
-        self._answer({"data": [{"id": "instant"}]})
-
-    def do_POST(self) -> None:
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        groups = re.findall(r'"(\w+)"(?: \| "\w+")*', body.get("grammar", ""))
-        self._answer({"choices": [{"message": {"role": "assistant", "content": " ".join(groups) or "0 0"}}]})
-
-    def _answer(self, body: dict[str, Any]) -> None:
-        content = json.dumps(body).encode()
-        self.send_response(200)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
+def first(body: dict[str, Any]) -> str:
+    """The first answer that the grammar of a request to the LLM allows."""
+    return " ".join(re.findall(r'"(\w+)"(?: \| "\w+")*', body.get("grammar", ""))) or "0 0"
 
 
 def count(mode: str) -> None:
     """Serve in this thread, ask from another; prints the calls as JSON and ends the process."""
-    llm = ThreadingHTTPServer(("127.0.0.1", 0), _Llm)
-    threading.Thread(target=llm.serve_forever, daemon=True).start()
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port, folder = usable_port(0), tempfile.mkdtemp()
     for name in [name for name in os.environ if name.startswith("AICVDS_")]:
         del os.environ[name]
-    folder = tempfile.mkdtemp()
-    settings = {"MODE": mode, "STORE": f"{folder}/m.db", "LLM_URL": f"http://127.0.0.1:{llm.server_port}/v1"}
-    settings |= {"PLANNER_MS": "60000", "DEADLINE_MS": "60000", "LOG_LEVEL": "warning"}
+    settings = {"MODE": mode, "STORE": f"{folder}/m.db", "PLANNER_MS": "60000", "DEADLINE_MS": "60000"}
+    settings |= {"LOG_LEVEL": "warning"}
     os.environ |= {f"AICVDS_{name}": value for name, value in settings.items()}
     calls = Calls()
     threading.Thread(target=_ask, args=(port, calls), daemon=True).start()
     (serve,) = entry_points(group="aicvds.commands", name="serve")
     main = serve.load()
-    threading.setprofile(calls.heard)
-    sys.setprofile(calls.heard)
-    main(["--port", str(port)])
+    with answering(first) as os.environ["AICVDS_LLM_URL"]:
+        threading.setprofile(calls.heard)
+        sys.setprofile(calls.heard)
+        main(["--port", str(port)])
 
 
 def _ask(port: int, calls: Calls) -> None:
     code = 1
     try:
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=90) as client:
-            _await_llm(client)
+        url = f"http://{HOST}:{port}"
+        with EdgeClient(url) as waiting:
+            waiting.wait_ready(300)
+        with httpx.Client(base_url=url, timeout=90) as client:
             for step, uav in ((0, 0), (0, 1), (0, 2), (1, 0)):
                 answer = _decide(client, step, uav, None)
             body = {"decision_id": answer["decision_id"], "cost": 0.2, "failed": False}
@@ -192,17 +170,6 @@ def _ask(port: int, calls: Calls) -> None:
         code = 0
     finally:
         os._exit(code)
-
-
-def _await_llm(client: httpx.Client) -> None:
-    for _ in range(1200):
-        try:
-            if client.get("/readyz").json()["llm"] == "ready":
-                return
-        except httpx.TransportError:
-            pass
-        time.sleep(0.05)
-    raise RuntimeError("the edge is not ready")
 
 
 def _decide(client: httpx.Client, step: int, uav: int, outcome: dict[str, Any] | None) -> dict[str, Any]:
@@ -223,7 +190,7 @@ def _decide(client: httpx.Client, step: int, uav: int, outcome: dict[str, Any] |
 def measured(mode: str, rounds: int) -> Iterator[list[Calls]]:
     """The counts of each round, each from a process of its own."""
     for _ in range(rounds):
-        command = [sys.executable, __file__, COUNTED, mode]
+        command = [sys.executable, "-m", "lab.benchmarks.decision_path", COUNTED, mode]
         done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=300)
         told = json.loads(done.stdout)
         yield [Calls([tuple(call) for call in one["loop"]], [tuple(call) for call in one["beside"]]) for one in told]

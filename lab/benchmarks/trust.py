@@ -1,6 +1,6 @@
 """Whether trust finds a good LLM within one mission: no planner, and an LLM that answers as the planner would.
 
-    python benchmarks/trust.py --seeds 30
+    python -m lab.benchmarks.trust --seeds 30
 
 It flies every world twice over HTTP: by the edge's planner (mode `policy`), and in mode `guided` without the planner
 and with an LLM that names the planner's action, if that is a candidate. It prints the losses of both with

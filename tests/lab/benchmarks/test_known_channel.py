@@ -12,7 +12,9 @@ pytestmark = pytest.mark.long
 
 
 def test_every_planner_flies_the_same_worlds_and_knows_something_else(tmp_path: Path) -> None:
-    found = figures("known_channel", "--worlds", "2", "--first", "508", out=tmp_path / "known_channel.json")
+    found = figures(
+        "lab.benchmarks.known_channel", "--worlds", "2", "--first", "508", out=tmp_path / "known_channel.json"
+    )
     assert found["seeds"] == [508, 509]
     steps = {row["scheme"]: row["steps"] for row in found["rows"]}
     assert list(steps) == ["mpc", "known_kind", "known_own", "true_links"]

@@ -1,6 +1,6 @@
 """How well it decides over links with the statistics of measured ones: mode `policy`, heuristics, the learned map.
 
-    python benchmarks/gain_traces.py --seeds 30
+    python -m lab.benchmarks.gain_traces --seeds 30
 
 Each seed draws the gain traces of all UAVs and sensors, like those of measured flights: an excess loss over the mean
 path loss that is, for each sensor, a Gaussian process over the UAVs' places, with a correlation of 0.93 at 5 m, 0.49 at
@@ -17,6 +17,7 @@ an error at least 40% smaller). It writes the same as JSON. One seed takes some 
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,9 +26,10 @@ import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
-from trust import edge
 
+from lab.experiments.edges import Llm, edge_for
 from lab.experiments.intervals import interval, paired
+from lab.experiments.schemes import OFF
 from shared.client.edge_client import EdgeClient
 from shared.world.actions import Action
 from shared.world.channel import FloatArray
@@ -168,11 +170,14 @@ def main(args: Traced) -> int:
     console, seeds = Console(), range(args.first, args.first + args.seeds)
     scenario = scenario_named("paper")
     found = []
-    with edge() as (url, _):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        edge_for(OFF, Llm("none"), Path(folder) / "edge.log", console) as edge,
+    ):
         for scale in args.scales:
             sites = [replace(Site(scenario), gains=drawn_trace(scenario, seed, scale)) for seed in seeds]
             worlds = track(zip(sites, seeds, strict=True), f"Links x {scale}", total=len(seeds), console=console)
-            lost = [flown(f"{url}", site, seed) for site, seed in worlds]
+            lost = [flown(edge.url, site, seed) for site, seed in worlds]
             found.append({"scale": scale, **_losses(console, lost), "ahead": _ahead(console, sites, list(seeds))})
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"seeds": list(seeds), "goals": [GOAL, GOAL_AHEAD], "worlds": found}, indent=2))

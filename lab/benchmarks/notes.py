@@ -1,7 +1,7 @@
 """An LLM's understanding of operators' notes: held-out notes, compiled as the edge compiles them.
 
-    python benchmarks/notes.py
-    python benchmarks/notes.py --notes benchmarks/held_out_notes.json
+    python -m lab.benchmarks.notes
+    python -m lab.benchmarks.notes --notes lab/benchmarks/held_out_notes.json
 
 It prints the guidance from each note, the number of right readings and of those that are wrong and without a doubt, and
 by field the orders that were found and the orders that are wrong; it writes the same as JSON. Two structures are the

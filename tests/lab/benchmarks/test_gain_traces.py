@@ -12,7 +12,7 @@ pytestmark = pytest.mark.long
 
 
 def test_every_scheme_flies_the_traces_and_the_map_is_better_than_the_formula(tmp_path: Path) -> None:
-    found = figures("gain_traces", "--seeds", "1", "--scales", "0.7", out=tmp_path / "gain_traces.json")
+    found = figures("lab.benchmarks.gain_traces", "--seeds", "1", "--scales", "0.7", out=tmp_path / "gain_traces.json")
     (world,) = found["worlds"]
     lost = world["lost_packets"]
     assert {"policy", "mpc", "mpc_formula", "eof", "eof_fast", "nearest_fast"} <= set(lost)

@@ -1,7 +1,7 @@
 """What a planner would save that knew the channel of a shadowed world better than its beacons show.
 
-    python benchmarks/known_channel.py
-    python benchmarks/known_channel.py --worlds 20
+    python -m lab.benchmarks.known_channel
+    python -m lab.benchmarks.known_channel --worlds 20
 
 It flies `mpc`, the planner on board, in worlds of `shadowed`. `known_kind` is `mpc` that knows how much of the variance
 is a sensor's own and how much changes along the way, and over which distance: the radio map need not choose.

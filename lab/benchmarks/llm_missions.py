@@ -1,7 +1,7 @@
 """Several missions on one embedded LLM, at the pace of the paper's world: how many decisions are the LLM's, and when?
 
-    python benchmarks/llm_missions.py                 # four missions of three UAVs, a step in 10 s: five minutes
-    python benchmarks/llm_missions.py --step-s 2.5    # closer to the LLM's limit
+    python -m lab.benchmarks.llm_missions                 # four missions of three UAVs, a step in 10 s: five minutes
+    python -m lab.benchmarks.llm_missions --step-s 2.5    # closer to the LLM's limit
 
 It starts an edge in mode ``llm`` with the adapter that ships, and flies the missions in real time. All missions begin
 each step at the same moment, the worst case, and a mission's UAVs ask one after the other. It prints the decisions by
