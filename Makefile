@@ -20,7 +20,7 @@ help:
 	@echo "make test-long install, run the tests that train, run experiments and benchmarks, and fly whole missions"
 	@echo "make check     install, ruff, mypy --strict, import-linter"
 	@echo "make docs      install, build the documentation into site/, to be read without a network"
-	@echo "make bench     measure the edge and its LLM, side by side with others: runs/*.json"
+	@echo "make bench     measure the edge and its LLM, side by side with others: runs/*.json; 25 minutes"
 	@echo "make faults    fail, kill and starve real processes, and write docs/results/faults.md: 10 minutes"
 	@echo "make fuzz      send 10,000 requests that schemathesis generates, with keys and without: none may break the edge"
 	@echo "make soak      fly 200 missions for MINUTES=10: memory, tasks and connections must not grow"
@@ -63,16 +63,21 @@ check: install
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# The figures in docs/results/benchmarks.md have more rounds. These took 15:27 on a slow day, with two more rounds of startup.py, 20 s each.
+# The figures in docs/results/benchmarks.md have more rounds. About 25 minutes on two idle cores, estimated: startup to
+# world took 15 of them on a slow day, the last three were not measured together. The page needs Chromium.
+BENCH = $(BIN)/python -m benchmarks
 bench: install
-	$(BIN)/python benchmarks/startup.py --rounds 3
-	$(BIN)/python benchmarks/overhead.py --rounds 5
-	$(BIN)/python benchmarks/processor_stages.py
-	$(BIN)/python benchmarks/tokens.py --seeds 3
-	$(BIN)/python benchmarks/llm.py --rounds 3
-	$(BIN)/python benchmarks/sensors.py
-	$(BIN)/python benchmarks/fleet.py
-	$(BIN)/python benchmarks/world.py
+	$(BENCH).startup --rounds 3
+	$(BENCH).overhead --rounds 5
+	$(BENCH).processor_stages
+	$(BENCH).tokens --seeds 3
+	$(BENCH).llm --rounds 3
+	$(BENCH).sensors
+	$(BENCH).fleet
+	$(BENCH).world
+	$(BENCH).planning --rounds 2
+	$(BENCH).capacity
+	-$(BENCH).page --seconds 10
 
 faults: install
 	$(BIN)/pytest -m faults --capture=tee-sys tests/faults
@@ -81,7 +86,7 @@ fuzz: install
 	$(BIN)/pytest -m fuzz --capture=tee-sys tests/faults
 
 soak: install
-	$(BIN)/python benchmarks/soak.py --minutes $(MINUTES)
+	$(BENCH).soak --minutes $(MINUTES)
 
 compose:
 	tests/e2e/compose.sh

@@ -61,27 +61,32 @@ class Radio:
             self._told(mission, answer)
         return took_ms
 
-    def step(self, mission: Flown) -> None:
-        """Ask for the mission's next three decisions in one batch."""
+    def step(self, mission: Flown, attempts: int = 1) -> list[dict[str, Any]]:
+        """Ask for the mission's next three decisions in one batch, which is sent so many times."""
         states = [{**self._state(mission, uav), "outcome": mission.owed.pop(uav, None)} for uav in range(UAVS)]
-        answer, _ = self.post("/decide/batch", {"mission_id": mission.name, "step": mission.step, "uavs": states})
+        body = {"mission_id": mission.name, "step": mission.step, "uavs": states}
+        answer, _ = self.post("/decide/batch", body, attempts=attempts)
         for one in answer["decisions"]:
             self._told(mission, one)
+        return list(answer["decisions"])
 
-    def post(self, path: str, body: dict[str, Any], method: str = "POST") -> tuple[dict[str, Any], float]:
-        """The answer and its milliseconds."""
+    def post(
+        self, path: str, body: dict[str, Any], method: str = "POST", attempts: int = 1
+    ) -> tuple[dict[str, Any], float]:
+        """The last attempt's answer and its milliseconds; raises ``SystemExit`` where the edge refuses."""
         content = json.dumps(body).encode()
         headers = {"Content-Type": "application/json"}
         # The UAVs of `aicvds simulate` do the same.
         headers |= {"Idempotency-Key": uuid.uuid4().hex} if path.startswith("/decide") else {}
-        try:
-            response, data, took_ms = self._ask(method, path, content, headers)
-        except (ConnectionError, http.client.RemoteDisconnected):
-            # The edge closes idle connections after seconds; the key makes the second attempt the same request.
-            self._http.close()
-            response, data, took_ms = self._ask(method, path, content, headers)
-        if response.status >= 300:
-            raise SystemExit(f"{path} answered {response.status}: {data[:300]!r}")
+        for _ in range(attempts):
+            try:
+                response, data, took_ms = self._ask(method, path, content, headers)
+            except (ConnectionError, http.client.RemoteDisconnected):
+                # The edge closes idle connections after seconds; the key makes the second attempt the same request.
+                self._http.close()
+                response, data, took_ms = self._ask(method, path, content, headers)
+            if response.status >= 300:
+                raise SystemExit(f"{path} answered {response.status}: {data[:300]!r}")
         return (json.loads(data) if data else {}), took_ms
 
     def _ask(

@@ -15,12 +15,13 @@ as JSON. ``--guided 0`` shows the edge without the LLM's own memory.
 
 from __future__ import annotations
 
+import http.client
 import random
 import sys
 import threading
 import time
-import uuid
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,13 +31,8 @@ from rich.progress import Progress
 from scipy import stats
 
 from benchmarks.harness import Goal, Options, Report, Server, edge, run
-from benchmarks.load import SENSORS, heard
+from benchmarks.missions import Flown, Radio
 
-MISSIONS, UAVS = 200, 3
-# Outcomes of each mission before the measurement, by mode.
-WARM = {"value": 900, "guided": 300}
-# Seconds at the measurement's pace before the measurement, in which memory freed by the slower pace is used again.
-SETTLE_S = 240.0
 SAMPLE_S = 2.0
 WORKERS = 3
 DELETED_ONE_IN = 2000
@@ -52,17 +48,20 @@ class Soak(Options):
     """Seconds in which every mission flies a step during the measurement; 0: full speed."""
     guided: int = 2
     """Missions of mode guided, with the embedded LLM; 0 loads no LLM."""
+    missions: int = 200
+    """All missions."""
+    warm: tuple[int, int] = (900, 300)
+    """Outcomes of each mission before the measurement, in mode value and in mode guided."""
+    settle_s: float = 240.0
+    """Seconds at the pace before the measurement, in which memory freed by the slower pace is used again."""
 
 
 @dataclass
-class Mission:
-    """One fleet's progress in its flight."""
+class Mission(Flown):
+    """One fleet's progress in its flight, and its decisions by source."""
 
-    name: str
-    mode: str
-    step: int = 0
-    told: Counter[str] = field(default_factory=Counter)
-    owed: dict[int, dict[str, Any]] = field(default_factory=dict)
+    mode: str = "value"
+    sources: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass
@@ -79,53 +78,33 @@ class Sample:
 class Worker(threading.Thread):
     """Flies its missions in turn, a fleet's step at a time."""
 
-    def __init__(self, url: str, missions: list[Mission], seed: int) -> None:
+    def __init__(self, edge: Server, missions: list[Mission], seed: int) -> None:
         super().__init__(daemon=True)
-        self._url, self._missions, self._random = url, missions, random.Random(seed)
+        self._radio, self._missions, self._random = Radio(edge, seed), missions, random.Random(seed)
         self.over = False
         self.pace_s = 0.0
         self.error: str | None = None
 
     def run(self) -> None:
         try:
-            # Shorter than the edge's 5 s for an idle connection.
-            limits = httpx.Limits(keepalive_expiry=2.0)
-            with httpx.Client(base_url=self._url, timeout=60, limits=limits) as client:
-                while not self.over:
-                    began = time.monotonic()
-                    for flown, mission in enumerate(self._missions, 1):
-                        self._turn(client, mission)
-                        due = began + self.pace_s * flown / len(self._missions)
-                        while not self.over and (left := due - time.monotonic()) > 0:
-                            time.sleep(min(left, 1.0))
-        except (httpx.HTTPError, KeyError) as error:
+            while not self.over:
+                began = time.monotonic()
+                for flown, mission in enumerate(self._missions, 1):
+                    self._step(mission)
+                    due = began + self.pace_s * flown / len(self._missions)
+                    while not self.over and (left := due - time.monotonic()) > 0:
+                        time.sleep(min(left, 1.0))
+        except (OSError, http.client.HTTPException, KeyError, SystemExit) as error:
             if not self.over:
                 self.error = repr(error)
 
-    def _turn(self, client: httpx.Client, mission: Mission) -> None:
+    def _step(self, mission: Mission) -> None:
         if self._random.randrange(DELETED_ONE_IN) == 0 and mission.step:
-            client.delete(f"/missions/{mission.name}").raise_for_status()
-            client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
+            self._radio.post(f"/missions/{mission.name}", {}, "DELETE")
+            self._radio.made(mission.name, mission.mode)
             mission.owed.clear()
-        body = {
-            "mission_id": mission.name,
-            "step": mission.step,
-            "uavs": [self._state(mission, uav) for uav in range(UAVS)],
-        }
-        key = {"Idempotency-Key": uuid.uuid4().hex}
-        for _ in range(1 + (self._random.randrange(20) == 0)):
-            answer = client.post("/decide/batch", json=body, headers=key)
-            answer.raise_for_status()
-        for told in answer.json()["decisions"]:
-            cost = self._random.random()
-            mission.owed[told["uav_id"]] = {"decision_id": told["decision_id"], "cost": cost, "failed": cost > 0.8}
-            mission.told[told["source"]] += 1
-        mission.step += 1
-
-    def _state(self, mission: Mission, uav: int) -> dict[str, Any]:
-        sensors = heard(mission.step, [self._random.randrange(60) for _ in range(SENSORS)])
-        owed = mission.owed.get(uav)
-        return {"uav_id": uav, "position": [500.0 + 10 * uav, 450.0], "sensors": sensors, "outcome": owed}
+        decisions = self._radio.step(mission, attempts=1 + (self._random.randrange(20) == 0))
+        mission.sources.update(decision["source"] for decision in decisions)
 
 
 def sample(edge: Server, began: float) -> Sample:
@@ -154,16 +133,16 @@ def slope(samples: list[Sample]) -> tuple[float, float]:
 
 def measure(options: Soak) -> Report:
     """Fly; the report's goals say whether anything grows."""
-    missions = [Mission(f"soak{n}", "guided" if n < options.guided else "value") for n in range(MISSIONS)]
+    missions = [Mission(f"soak{n}", mode="guided" if n < options.guided else "value") for n in range(options.missions)]
     with edge({"LOG_LEVEL": "error", **({} if options.guided else {"MODE": "value"})}) as server:
         samples = _fly(server, missions, options)
     grown, half = slope(samples)
     figures: dict[str, Any] = {
         "minutes": options.minutes,
-        "missions": MISSIONS,
+        "missions": options.missions,
         "pace_s": options.pace_s,
-        "decisions": sum(mission.told.total() for mission in missions),
-        "guided": dict(sum((mission.told for mission in missions if mission.mode == "guided"), Counter[str]())),
+        "decisions": sum(mission.sources.total() for mission in missions),
+        "guided": dict(sum((mission.sources for mission in missions if mission.mode == "guided"), Counter[str]())),
         "resident_mb": [round(samples[0].resident_mb, 1), round(samples[-1].resident_mb, 1)],
         "slope_mb_an_hour": [round(value, 2) for value in (grown, grown - half, grown + half)],
     }
@@ -177,44 +156,30 @@ def measure(options: Soak) -> Report:
     return Report(figures, {"Soak": rows}, goals)
 
 
-def _settle(workers: list[Worker], progress: Progress, seconds: float) -> None:
-    settling, began = progress.add_task("at the pace", total=seconds), time.monotonic()
-    while (passed := time.monotonic() - began) < seconds:
-        progress.update(settling, completed=passed)
-        _check(workers)
-        time.sleep(1)
-    progress.update(settling, completed=seconds)
-
-
 def _fly(edge: Server, missions: list[Mission], options: Soak) -> list[Sample]:
-    with httpx.Client(base_url=edge.url, timeout=300) as client:
-        for mission in missions:
-            client.put(f"/missions/{mission.name}", json={"mode": mission.mode}).raise_for_status()
+    for mission in missions:
+        Radio(edge, 0).made(mission.name, mission.mode)
     guided, others = missions[: options.guided], missions[options.guided :]
     shares = [share for share in (guided, *(others[n::WORKERS] for n in range(WORKERS))) if share]
-    workers = [Worker(edge.url, share, seed) for seed, share in enumerate(shares)]
+    workers = [Worker(edge, share, seed) for seed, share in enumerate(shares)]
     for worker in workers:
         worker.start()
-    samples = list[Sample]()
-    with Progress() as progress:
-        warming = progress.add_task("warming up", total=1.0)
-        while (least := min(UAVS * mission.step / WARM[mission.mode] for mission in missions)) < 1.0:
-            progress.update(warming, completed=least)
-            _check(workers)
-            time.sleep(1)
-        progress.update(warming, completed=1.0)
-        for worker in workers:
-            worker.pace_s = options.pace_s
-        _settle(workers, progress, SETTLE_S if options.pace_s else 0.0)
-        for mission in missions:
-            mission.told.clear()
-        began = time.monotonic()
-        measuring = progress.add_task("measuring", total=options.minutes * 60)
-        while time.monotonic() < began + options.minutes * 60:
-            samples.append(sample(edge, began))
-            progress.update(measuring, completed=samples[-1].at_s)
-            _check(workers)
-            time.sleep(SAMPLE_S)
+    warm = dict(zip(("value", "guided"), options.warm, strict=True))
+    _watch(workers, "warming up", 1.0, lambda: min(mission.told / warm[mission.mode] for mission in missions))
+    for worker in workers:
+        worker.pace_s = options.pace_s
+    settles = time.monotonic()
+    if options.pace_s:
+        _watch(workers, "at the pace", 1.0, lambda: (time.monotonic() - settles) / options.settle_s)
+    for mission in missions:
+        mission.sources.clear()
+    began, samples = time.monotonic(), list[Sample]()
+
+    def sampled() -> float:
+        samples.append(sample(edge, began))
+        return samples[-1].at_s / (60 * options.minutes)
+
+    _watch(workers, "measuring", SAMPLE_S, sampled)
     for worker in workers:
         worker.over = True
     for worker in workers:
@@ -222,9 +187,16 @@ def _fly(edge: Server, missions: list[Mission], options: Soak) -> list[Sample]:
     return samples
 
 
-def _check(workers: list[Worker]) -> None:
-    if faults := [worker.error for worker in workers if worker.error]:
-        raise SystemExit(f"soak: {faults[0]}")
+def _watch(workers: list[Worker], label: str, pause_s: float, share: Callable[[], float]) -> None:
+    """Wait until the share that is done is 1; raises ``SystemExit`` if a worker failed."""
+    with Progress() as progress:
+        task = progress.add_task(label, total=1.0)
+        while (done := share()) < 1.0:
+            progress.update(task, completed=done)
+            if faults := [worker.error for worker in workers if worker.error]:
+                raise SystemExit(f"soak: {faults[0]}")
+            time.sleep(pause_s)
+        progress.update(task, completed=1.0)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.long
 
 
 _BLOCKS = ("o200k", "o200k_static", "o200k_experiences", "o200k_state")
-SMALLEST = ("--seeds", "1", "--steps", "4", "--asked", "1", "--policy", "eof", "--encoders", "tiny", "--repeats", "1")
+SMALLEST = ("--seeds", "1", "--steps", "4", "--asked", "1", "--policy", "eof")
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +44,3 @@ def test_the_server_reads_what_was_reckoned(found: Any) -> None:
     for way in ("guided", "llm", "paper"):
         assert asked[way]["new_as_reckoned"] == 1.0
         assert asked["lost_packets_above_best"][way]["mean"] >= 0.0
-
-
-@pytest.mark.timeout(600)
-def test_a_compressor_pays_only_below_the_speed_at_which_it_breaks_even(found: Any) -> None:
-    (tiny,) = found["compression"]["compressors"].values()
-    even = tiny["pays_below_tokens_per_s"]
-    for speed, ratio in tiny["spent_to_saved_at_speed_reckoned"].items():
-        assert (ratio > 1.0) == (float(speed) > even)

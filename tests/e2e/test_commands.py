@@ -70,7 +70,8 @@ PARSED = {
     "python -m lab distill-orders": "an hour; tests/lab/distilling/test_distill_orders.py runs it small",
     "python -m lab pretrain": "minutes; tests/e2e/test_pretrain.py runs it small",
     "python -m lab demonstrate": "minutes; tests/e2e/test_pretrain.py runs it small",
-    "python benchmarks/": "minutes to hours, and they measure",
+    "python -m benchmarks.": "minutes to hours, and they measure; tests/benchmarks runs them small",
+    "python -m lab.benchmarks.": "minutes to hours, and they measure; tests/lab/benchmarks runs them small",
 }
 # `make --dry-run` finds their targets.
 MADE = {
@@ -80,7 +81,7 @@ MADE = {
     "make test-long": "minutes; CI runs it",
     "make check": "CI runs it",
     "make compose": "it needs a Docker engine; CI runs it",
-    "make bench": "a quarter of an hour, and it measures",
+    "make bench": "half an hour, and it measures",
     "make faults": "ten minutes",
     "make fuzz": "some minutes; tests/integration/service/api/test_fuzz.py is a short one",
     "make soak": "ten minutes",
@@ -157,8 +158,7 @@ def test_every_list_is_of_commands_that_are_shown() -> None:
 def workspace(tmp_path: Path) -> Path:
     """A directory that looks to the commands like the repository, and keeps what they write."""
     (tmp_path / ".venv").symlink_to(sys.prefix)
-    for name in ("examples", "benchmarks"):
-        (tmp_path / name).symlink_to(ROOT / name)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
 
 
@@ -226,16 +226,11 @@ def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytes
             patched.setattr(sys, "argv", [program, *args])
             with pytest.raises(Understood):
                 cli.main()
-        elif args[0] == "-m":
+        else:
+            assert args[0] == "-m"
             patched.setattr(sys, "argv", args[1:])
             with pytest.raises(Understood):
                 runpy.run_module(args[1], run_name="__main__")
-        else:
-            patched.setattr(sys, "argv", args)
-            # As Python does with a script's folder: benchmarks import each other.
-            patched.syspath_prepend(str((ROOT / args[0]).parent))
-            with pytest.raises(Understood):
-                runpy.run_path(str(ROOT / args[0]), run_name="__main__")
 
 
 class Understood(Exception):
