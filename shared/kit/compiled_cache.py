@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from numba.core.caching import InTreeCacheLocator
 
 _RULES = Path(__file__).parents[1] / "world"
+
+
+@cache
+def _stamp(folder: Path) -> bytes:
+    modules = sorted({*folder.glob("*.py"), *_RULES.glob("*.py")})
+    return hashlib.sha256(b"".join(module.read_bytes() for module in modules)).digest()
 
 
 class ModuleCacheLocator(InTreeCacheLocator):
@@ -20,8 +27,11 @@ class ModuleCacheLocator(InTreeCacheLocator):
 
     def get_source_stamp(self) -> bytes:
         """A hash of the modules of both folders."""
-        modules = sorted({*Path(self._py_file).parent.glob("*.py"), *_RULES.glob("*.py")})
-        return hashlib.sha256(b"".join(module.read_bytes() for module in modules)).digest()
+        return _stamp(Path(self._py_file).parent)
+
+    def get_disambiguator(self) -> str:
+        """The line, and the beginning of the hash: numba would unpickle what other sources left before it compares."""
+        return f"{super().get_disambiguator()}.{self.get_source_stamp().hex()[:12]}"  # type: ignore[no-untyped-call]
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Any:
