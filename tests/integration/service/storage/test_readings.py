@@ -15,9 +15,9 @@ from service.storage.rows import decode
 from service.storage.store import Store
 from shared.wire.readings import SensorReading
 from shared.wire.schemas import MissionSpec
+from tests.integration.service.storage.test_learned_world import SENSORS, Flight, the_same
 from tests.support.stored_missions import state
 from tests.support.waiting import PATIENCE_S
-from tests.unit.service.storage.test_learned_world import SENSORS, Flight, the_same
 
 
 def say(mission: Mission, number: int) -> list[str]:
