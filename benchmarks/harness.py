@@ -209,7 +209,11 @@ def running(
             yield Server(url, psutil.Process(process.pid))
         finally:
             process.terminate()
-            process.wait(STOP_S)
+            try:
+                process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 @contextmanager

@@ -230,7 +230,7 @@ def test_what_takes_long_is_at_least_understood(command: str, monkeypatch: pytes
             assert args[0] == "-m"
             patched.setattr(sys, "argv", args[1:])
             with pytest.raises(Understood):
-                runpy.run_module(args[1], run_name="__main__")
+                runpy.run_module(args[1], run_name="__main__", alter_sys=True)
 
 
 class Understood(Exception):
