@@ -118,7 +118,7 @@ class Laps(RecedingHorizonPolicy):
         self._start: dict[int, float] = {}
         self.errors: list[tuple[float, float]] = []
 
-    def _planned(self, uav: int, taken: frozenset[int]) -> Action:
+    def _plan_action(self, uav: int, taken: frozenset[int]) -> Action:
         last, path = self.belief.uavs[uav], self._paths[uav]
         assert last.progress_m is not None
         first = self._start.setdefault(uav, last.progress_m)
