@@ -84,7 +84,7 @@ class EdgeStub:
 
     def _answer(self, body: DecideRequest, behaviour: Behaviour) -> DecideResponse:
         sensors = body.sensors.id
-        sensor = 9_999 if behaviour == "wrong" else sensors[(body.step + body.uav_id) % len(sensors)]
+        sensor = 1_999 if behaviour == "wrong" else sensors[(body.step + body.uav_id) % len(sensors)]
         tokens = Tokens(
             tokenizer="stub",
             static=200,

@@ -202,7 +202,7 @@ def test_garbage_is_no_traceback(stub: EdgeStub, request_: DecideRequest, client
     with client(stub.url) as edge:
         with pytest.raises(EdgeProtocolError, match="no DecideResponse"):
             edge.decide(request_)
-        with pytest.raises(EdgeProtocolError, match="sensor 9999, which was not offered"):
+        with pytest.raises(EdgeProtocolError, match="sensor 1999, which was not offered"):
             edge.decide(request_)
 
 
