@@ -1,49 +1,9 @@
-"""``python -m lab COMMAND``: what is studied beside the product: experiments, training, and their records."""
+"""``python -m lab``: see :mod:`lab.command_line`."""
 
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 
-from shared.kit.validation_messages import suggestion
+from lab.command_line import main
 
-_COMMANDS = {
-    "experiment": "reproduce a figure or table of the paper, or one beyond it, over many seeds",
-    "explore": "record exploring UAVs on training worlds, for pretrain, distill and demonstrate",
-    "pretrain": "train the attention and velocity modules' start on what explore recorded",
-    "demonstrate": "choose worked examples for the prompt from what explore recorded",
-    "distill": "train the embedded LLM's adapter on what explore recorded",
-    "distill-orders": "train the adapter that reads operators' notes",
-    "train": "train the learned baselines, MADQN and MAPPO",
-}
-
-
-def usage() -> str:
-    """The text of ``python -m lab --help``."""
-    commands = "\n".join(f"  {name:<15} {text}" for name, text in _COMMANDS.items())
-    return (
-        f"usage: python -m lab COMMAND [OPTIONS]\n\n{commands}\n\n"
-        "`python -m lab COMMAND --help` explains a command, its defaults and its units. It runs in a checkout."
-    )
-
-
-def main() -> int:
-    """Run one command with the rest of the command line; returns the process's exit code."""
-    name, rest = (sys.argv[1], sys.argv[2:]) if len(sys.argv) > 1 else ("--help", [])
-    if name in ("--help", "-h"):
-        print(usage())
-        return 0
-    if name not in _COMMANDS:
-        print(f"python -m lab: unknown command {name!r}{suggestion(name, _COMMANDS)}\n\n{usage()}", file=sys.stderr)
-        return 2
-    try:
-        return int(import_module(f"lab.commands.{name.replace('-', '_')}").main(rest) or 0)
-    except ModuleNotFoundError as missing:
-        if (missing.name or "").partition(".")[0] in ("lab", "field", "service", "simulator", "shared"):
-            raise
-        print(f"python -m lab {name}: {missing.name} is not installed: pip install -e '.[lab]'", file=sys.stderr)
-        return 2
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+sys.exit(main())

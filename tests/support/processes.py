@@ -14,7 +14,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
-from lab import __main__ as lab
+from lab import command_line as lab
 from shared.kit import command_line as cli
 from tests.support.places import ROOT
 from tests.support.waiting import PATIENCE_S

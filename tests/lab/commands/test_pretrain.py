@@ -85,7 +85,7 @@ def test_a_checkpoint_of_another_preset_is_not_loaded(tmp_path: Path, monkeypatc
     (tmp_path / "checkpoints").mkdir()
     save(Modules("paper", 15, seed=0), tmp_path / "checkpoints" / "reach.pt")
     monkeypatch.setattr(checkpoints, "files", lambda package: tmp_path)
-    with pytest.raises(ValueError, match=r"reach\.pt holds modules of the feature preset paper"):
+    with pytest.raises(ValueError, match=r"reach\.pt has modules of the feature preset paper"):
         checkpoints._packaged.__wrapped__("reach")
 
 

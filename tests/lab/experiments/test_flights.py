@@ -11,6 +11,7 @@ import pytest
 from lab.experiments.flight import FlightStore, flight_key
 from lab.experiments.plan import weights_of
 from lab.experiments.schemes import BOUND, OFF, Scheme, at_full_speed, llm, local, over_edge
+from lab.marl import learned
 from shared.world.scenario import Scenario
 from simulator.flying.rollout import rollout
 from simulator.policies.registry import policy_named
@@ -125,7 +126,7 @@ def test_a_scheme_that_cannot_fly_is_left_out_and_named(tmp_path: Path, monkeypa
         def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> tuple[int, int]:
             raise AssertionError("it cannot fly")
 
-    monkeypatch.setattr("lab.marl.learned.madqn", Untrained)
+    monkeypatch.setattr(learned, "madqn", Untrained)
     [result] = run_in(tmp_path).make([declared(local("eof"), local("madqn"))])
     assert list(result.schemes) == ["eof"]
     assert any("MADQN on paper cannot fly: trained for 4 sensors" in note for note in result.notes)

@@ -65,7 +65,7 @@ def test_half_of_the_sensors_report_every_third_step(edge: Edge, monkeypatch: py
 class Hearing(RecedingHorizonPolicy):
     """Keeps the fleet's belief of what it hears, and flies the same way whatever that is."""
 
-    def _planned(self, uav: int, taken: frozenset[int]) -> Action:
+    def _plan_action(self, uav: int, taken: frozenset[int]) -> Action:
         return Action(uav, 7)
 
 

@@ -43,7 +43,9 @@ def test_it_beats_random_by_far_on_evaluation_worlds(scheme: str) -> None:
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_the_batched_evaluation_in_training_is_that_of_the_policy(scheme: str) -> None:
     network = shipped(scheme).network(PAPER)
-    assert lost_packets(PAPER, network, range(4)).tolist() == [lost(scheme, seed) for seed in range(4)]
+    assert lost_packets(PAPER, network, range(4)).tolist() == [
+        lost(f"lab.marl.learned:{scheme}", seed) for seed in range(4)
+    ]
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
