@@ -29,10 +29,10 @@ from rich.console import Console
 
 ROOT = Path(__file__).parent
 DIST = ROOT / "dist"
-PACKAGES = ("service", "shared", "simulator")
+PACKAGES = ("service", "shared", "simulator", "field")
 IMAGES = ("edge", "simulator")
 # Extras for work on this repository, which users do not need.
-OWN_EXTRAS = {"dev", "docs", "release"}
+OWN_EXTRAS = {"dev", "docs", "lab", "release"}
 
 console = Console(stderr=True, highlight=False)
 

@@ -35,6 +35,8 @@ FROM dependencies AS application
 COPY README.md LICENSE ./
 COPY shared/ shared/
 COPY service/ service/
+# `aicvds mqtt`.
+COPY field/ field/
 # `make release` passes the version: there is no git here, and with git every commit would rebuild the layers above.
 ARG VERSION=""
 RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_AIC_VDS=$VERSION pip wheel --no-deps --wheel-dir /wheels .
