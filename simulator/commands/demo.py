@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -48,7 +49,8 @@ class Demo:
     wait_s: float = 300.0
     """Seconds that the edge may take to start and to load its LLM."""
     bound: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = True
-    """Leave out the search, of at most 10 s after the flight, for the fewest packets that any fleet could have lost."""
+    """Leave out the search, of at most 10 s after the flight, for the fewest packets that any fleet could have lost. It
+    needs the extra `bound`."""
 
 
 def main(argv: list[str]) -> int:
@@ -80,7 +82,7 @@ def demo(options: Demo, command: str, console: Console) -> int:
         command=command,
         edge=f"http://{HOST}:{port}",
         wait_s=options.wait_s,
-        bound_s=BOUND_S if options.bound else 0.0,
+        bound_s=BOUND_S if options.bound and find_spec("ortools") is not None else 0.0,
         reference="policy",
     )
     log = options.out / EDGE_LOG
