@@ -33,7 +33,7 @@ install: .venv/installed
 	$(PYTHON) install.py all $(TORCH_INDEX:%=--torch-index %)
 	@touch $@ .venv/demo
 
-# Less than a tenth of the packages: what serves, simulates and draws.
+# What serves, simulates and draws.
 .venv/demo: pyproject.toml constraints.txt install.py
 	$(PYTHON) install.py demo $(TORCH_INDEX:%=--torch-index %)
 	@touch $@

@@ -47,7 +47,7 @@ class Startup(Options):
 def measure(args: Startup) -> Report:
     """Start everything in turn; raises ``SystemExit`` without the embedded LLM."""
     with tempfile.TemporaryDirectory() as folder:
-        # What is timed is one request, which makes its mission.
+        # The benchmark times one request, which makes its mission.
         env = environment({"STORE": f"{folder}/missions.db", "CREATE_ON_DECIDE": "on"})
         with _edge(env) as (client, _):
             if (llm := client.get("/readyz").json()["llm"]) not in ("loading", "ready"):

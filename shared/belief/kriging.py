@@ -27,7 +27,7 @@ from shared.world.channel import FloatArray, IntArray
 # A measurement this many standard deviations from its prediction counts less, as in Huber's estimator.
 _HUBER = 3.0
 _HUBER_LEAST_DB = 1.0
-# Measurements of a sensor within this distance are of the same place, metres; the most that are kept of one place.
+# The radius of one place, metres, and the largest number of measurements of it that are kept.
 _SAME_PLACE_M, _MOST_OF_PLACE = 10.0, 2
 
 

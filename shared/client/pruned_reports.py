@@ -19,7 +19,7 @@ from shared.world.scenario import Scenario
 
 # Steps between a UAV's checks that its weights are still current.
 REFRESH_STEPS = 10
-# Queries a block: the full matrix of 10,000 sensors would take 400 MB.
+# Queries a block.
 _BLOCK = 256
 
 FloatMatrix = NDArray[np.float32]

@@ -48,7 +48,7 @@ class FleetProblem:
             the first one.
 
     Raises:
-        ValueError: a shape is wrong, or the search would read past an array; the message names the field.
+        ValueError: a field has a wrong shape or value; the message names the field.
     """
 
     scenario: Scenario
@@ -87,6 +87,7 @@ class FleetProblem:
             if (value := getattr(self, name)) is not None and value.shape != shape:
                 raise ValueError(f"{name} has shape {value.shape}, must be {shape}")
         self._check_tables(steps * (levels - 1) + 1, count)
+        self._check_values()
         if self.allowed is not None and not self.allowed.any():
             raise ValueError("allowed has no velocity")
         # The compiled search reads the stages as indices, without a check.
@@ -109,6 +110,15 @@ class FleetProblem:
         for uav, actions in self.fixed.items():
             if not 0 <= uav < self.uavs or actions.ndim != 2 or actions.shape[1] != 2 or len(actions) > self.horizon:
                 raise ValueError(f"fixed[{uav}] has shape {actions.shape}, must be (n, 2) of a UAV")
+
+    def _check_values(self) -> None:
+        for name, arrays in (("queue", [self.queue]), ("arrivals", [self.arrivals]), ("links", self.links or ())):
+            if any(array.dtype.kind not in "iu" or array.min(initial=0) < 0 for array in arrays):
+                raise ValueError(f"{name} must be whole packets, at least 0")
+        if self.queue.max(initial=0) > self.scenario.queue_capacity:
+            raise ValueError(f"queue has {self.queue.max()} packets, the capacity is {self.scenario.queue_capacity}")
+        if not all(((chance >= 0) & (chance <= 1)).all() for chance in self.chances or ()):
+            raise ValueError("chances must be probabilities, 0..1")
 
     @property
     def horizon(self) -> int:

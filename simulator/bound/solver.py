@@ -117,7 +117,7 @@ def plan(
     Raises:
         ValueError: the problem has uncertain links or queues, guidance, or sensors or actions that are given; only
             :class:`shared.planning.annealing.Annealing` plans with these.
-        ModuleNotFoundError: OR-Tools is not installed (extra ``experiments``).
+        ModuleNotFoundError: OR-Tools is not installed (extra ``bound``).
         Interrupted: Ctrl-C came, and the budget limits seconds.
     """
     from simulator.bound.formulation import Formulation
@@ -295,8 +295,8 @@ def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any
     """
     if budget.seconds == math.inf:
         return solver.solve(model, listener), False
-    with ThreadPoolExecutor(1) as beside:
-        search = beside.submit(solver.solve, model, listener)
+    with ThreadPoolExecutor(1) as solving:
+        search = solving.submit(solver.solve, model, listener)
         try:
             return search.result(), False
         except KeyboardInterrupt:

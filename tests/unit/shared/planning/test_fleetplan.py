@@ -193,7 +193,10 @@ def test_more_arrivals_than_a_queue_holds_are_lost_whatever_is_done() -> None:
     "field, value",
     [
         ("queue", np.array([1, 0])),
+        ("queue", np.array([61, 0, 0])),
+        ("queue", np.array([1.5, 0, 0])),
         ("arrivals", np.zeros((0, 3), dtype=np.int64)),
+        ("arrivals", np.full((2, 3), -1)),
         ("places", np.zeros((3, 3))),
         ("fixed", {2: np.array([[0, 0]])}),
         ("late", np.zeros((2, 2, 3))),

@@ -50,9 +50,13 @@ def actions(*pairs: tuple[int, int]) -> IntArray:
         ("links", [np.zeros((1, SUMS, SENSORS + 1), dtype=np.int64)]),
         ("links", [np.zeros((SUMS, SENSORS), dtype=np.int64)]),
         ("links", [np.zeros((1, SUMS, SENSORS), dtype=np.int64)] * 2),
+        ("links", [np.full((1, SUMS, SENSORS), 1.5)]),
+        ("links", [np.full((1, SUMS, SENSORS), -1)]),
         ("links", None),
         ("chances", [np.ones((1, SUMS, SENSORS + 1))]),
         ("chances", [np.ones((1, SUMS, SENSORS))] * 2),
+        ("chances", [np.full((1, SUMS, SENSORS), 1.01)]),
+        ("chances", [np.full((1, SUMS, SENSORS), np.nan)]),
     ],
 )
 def test_tables_that_make_no_sense_name_their_field(field: str, value: Any) -> None:
