@@ -17,7 +17,7 @@ EPISODES = ("--episodes", "120")
 # A training that goes no further than its first save.
 STANDS_STILL = """
 import signal, sys
-from simulator.commands import train
+from lab.commands import train
 from lab.marl import training
 
 save = training.Training.save
