@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, SecretStr, field_validator, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, field_validator, model_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from service.config.prompt_budget import prompt_tokens
 from shared.kit.cores import usable_cores
@@ -44,6 +45,29 @@ _SIMULATORS = {
 }
 
 
+def _json_object(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    try:
+        found = json.loads(value)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise ValueError('must be a JSON object, for example {"name": "value"}')
+    return found
+
+
+def _header_safe_texts(texts: dict[str, str]) -> dict[str, str]:
+    for name, value in texts.items():
+        if not (name.isascii() and name.isprintable() and value.isascii() and value.isprintable()):
+            raise ValueError(f"{name[:40]!r}: name and value must be printable ASCII")
+    return texts
+
+
+JsonObject = Annotated[dict[str, Any], NoDecode, BeforeValidator(_json_object)]
+JsonTexts = Annotated[dict[str, str], NoDecode, BeforeValidator(_json_object), AfterValidator(_header_safe_texts)]
+
+
 class Settings(BaseSettings):
     """Settings of one edge service.
 
@@ -69,6 +93,18 @@ class Settings(BaseSettings):
     # Name of a header with the mission's ID in each call for a decision, for a router that sends requests of one
     # session to one replica. Unset: none.
     llm_session_header: str | None = Field(None, pattern=r"^[A-Za-z0-9-]{1,64}$")
+    # Further fields of each completion's body, a JSON object: {"reasoning_effort": "none"}, or
+    # {"chat_template_kwargs": {"enable_thinking": false}}. They replace the edge's own of the same name.
+    llm_extra_body: JsonObject = Field(default_factory=dict)
+    # Further headers of each request to the server, a JSON object of texts: {"api-key": "..."} for Azure.
+    llm_extra_headers: JsonTexts = Field(default_factory=dict, repr=False)
+    # Further parameters of the server's URLs, a JSON object of texts: {"api-version": "2024-10-21"}.
+    llm_extra_query: JsonTexts = Field(default_factory=dict, repr=False)
+    # Most tokens that a model may think before its answer. The edge begins without any, and raises them when an answer
+    # ends before it has begun. 0: never.
+    llm_thinking_tokens: int = Field(2048, ge=0, le=131_072)
+    # Seconds for which the first request may wait, while the server loads its model.
+    llm_load_s: float = Field(300.0, ge=1, le=3600)
     # Milliseconds after which a second server, or the only one again, is called in addition to a server that has not
     # answered. 0: never. It doubles the work of a slow server, so it pays where there are several.
     hedge_ms: int = Field(0, ge=0, le=60_000)

@@ -65,6 +65,7 @@ class Completion:
         prompt_tokens: of the server's ``usage``, as ``cached_tokens`` and ``completion_tokens``; None if missing.
         positions: of the text's tokens; empty if the server gives no probabilities.
         model: name of the model that answered.
+        unfinished: whether the server stopped at its limit of tokens before the answer began.
     """
 
     text: str
@@ -73,6 +74,7 @@ class Completion:
     completion_tokens: int | None
     positions: tuple[TokenPosition, ...] = ()
     model: str | None = None
+    unfinished: bool = False
 
 
 def check_answer(text: str, sensor_ids: Collection[int], velocities: int) -> Action:
@@ -99,6 +101,6 @@ def _two_integers(text: str) -> tuple[int, int]:
         except (ValueError, RecursionError):
             raise NoDecision("answer_format", repr(text[:80])) from None
         values = [answer.get(key) for key in ("sensor_id", "velocity")]
-        if len(answer) == 2 and all(type(value) is int for value in values):
+        if all(type(value) is int for value in values):
             return values[0], values[1]
     raise NoDecision("answer_format", repr(text[:80]))

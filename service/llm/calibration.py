@@ -25,6 +25,8 @@ _SMOOTHING = 0.05
 _LEAST_BIAS = 0.1
 # Less than any meaningful probability, and large enough to be halved and divided without underflow.
 _TINY = 1e-12
+# Least probability of all labels together. A model that answers by a label gives them nearly all of it.
+_LEAST_MASS = 1e-3
 _MOST_BIASES = 64
 _ATTEMPTS = 3
 _TIMEOUT_S = 30.0
@@ -38,20 +40,18 @@ def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> l
     """The LLM's probabilities of the labels of each list; those of a list sum to 1.
 
     A label that is not among the likeliest tokens gets half of the least probability among them. Where the server gives
-    no probabilities, its answer gets 0.95, and all labels of the list share the rest.
+    no probabilities of labels, its answer gets 0.95, and all labels of the list share the rest.
 
     Raises:
-        NoDecision: neither the likeliest tokens nor the text name an offered label.
+        NoDecision: neither the likeliest tokens nor the text name an offered label, or all labels together are hardly
+            probable: a thinking model begins with another token, and renormalised its labels would be noise.
     """
-    # Several labels have ends of lines between them. A single label is at the first position, whatever token was drawn.
-    positions = completion.positions
-    if len(lists) > 1:
-        positions = tuple(position for position in positions if position.token.strip())
-    found = [
-        {label: position.likeliest[label] for label in labels if label in position.likeliest}
-        for position, labels in zip(positions, lists, strict=False)
-    ]
-    if len(found) == len(lists) and all(sum(by_label.values()) > 0.0 for by_label in found):
+    found = _by_label(completion, lists)
+    if found:
+        least = min(sum(by_label.values()) for by_label in found)
+        if least < _LEAST_MASS:
+            detail = f"{completion.text[:80]!r}: the labels have {least:.1g} of the probability"
+            raise NoDecision("answer_format", detail)
         return [_filled(by_label, labels) for by_label, labels in zip(found, lists, strict=True)]
     answers = check_labels(completion.text, lists)
     return [
@@ -60,8 +60,21 @@ def probabilities(completion: Completion, lists: Sequence[Collection[str]]) -> l
     ]
 
 
+def _by_label(completion: Completion, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
+    """Each list's labels among the likeliest tokens of its position; empty if a position has none of its labels."""
+    # Several labels have ends of lines between them. A single label is at the first position, whatever token was drawn.
+    positions = completion.positions
+    if len(lists) > 1:
+        positions = tuple(position for position in positions if position.token.strip())
+    found = [
+        {label: position.likeliest[label] for label in labels if position.likeliest.get(label, 0.0) > 0.0}
+        for position, labels in zip(positions, lists, strict=False)
+    ]
+    return found if len(found) == len(lists) and all(found) else []
+
+
 def _filled(found: Mapping[str, float], labels: Collection[str]) -> dict[str, float]:
-    least = max(_TINY, 0.5 * min(value for value in found.values() if value > 0.0))
+    least = max(_TINY, 0.5 * min(found.values()))
     return _normalised({label: found.get(label) or least for label in labels})
 
 
@@ -102,7 +115,7 @@ class LabelReader:
     def read(self, completion: Completion, static: str, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
         """The labels' probabilities by list, calibrated once the bias is known; raises :class:`NoDecision`."""
         measured = probabilities(completion, lists)
-        bias = self.bias(completion.model, static, len(lists)) if completion.positions else None
+        bias = self.bias(completion.model, static, len(lists)) if _by_label(completion, lists) else None
         if bias is None:
             return measured
         return [calibrated(*pair) for pair in zip(measured, bias, strict=True)]

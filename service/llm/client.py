@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import functools
 import json
-import math
+import logging
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 from urllib.request import getproxies, proxy_bypass
 
@@ -18,20 +19,40 @@ from aiohttp.client_proto import ResponseHandler
 from pydantic_core import to_json
 from yarl import URL
 
-from service.llm.answers import Completion, NoDecision, NotUnderstood, TokenPosition, Unreachable
-from service.llm.request_bodies import TOP_LOGPROBS
+from service.llm.answer_reading import completion_of
+from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
+from service.llm.request_terms import RequestExtras, RequestTerms
+from service.llm.server_words import connection_fault, excerpt, excerpt_of
 
 # Far above any regular completion of two integers; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_TOKEN = 256 * 1024, 8 * 1024
 # Bytes in addition to the body: heads (possibly several), chunk framing and trailers.
 _MAX_HEAD_BYTES = 64 * 1024
-_MAX_TOKENS, _MAX_POSITIONS = 10**9, 256
 # Each decision's answer, log line and trace has the model's name; the longest real names are paths.
 _MAX_NAME = 200
 # The statuses by which servers refuse an unknown field; no other status says anything about the field.
 _NOT_UNDERSTOOD = (400, 404, 422)
-# Bytes of body that the answer to this task's request may have.
-_ALLOWED: ContextVar[int] = ContextVar("allowed_body_bytes")
+_REDIRECTS = (301, 302, 303, 307, 308)
+
+
+@dataclass(slots=True)
+class _Exchange:
+    """One request and its answer.
+
+    Attributes:
+        most: bytes of body that the answer may have.
+        reused: whether the connection had an earlier request.
+        answered: whether a byte of the answer came.
+    """
+
+    most: int
+    reused: bool = False
+    answered: bool = False
+
+
+# This task's request.
+_EXCHANGE: ContextVar[_Exchange] = ContextVar("exchange")
+log = logging.getLogger(__name__)
 
 
 class LLMClient:
@@ -41,24 +62,39 @@ class LLMClient:
         base_url: up to and including ``/v1``.
         trust_env: obey ``HTTP_PROXY`` and similar variables.
         session_header: name of a header with each completion's session; None: none.
+        extras: the operator's own fields, headers and query of each request.
 
     Raises:
         NoDecision: the environment names a proxy that cannot be used.
     """
 
     def __init__(
-        self, base_url: str, *, api_key: str | None = None, trust_env: bool = True, session_header: str | None = None
+        self,
+        base_url: str,
+        *,
+        api_key: str | None = None,
+        trust_env: bool = True,
+        session_header: str | None = None,
+        extras: RequestExtras | None = None,
     ) -> None:
         self.base_url = base_url
         # Found once: aiohttp would look for a proxy at each call, in a thread.
         self._proxy = _proxy_to(base_url) if trust_env else {}
         self._session_header = session_header
+        self._extras = extras or RequestExtras()
+        self._terms = RequestTerms()
         # Parsed once: aiohttp would parse a string at each call.
-        self._models, self._completions = (URL(f"{base_url}/{path}") for path in ("models", "chat/completions"))
+        self._models, self._completions = (
+            URL(f"{base_url}/{path}").update_query(self._extras.query) for path in ("models", "chat/completions")
+        )
         # Identity: a compressed answer of a few kilobytes could unpack to gigabytes before its size is checked.
         headers = {"Accept-Encoding": "identity", "Content-Type": "application/json"}
         if api_key:
             headers["Authorization"] = f"Bearer {api_key}"
+        headers |= self._extras.headers
+        self._secrets = tuple(
+            secret for secret in (api_key, *self._extras.headers.values(), *self._extras.query.values()) if secret
+        )
         # The edge bounds its calls, so the connector need not; the certificates are those that httpx trusts.
         connector = _BoundedConnector(limit=0, ssl=httpx.create_ssl_context(trust_env=trust_env))
         self._http = aiohttp.ClientSession(
@@ -76,14 +112,19 @@ class LLMClient:
     async def models(self) -> list[str]:
         """The listed models' names, without unprintable ones and those of more than 200 characters.
 
+        The list is OpenAI's, or without an object around it.
+
         Raises:
             NoDecision: the server gives no list, or no name in it can be used.
         """
         answer = await self._call("GET", self._models, None)
         try:
-            listed = [model["id"] for model in answer["data"]]
+            models = answer if isinstance(answer, list) else answer["data"]
+            listed = [model if isinstance(model, str) else model["id"] for model in models]
         except (KeyError, TypeError):
-            raise NoDecision("llm_error", f"{self.base_url}/models: no list of models") from None
+            said = excerpt_of(answer, self._secrets)
+            detail = f"no list of models{f': {said}' if said else ''}"
+            raise NoDecision("llm_error", f"{self.base_url}/models: {detail}") from None
         names = [n for n in listed if isinstance(n, str) and n.isprintable() and len(n) <= _MAX_NAME]
         if listed and not names:
             raise NoDecision("llm_error", f"{self.base_url}/models: no model has a name that can be used")
@@ -95,22 +136,31 @@ class LLMClient:
         Args:
             session: an ID shared by completions with a common prefix, which a router may send to the same server.
         """
-        # Each token may come with the likeliest tokens of its position.
-        most = max(_MAX_RESPONSE_BYTES, _BYTES_A_TOKEN * body.get("max_tokens", 1))
-        answer = await self._call("POST", self._completions, body, most, session)
-        try:
-            text = answer["choices"][0]["message"]["content"]
-            usage = answer.get("usage") or {}
-            details = usage.get("prompt_tokens_details") or {}
-            counts = (usage.get("prompt_tokens"), details.get("cached_tokens"), usage.get("completion_tokens"))
-        except (AttributeError, KeyError, IndexError, TypeError):
-            raise NoDecision("llm_error", f"{self.base_url}: a 200 that is no chat completion") from None
-        if not isinstance(text, str):
-            raise NoDecision("llm_error", f"{self.base_url}: a completion without text")
-        prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
-        if prompt is not None and cached is not None:
-            cached = min(cached, prompt)
-        return Completion(text, prompt, cached, completion, _positions(answer["choices"][0]))
+        terms = self._terms
+        while True:
+            sent = terms.applied(body)
+            # Each token may come with the likeliest tokens of its position.
+            most = max(_MAX_RESPONSE_BYTES, _BYTES_A_TOKEN * sent[terms.max_tokens])
+            if self._extras.body:
+                sent = {**sent, **self._extras.body}
+            try:
+                answer = completion_of(await self._call("POST", self._completions, sent, most, session), self.base_url)
+            except NotUnderstood as refused:
+                other = terms.after_refusal(str(refused), sent)
+                if other is None:
+                    raise
+            else:
+                other = terms.with_more_tokens(self._extras.most_tokens) if answer.unfinished else None
+                if other is None:
+                    if not answer.unfinished:
+                        self._remember(terms)
+                    return answer
+            terms = other
+
+    def _remember(self, terms: RequestTerms) -> None:
+        if terms != self._terms:
+            log.warning("%s: requests follow the server's refusals and limits from now on: %s", self.base_url, terms)
+            self._terms = terms
 
     async def _call(
         self,
@@ -120,60 +170,57 @@ class LLMClient:
         most: int = _MAX_RESPONSE_BYTES,
         session: str | None = None,
     ) -> Any:
-        content, options = bytearray(), self._proxy
         sent = None if body is None else to_json(body)
+        headers = {}
         if session is not None and self._session_header is not None:
-            options = {**options, "headers": {**options.get("headers", {}), self._session_header: session}}
+            headers = {self._session_header: session}
+        exchange = _Exchange(most)
         try:
-            allowed = _ALLOWED.set(most)
+            status, location, content = await self._exchange(method, url, sent, headers, exchange)
+        except (aiohttp.ServerDisconnectedError, ConnectionResetError, aiohttp.ClientOSError) as error:
+            if not exchange.reused or exchange.answered or isinstance(error, aiohttp.ClientConnectorError):
+                raise self._failure(error) from error
+            # The server closed an idle connection as the request was sent (aiohttp 9138): it has not seen the request.
             try:
-                request = await self._http.request(method, url, data=sent, allow_redirects=False, **options)
-            finally:
-                _ALLOWED.reset(allowed)
-            async with request as response:
-                if response.headers.get("Content-Encoding", "identity") != "identity":
-                    raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
-                async for chunk in response.content.iter_any():
-                    content += chunk
-                    if len(content) > most:
-                        raise NoDecision("llm_error", f"{self.base_url}: more than {most} bytes")
-        except aiohttp.ClientConnectorError as error:
-            raise Unreachable("llm_error", f"{self.base_url}: {type(error).__name__}") from error
+                status, location, content = await self._exchange(method, url, sent, headers, _Exchange(most))
+            except (aiohttp.ClientError, OSError, ValueError) as again:
+                raise self._failure(again) from again
         except (aiohttp.ClientError, OSError, ValueError) as error:
-            # The error's text is left out: it may quote the Authorization header.
-            raise NoDecision("llm_error", f"{self.base_url}: {type(error).__name__}") from error
-        if response.status in _NOT_UNDERSTOOD:
-            raise NotUnderstood("llm_status", f"{self.base_url}: HTTP {response.status}")
-        if response.status != 200:
-            raise NoDecision("llm_status", f"{self.base_url}: HTTP {response.status}")
+            raise self._failure(error) from error
+        if status != 200:
+            said = f" to {location.split('?')[0][:200]}" if status in _REDIRECTS else excerpt(content, self._secrets)
+            kind = NotUnderstood if status in _NOT_UNDERSTOOD else NoDecision
+            raise kind("llm_status", f"{self.base_url}: HTTP {status}{': ' * (status not in _REDIRECTS)}{said}")
         try:
             return json.loads(content)
         except (ValueError, RecursionError):
-            raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON") from None
+            said = excerpt(content, self._secrets)
+            raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON: {said!r}") from None
 
+    async def _exchange(
+        self, method: str, url: URL, sent: bytes | None, headers: dict[str, str], exchange: _Exchange
+    ) -> tuple[int, str, bytearray]:
+        """Status, ``Location`` and body of the answer to one request."""
+        content, options = bytearray(), self._proxy
+        if headers:
+            options = {**options, "headers": {**options.get("headers", {}), **headers}}
+        present = _EXCHANGE.set(exchange)
+        try:
+            request = await self._http.request(method, url, data=sent, allow_redirects=False, **options)
+        finally:
+            _EXCHANGE.reset(present)
+        async with request as response:
+            if response.headers.get("Content-Encoding", "identity") != "identity":
+                raise NoDecision("llm_error", f"{self.base_url}: compressed, though identity was asked for")
+            async for chunk in response.content.iter_any():
+                content += chunk
+                if len(content) > exchange.most:
+                    raise NoDecision("llm_error", f"{self.base_url}: more than {exchange.most} bytes")
+        return response.status, response.headers.get("Location", ""), content
 
-def _positions(choice: Any) -> tuple[TokenPosition, ...]:
-    """The readable positions of an answer: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
-    found: list[TokenPosition] = []
-    try:
-        for position in choice["logprobs"]["content"][:_MAX_POSITIONS]:
-            likeliest = _probabilities(position.get("top_logprobs") or position.get("top_probs") or [])
-            found.append(TokenPosition(str(position.get("token", "")), likeliest))
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
-        pass
-    return tuple(found) if any(position.likeliest for position in found) else ()
-
-
-def _probabilities(likeliest: Any) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for entry in likeliest[: 4 * TOP_LOGPROBS]:
-        probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
-        # A NaN, in either field, is no probability.
-        known = 0.0 <= probability <= 1.0 and not math.isnan(entry.get("logprob", 0.0))
-        if isinstance(entry["token"], str) and known:
-            token = entry["token"].strip()
-            found[token] = min(1.0, found.get(token, 0.0) + float(probability))
-    return found
+    def _failure(self, error: aiohttp.ClientError | OSError | ValueError) -> NoDecision:
+        kind = Unreachable if isinstance(error, aiohttp.ClientConnectorError) else NoDecision
+        return kind("llm_error", f"{self.base_url}: {connection_fault(error)}")
 
 
 def _proxy_to(url: str) -> dict[str, Any]:
@@ -203,7 +250,7 @@ class _TooMuch(aiohttp.ClientConnectionError):
 
 
 class _BoundedConnector(aiohttp.TCPConnector):
-    """Makes connections that are aborted past ``_ALLOWED`` bytes of a request's body and 64 KB of heads."""
+    """Makes connections that are aborted past the bytes that an answer may have and 64 KB of heads."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -213,15 +260,21 @@ class _BoundedConnector(aiohttp.TCPConnector):
 
 
 class _BoundedResponse(ResponseHandler):
+    _exchange: _Exchange | None = None
     _left = 0
 
     def set_response_params(self, **params: Any) -> None:
         """Called by aiohttp as a request begins, in that request's task."""
-        self._left = _ALLOWED.get() + _MAX_HEAD_BYTES
+        exchange = _EXCHANGE.get()
+        exchange.reused = self._exchange is not None
+        self._exchange = exchange
+        self._left = exchange.most + _MAX_HEAD_BYTES
         super().set_response_params(**params)
 
     def data_received(self, data: bytes) -> None:
         self._left -= len(data)
+        if self._exchange is not None:
+            self._exchange.answered = True
         if self._left >= 0 or self.transport is None:
             super().data_received(data)
             return

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.calibration import check_labels
-from service.llm.request_bodies import Constraint, chat_body, label_body
+from service.llm.request_bodies import Constraint, TokenProbabilities, chat_body, label_body
 
 if TYPE_CHECKING:
     from service.llm.client import LLMClient
@@ -25,6 +25,7 @@ _ANY_NUMBER = 1000
 _PROBE_TEXT = "Say hello."
 _PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
 _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
+_PROBABILITIES: tuple[TokenProbabilities, ...] = ("sampled", "top_20", "top_5")
 # A server that answers 503 may only be busy: once it answers a plain request, it is probed once more.
 _PASSES = 2
 
@@ -35,12 +36,12 @@ class Abilities:
 
     Attributes:
         constraint: the kind of constraint that it obeys.
-        logprobs: whether it gives the probabilities of tokens.
+        logprobs: the probabilities of tokens that it gives.
         max_uavs_per_call: number of UAVs that one call may decide for.
     """
 
     constraint: Constraint
-    logprobs: bool
+    logprobs: TokenProbabilities
     max_uavs_per_call: int
 
 
@@ -51,7 +52,7 @@ async def probe(client: LLMClient, model: str | None) -> Abilities:
         NoDecision: the server does not answer a plain one, or is gone.
     """
     constraint = await _constraint(client, model)
-    logprobs = await _gives_probabilities(client, model, constraint)
+    logprobs = await _probabilities(client, model, constraint)
     together = await _answers_lists(client, model, constraint, logprobs)
     return Abilities(constraint, logprobs, _ANY_NUMBER if together else 1)
 
@@ -78,13 +79,22 @@ async def _constraint(client: LLMClient, model: str | None) -> Constraint:
     return "none"
 
 
-async def _gives_probabilities(client: LLMClient, model: str | None, constraint: Constraint) -> bool:
-    body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, [["A", "B"]])
-    found = await _answer(client, body)
-    return found is not None and bool(found.positions)
+async def _probabilities(client: LLMClient, model: str | None, constraint: Constraint) -> TokenProbabilities:
+    """The best token probabilities that the server gives."""
+    for kind in _PROBABILITIES:
+        if kind == "sampled" and constraint != "grammar":
+            continue
+        found = await _answer(
+            client, label_body(model, "Answer in words.", _PROBE_TEXT, constraint, [["A", "B"]], kind)
+        )
+        if found is not None and found.positions:
+            return kind
+    return "none"
 
 
-async def _answers_lists(client: LLMClient, model: str | None, constraint: Constraint, logprobs: bool) -> bool:
+async def _answers_lists(
+    client: LLMClient, model: str | None, constraint: Constraint, logprobs: TokenProbabilities
+) -> bool:
     """Whether the server names a label of each of two lists, as only a constrained server does."""
     lists = [["A", "B"], ["C", "D"]]
     body = label_body(model, "Answer in words.", _PROBE_TEXT, constraint, lists, logprobs)

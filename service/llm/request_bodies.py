@@ -9,10 +9,14 @@ from typing import Any, Literal
 # The kinds of constraint that servers obey: llama.cpp's grammar, vLLM's structured outputs, OpenAI's JSON schema.
 Constraint = Literal["grammar", "structured_outputs", "json_schema", "none"]
 
-# The most token probabilities that OpenAI and vLLM give for each position.
-TOP_LOGPROBS = 20
+# The token probabilities that a server gives, from the best to the plainest: after sampling (llama.cpp alone), the 20
+# likeliest (the most of OpenAI and vLLM), the 5 likeliest (the most of others), or none.
+TokenProbabilities = Literal["sampled", "top_20", "top_5", "none"]
+TOP_LOGPROBS = {"sampled": 20, "top_20": 20, "top_5": 5}
 # The temperature at which llama.cpp draws several labels one after the other.
 SEVERAL_LABELS_TEMPERATURE = 0.2
+# Sensor IDs and number of velocities of the first request.
+WARM_UP_CHOICES = ([0], 15)
 _LABEL_SEPARATOR = r' "\n" '
 
 
@@ -65,9 +69,9 @@ def label_body(
     user: str,
     constraint: Constraint,
     lists: Sequence[Sequence[str]],
-    logprobs: bool = True,
+    logprobs: TokenProbabilities = "sampled",
 ) -> dict[str, Any]:
-    """The request body for one label of each list, with the likeliest tokens' probabilities if ``logprobs``.
+    """The request body for one label of each list, with the likeliest tokens' probabilities.
 
     By default llama.cpp gives its probabilities from before the grammar. After sampling at temperature 0 all but one
     are 0. So it samples at temperature 1 without cutting any token off: the text is a draw. llama.cpp applies the
@@ -79,9 +83,9 @@ def label_body(
     fields = constrain_labels(constraint, lists)
     if constraint == "grammar":
         fields["cache_prompt"] = True
-    if logprobs:
-        fields |= {"logprobs": True, "top_logprobs": TOP_LOGPROBS}
-        if constraint == "grammar":
+    if logprobs != "none":
+        fields |= {"logprobs": True, "top_logprobs": TOP_LOGPROBS[logprobs]}
+        if logprobs == "sampled" and constraint == "grammar":
             fields |= {"post_sampling_probs": True, "samplers": ["temperature"]}
             fields["temperature"] = 1.0 if len(lists) == 1 else SEVERAL_LABELS_TEMPERATURE
     # A token for each label, and one for each end of a line between them.
@@ -104,10 +108,12 @@ def rewriting_body(
     )
 
 
-def warm_up_body(model: str | None, first: WarmUp, constraint: Constraint, logprobs: bool) -> dict[str, Any]:
+def warm_up_body(
+    model: str | None, first: WarmUp, constraint: Constraint, logprobs: TokenProbabilities
+) -> dict[str, Any]:
     """The request body of a server's first request."""
     if first.labels is None:
-        return chat_body(model, first.static, first.user, constraint, [0], 15)
+        return chat_body(model, first.static, first.user, constraint, *WARM_UP_CHOICES)
     return label_body(model, first.static, first.user, constraint, [first.labels], logprobs)
 
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
-from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
+from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable, check_answer
+from service.llm.calibration import probabilities
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.decision_priority import DecisionPriority
 from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
@@ -21,14 +22,17 @@ from service.llm.model_file import ModelMissing
 from service.llm.probing import probe, probe_body
 from service.llm.request_bodies import (
     SEVERAL_LABELS_TEMPERATURE,
+    WARM_UP_CHOICES,
     Constraint,
     Rewriting,
+    TokenProbabilities,
     WarmUp,
     chat_body,
     label_body,
     rewriting_body,
     warm_up_body,
 )
+from service.llm.request_terms import RequestExtras
 from service.llm.usability import Usability
 from shared.wire.reasons import Reason
 from shared.wire.schemas import Readiness
@@ -73,7 +77,7 @@ class LlmServer:
         notes_model: name of the model that reads notes.
         reads_letters: whether that model has the orders' adapter, which reads notes whose numbers are letters.
         constraint: the kind of constraint that the server obeys.
-        logprobs: whether the server gives the probabilities of tokens.
+        logprobs: the probabilities of tokens that the server gives.
         max_uavs_per_call: number of UAVs that one call may decide for.
     """
 
@@ -93,7 +97,7 @@ class LlmServer:
         self.model = self.bare_model = self.notes_model = settings.llm_model
         self.reads_letters = False
         self.constraint: Constraint = "none"
-        self.logprobs = False
+        self.logprobs: TokenProbabilities = "none"
         self.max_uavs_per_call = 1
         self.usability = Usability()
         self._breaker = CircuitBreaker()
@@ -150,7 +154,7 @@ class LlmServer:
         body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
         # The silence of a call for several UAVs says nothing about calls for one.
         answer = await self._decide(mission_id, body, self._silence if len(lists) == 1 else None)
-        if self.constraint != "grammar" or len(lists) == 1:
+        if self.logprobs != "sampled" or len(lists) == 1:
             return answer
         positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
         return replace(answer, positions=positions)
@@ -246,7 +250,13 @@ class LlmServer:
             try:
                 client = await self._connect()
                 self.status = ServerStatus("ready")
-                log.info("LLM ready: %s at %s, constraint %s", self.model, client.base_url, self.constraint)
+                log.info(
+                    "LLM ready: %s at %s, constraint %s, token probabilities %s",
+                    self.model,
+                    client.base_url,
+                    self.constraint,
+                    self.logprobs,
+                )
                 return
             except (ModelMissing, AdapterUnusable, LoadFailed) as error:
                 self.status = ServerStatus("unavailable", str(error))
@@ -265,7 +275,14 @@ class LlmServer:
         settings, http_client = self._settings, await asyncio.to_thread(_http_client)
         if self._client is None and settings.llm_url is not None:
             key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
-            self._client = http_client(settings.llm_url, api_key=key, session_header=settings.llm_session_header)
+            extras = RequestExtras(
+                settings.llm_extra_body,
+                settings.llm_extra_headers,
+                settings.llm_extra_query,
+                settings.llm_thinking_tokens,
+            )
+            header = settings.llm_session_header
+            self._client = http_client(settings.llm_url, api_key=key, session_header=header, extras=extras)
         elif self._client is None:
             self._embedded = await self._embed(settings)
             self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
@@ -273,18 +290,62 @@ class LlmServer:
             self.bare_model = self.bare_model or self._embedded.bare_model
             self.notes_model = self.notes_model or self._embedded.notes_model
             self.reads_letters = bool(self._embedded.with_orders)
-        async with asyncio.timeout(_PROBE_TIMEOUT_S):
-            if self.model is None:
-                self.model = self.bare_model = self.notes_model = next(iter(await self._client.models()), None)
-            found = await probe(self._client, self.model)
-            self.constraint, self.logprobs = found.constraint, found.logprobs
-            self.max_uavs_per_call = found.max_uavs_per_call
+        async with asyncio.timeout(settings.llm_load_s):
+            await self._find_abilities(self._client)
         try:
-            async with asyncio.timeout(_PROBE_TIMEOUT_S):
-                await self._client.complete(warm_up_body(self.model, self._warm_up, self.constraint, self.logprobs))
+            await self._judge(self._client)
         except (NoDecision, TimeoutError) as error:
-            log.info("the LLM did not answer the warm-up: %s", error)
+            log.warning("the LLM's answer to the first question cannot be used: %s", error or "none in time")
         return self._client
+
+    async def _judge(self, client: LLMClient) -> None:
+        """Send the warm-up, and check its answer as a decision's; raises :class:`NoDecision` or ``TimeoutError``."""
+        body = warm_up_body(self.model, self._warm_up, self.constraint, self.logprobs)
+        async with asyncio.timeout(_PROBE_TIMEOUT_S):
+            answer = await client.complete(body)
+        if self._warm_up.labels is None:
+            check_answer(answer.text, *WARM_UP_CHOICES)
+        else:
+            probabilities(answer, [self._warm_up.labels])
+
+    async def _find_abilities(self, client: LLMClient) -> None:
+        """Ask the server for its model, unless the settings or the model file name one, and for its abilities."""
+        if self._embedded is None and self._settings.llm_model is None:
+            self.model = self.bare_model = self.notes_model = await _listed_model(client)
+        found = await probe(client, self.model)
+        self.constraint, self.logprobs = found.constraint, found.logprobs
+        self.max_uavs_per_call = found.max_uavs_per_call
+
+    def record_unusable(self, fault: NoDecision) -> None:
+        """Count an answer that a decision cannot use; a degraded server is probed again, as it may have changed."""
+        self.usability.unusable(fault)
+        if self.usability.degraded and self.status.llm == "ready" and not self.recovering:
+            self._task = asyncio.create_task(self._probe_again(), name="llm-probe-again", context=Context())
+
+    async def _probe_again(self) -> None:
+        """While the answers are unusable: ask for model and abilities again, and for a decision."""
+        while self._client is not None and self.usability.degraded:
+            await asyncio.sleep(self.usability.pause_s)
+            try:
+                async with asyncio.timeout(_PROBE_TIMEOUT_S):
+                    await self._find_abilities(self._client)
+                await self._judge(self._client)
+            except (NoDecision, TimeoutError) as error:
+                log.info("the LLM's answers are still unusable: %s", error or "none in time")
+                self.usability.probed(passed=False)
+            else:
+                self.usability.probed(passed=True)
+
+
+async def _listed_model(client: LLMClient) -> str | None:
+    """The first model that the server lists; None, and the server's own default, if it gives no list."""
+    try:
+        return next(iter(await client.models()), None)
+    except Unreachable:
+        raise
+    except NoDecision as error:
+        log.info("the server lists no models, so requests name none: %s", error)
+        return None
 
 
 def _http_client() -> type[LLMClient]:

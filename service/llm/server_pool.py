@@ -49,12 +49,12 @@ class ServerPool:
     @property
     def active(self) -> LlmServer:
         """The first server of the settings that is ready, or the first of all."""
-        return next((server for server in self._each if server.status.llm == "ready"), self._each[0])
+        return _first_usable(self._each)
 
     def serving(self, mission_id: str) -> LlmServer:
         """The first server of a mission that is ready, or its first of all."""
         each = self._each if len(self._each) == 1 else self._ordered(mission_id, self._each)
-        return next((server for server in each if server.status.llm == "ready"), each[0])
+        return _first_usable(each)
 
     @property
     def status(self) -> Literal["loading", "ready", "unavailable", "off"]:
@@ -94,11 +94,11 @@ class ServerPool:
 
     def record_usability(self, mission_id: str, fault: NoDecision | None) -> None:
         """Record whether the answer to a decision's call could be used; ``fault`` is the reason why not."""
-        usability = self.serving(mission_id).usability
+        server = self.serving(mission_id)
         if fault is None:
-            usability.usable()
+            server.usability.usable()
         elif fault.reason in LLM_FAILURES and fault.reason != "llm_timeout":
-            usability.unusable(fault)
+            server.record_unusable(fault)
 
     def start(self) -> None:
         """Begin to load or reach all servers, unless the LLM is off."""
@@ -128,7 +128,7 @@ class ServerPool:
         ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
         if len(ready) > 1:
             # A stable sort: where every server is full, the order is as without a limit.
-            ready = sorted(self._ordered(mission_id, ready), key=lambda server: self._calls[server] >= self._slots)
+            ready = sorted(self._ordered(mission_id, ready), key=self._reluctance)
         waiting = deque(ready or self._each[:1])
         if self._hedge_s is not None and len(waiting) == 1:
             # A hedge to the same address: there may be several machines behind it.
@@ -163,6 +163,9 @@ class ServerPool:
             await asyncio.gather(*running, return_exceptions=True)
         raise failure or NoDecision("llm_unavailable", "there is no server")
 
+    def _reluctance(self, server: LlmServer) -> tuple[bool, bool]:
+        return server.usability.degraded is not None, self._calls[server] >= self._slots
+
     def _ordered(self, mission_id: str, servers: list[LlmServer]) -> list[LlmServer]:
         """Servers in a mission's order: the one of the settings, or by rendezvous hashing."""
         if not self._by_mission:
@@ -175,3 +178,9 @@ class ServerPool:
         task = asyncio.create_task(call(server), name="ask-llm")
         task.add_done_callback(lambda _: self._calls.subtract([server]))
         running[task] = server
+
+
+def _first_usable(servers: Sequence[LlmServer]) -> LlmServer:
+    """The first ready server whose answers can be used, else the first ready one, else the first."""
+    ready = [server for server in servers if server.status.llm == "ready"]
+    return next((server for server in ready if server.usability.degraded is None), (ready or servers)[0])

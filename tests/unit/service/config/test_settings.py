@@ -48,3 +48,18 @@ def test_experiences_that_cannot_fit_the_context_are_refused() -> None:
     with pytest.raises(ValidationError, match="AICVDS_LLM_CONTEXT"):
         Settings(experiences=200)
     assert Settings(experiences=200, llm_context=8192).experiences == 200
+
+
+@pytest.mark.parametrize("text", ["[1]", "no JSON", '{"a": ', "7"])
+def test_further_fields_are_a_json_object(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setenv("AICVDS_LLM_EXTRA_BODY", text)
+    with pytest.raises(ValidationError, match="must be a JSON object"):
+        Settings()
+    monkeypatch.setenv("AICVDS_LLM_EXTRA_BODY", '{"reasoning_effort": "none", "n": {"m": [1]}}')
+    assert Settings().llm_extra_body == {"reasoning_effort": "none", "n": {"m": [1]}}
+
+
+@pytest.mark.parametrize("headers", [{"a": "b\r\nc: d"}, {"a\n": "b"}, {"a": "ü"}])
+def test_further_headers_are_printable(headers: dict[str, str]) -> None:
+    with pytest.raises(ValidationError, match="printable ASCII"):
+        Settings(llm_extra_headers=headers)

@@ -6,7 +6,12 @@ from service.llm.request_bodies import constrain
 
 @pytest.mark.parametrize(
     ("text", "decision"),
-    [("3 7", (3, 7)), (" 3 14\n", (3, 14)), ('{"sensor_id": 3, "velocity": 0}', (3, 0))],
+    [
+        ("3 7", (3, 7)),
+        (" 3 14\n", (3, 14)),
+        ('{"sensor_id": 3, "velocity": 0}', (3, 0)),
+        ('{"why": 1, "sensor_id": 3, "velocity": 7}', (3, 7)),
+    ],
 )
 def test_accepts_two_admissible_integers(text: str, decision: tuple[int, int]) -> None:
     assert check_answer(text, [3, 9], 15) == decision
@@ -28,7 +33,6 @@ def test_accepts_two_admissible_integers(text: str, decision: tuple[int, int]) -
         ('{"sensor_id": 3}', "answer_format"),
         ('{"sensor_id": true, "velocity": 7}', "answer_format"),
         ('{"sensor_id": "3", "velocity": 7}', "answer_format"),
-        ('{"sensor_id": 3, "velocity": 7, "why": 1}', "answer_format"),
         ('{"sensor_id": 3, "velo', "answer_format"),
         ("{" * 100_000, "answer_format"),
         ("4 7", "answer_sensor"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from service.llm.answers import Completion, NoDecision, TokenPosition, raised
-from service.llm.calibration import calibrated, probabilities
+from service.llm.calibration import LabelReader, calibrated, probabilities
 
 
 def completion(text: str, **first_token: float) -> Completion:
@@ -76,3 +76,16 @@ def test_a_low_temperature_is_undone() -> None:
     cooled = {label: value**5 / sum(v**5 for v in p.values()) for label, value in p.items()}
     assert TokenPosition("A", cooled).untempered(0.2).likeliest == pytest.approx(p)
     assert TokenPosition("A", {}).untempered(0.2).likeliest == {}
+
+
+def test_labels_with_hardly_any_probability_are_no_answer() -> None:
+    """A thinking model begins with another token; renormalised, its labels would seem sure."""
+    with pytest.raises(NoDecision, match="the labels have 3e-07 of the probability"):
+        probabilities(completion("<think>", **{"<think>": 0.99, "A": 2e-7, "B": 1e-7}), [["A", "B"]])
+
+
+def test_a_bias_of_token_probabilities_corrects_no_answer_read_from_the_text() -> None:
+    reader = LabelReader()
+    reader._bias["model", "static", 1] = [{"A": 0.9, "B": 0.1}]
+    other = Completion("A", None, None, None, (TokenPosition("A", {"x": 1.0}),), "model")
+    assert reader.read(other, "static", [["A", "B"]]) == [pytest.approx({"A": 0.975, "B": 0.025})]

@@ -1,0 +1,115 @@
+"""Reads a chat completion as servers really send it; the decision's own checks are in :mod:`service.llm.answers`.
+
+Servers that were seen: a model's thoughts before the answer, within ``<think>`` tags (QwQ behind vLLM without a
+reasoning parser) or in a field of their own with no content yet (Ollama, vLLM 39103); content as a list of parts
+(Mistral, LiteLLM); a JSON answer within a Markdown fence (vllm 38696); the byte-level tokens of GPT-2's vocabulary,
+whose blank is written as another letter (lmdeploy 2802), and null among the token probabilities.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from service.llm.answers import Completion, NoDecision, TokenPosition
+from service.llm.server_words import excerpt_of
+
+_MAX_TOKENS, _MAX_POSITIONS, _MAX_LIKELIEST = 10**9, 4096, 80
+_THOUGHTS = re.compile(r"\A\s*(?:<think(?:ing)?>.*?</think(?:ing)?>\s*)+", re.DOTALL)
+_UNCLOSED = re.compile(r"\A\s*<think(?:ing)?>", re.DOTALL)
+_CLOSING = re.compile(r"</think(?:ing)?>")
+_FENCE = re.compile(r"\A\s*```[a-zA-Z]*\s*\n?(.*?)\n?\s*```\s*\Z", re.DOTALL)
+# A blank and the end of a line in the vocabularies of GPT-2 and SentencePiece.
+_BLANKS = str.maketrans({"Ġ": " ", "▁": " ", "Ċ": "\n"})
+
+
+def completion_of(answer: Any, base_url: str) -> Completion:
+    """The completion of a server's JSON answer.
+
+    Raises:
+        NoDecision: the answer is an error object, or has no text, not even an empty one.
+    """
+    try:
+        choice = answer["choices"][0]
+        message = choice["message"]
+        content, reasoning = message.get("content"), message.get("reasoning_content") or message.get("reasoning")
+    except (AttributeError, KeyError, IndexError, TypeError):
+        said = excerpt_of(answer)
+        detail = f"a 200 that is no chat completion{f': {said!r}' if said else ''}"
+        raise NoDecision("llm_error", f"{base_url}: {detail}") from None
+    cut = choice.get("finish_reason") == "length"
+    text = _text(content)
+    if text is None and (reasoning or cut):
+        text = ""
+    if text is None:
+        raise NoDecision("llm_error", f"{base_url}: a completion without text")
+    plain = _without_thoughts(text)
+    positions = _positions(choice)
+    if plain != text:
+        positions = _after_thoughts(positions)
+    prompt, cached, completion = _counts(answer.get("usage"))
+    unfinished = cut and not plain.strip() and (not text or bool(reasoning) or plain != text)
+    return Completion(plain, prompt, cached, completion, positions, unfinished=unfinished)
+
+
+def _text(content: Any) -> str | None:
+    if isinstance(content, list):
+        parts = [part.get("text") for part in content if isinstance(part, dict) and part.get("type") == "text"]
+        return "".join(part for part in parts if isinstance(part, str))
+    return content if isinstance(content, str) else None
+
+
+def _without_thoughts(text: str) -> str:
+    """A text without the thoughts and the fence around its answer; empty if the thoughts have no end."""
+    if "<think" in text or "</think" in text:
+        text = _THOUGHTS.sub("", text)
+        # Some chat templates open the thoughts in the prompt, so that the answer has the closing tag alone.
+        text = "" if _UNCLOSED.match(text) else _CLOSING.split(text)[-1].lstrip()
+    fenced = _FENCE.match(text) if "```" in text else None
+    return fenced[1] if fenced else text
+
+
+def _counts(usage: Any) -> tuple[int | None, int | None, int | None]:
+    """Tokens of the prompt, of its cached part and of the completion, where the server gives plausible ones."""
+    usage = usage if isinstance(usage, dict) else {}
+    details = usage.get("prompt_tokens_details")
+    cached = details.get("cached_tokens") if isinstance(details, dict) else None
+    counts = (usage.get("prompt_tokens"), cached, usage.get("completion_tokens"))
+    prompt, cached, completion = (c if type(c) is int and 0 <= c <= _MAX_TOKENS else None for c in counts)
+    return prompt, cached if prompt is None or cached is None else min(cached, prompt), completion
+
+
+def _positions(choice: Any) -> tuple[TokenPosition, ...]:
+    """The readable positions of an answer: OpenAI's ``top_logprobs``, or llama.cpp's ``top_probs``."""
+    found: list[TokenPosition] = []
+    try:
+        for position in choice["logprobs"]["content"][:_MAX_POSITIONS]:
+            likeliest = _probabilities(position.get("top_logprobs") or position.get("top_probs") or [])
+            found.append(TokenPosition(str(position.get("token", "")).translate(_BLANKS), likeliest))
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+        pass
+    return tuple(found) if any(position.likeliest for position in found) else ()
+
+
+def _after_thoughts(positions: tuple[TokenPosition, ...]) -> tuple[TokenPosition, ...]:
+    """The positions after the thoughts' closing tag and its blanks; none if no token has the tag."""
+    closed = [index for index, position in enumerate(positions) if "</think" in position.token]
+    if not closed:
+        return ()
+    rest = positions[closed[-1] + 1 :]
+    return rest[next((index for index, position in enumerate(rest) if position.token.strip()), len(rest)) :]
+
+
+def _probabilities(likeliest: Any) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for entry in likeliest[:_MAX_LIKELIEST]:
+        if not isinstance(entry, dict):
+            continue
+        probability = entry["prob"] if "prob" in entry else math.exp(min(0.0, entry["logprob"]))
+        # A NaN, in either field, is no probability.
+        known = 0.0 <= probability <= 1.0 and not math.isnan(entry.get("logprob", 0.0))
+        if isinstance(entry["token"], str) and known:
+            token = entry["token"].translate(_BLANKS).strip()
+            found[token] = min(1.0, found.get(token, 0.0) + float(probability))
+    return found

@@ -1,0 +1,71 @@
+"""Chat completions as servers really send them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from service.llm.answer_reading import completion_of
+from service.llm.answers import NoDecision
+
+
+def answer(content: Any, **choice: Any) -> dict[str, Any]:
+    return {"choices": [{"message": {"content": content}, **choice}]}
+
+
+def position(token: str, *likeliest: Any) -> dict[str, Any]:
+    return {"token": token, "top_logprobs": list(likeliest)}
+
+
+def entry(token: str, probability: float) -> dict[str, Any]:
+    return {"token": token, "logprob": math.log(probability)}
+
+
+@pytest.mark.parametrize("blank", ["Ġ", "▁", " ", ""])
+def test_a_token_may_begin_with_the_blank_of_its_vocabulary_and_an_entry_may_be_null(blank: str) -> None:
+    content = [position(f"{blank}A", None, entry(f"{blank}A", 0.9), entry(f"{blank}B", 0.1))]
+    read = completion_of(answer("A", logprobs={"content": content}), "url")
+    assert read.positions[0].likeliest == pytest.approx({"A": 0.9, "B": 0.1})
+
+
+def test_positions_of_thoughts_are_none_of_the_answer() -> None:
+    tokens = ["<think>", "Hm", "</think>", "\n\n", "B"]
+    content = [position(token, entry(token, 0.8), entry("A", 0.1)) for token in tokens]
+    read = completion_of(answer("<think>Hm</think>\n\nB", logprobs={"content": content}), "url")
+    assert read.text == "B"
+    assert [found.token for found in read.positions] == ["B"]
+
+
+@pytest.mark.parametrize(
+    ("content", "text", "unfinished"),
+    [
+        ("", "", True),
+        (None, "", True),
+        ("<think>Hm", "", True),
+        ("<thinking>Hm", "", True),
+        # White space without end is no thought: more tokens would be more of it.
+        ("{\n\n\n", "{\n\n\n", False),
+        (" \n ", " \n ", False),
+        ("0 7", "0 7", False),
+    ],
+)
+def test_an_answer_cut_off_before_it_begins_is_unfinished(content: str | None, text: str, unfinished: bool) -> None:
+    read = completion_of(answer(content, finish_reason="length"), "url")
+    assert (read.text, read.unfinished) == (text, unfinished)
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"error": {"message": "no such model"}}, "no such model"),
+        ({"error": "Unexpected endpoint"}, "Unexpected endpoint"),
+        ({"choices": []}, "no chat completion"),
+        (answer(None, finish_reason="stop"), "without text"),
+        (answer(7), "without text"),
+    ],
+)
+def test_no_completion_is_named_in_the_servers_words(body: Any, words: str) -> None:
+    with pytest.raises(NoDecision, match=words):
+        completion_of(body, "url")

@@ -1,0 +1,79 @@
+"""Request bodies that follow a server's refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from service.llm.request_bodies import chat_body, label_body
+from service.llm.request_terms import RequestTerms
+from service.llm.server_words import excerpt
+
+
+def body() -> dict[str, Any]:
+    return label_body("m", "instructions", "state", "none", [["A", "B"]], "top_20")
+
+
+@pytest.mark.parametrize(
+    ("message", "changes"),
+    [
+        ("Use 'max_completion_tokens' instead of max_tokens", {"max_tokens": "max_completion_tokens"}),
+        ("temperature: Extra inputs are not permitted", {"temperature": False}),
+        ("Requested sample logprobs of 20, which is greater than max allowed: 5", {"top_logprobs": 5}),
+        ("messages[0].role: Unsupported value", {"system_role": False}),
+        ("Conversation roles must alternate user/assistant/user/assistant/...", {"system_role": False}),
+        ("max_tokens: context length of 2048 is exceeded", None),
+        ("The model does not exist", None),
+        ("unknown field: grammar", None),
+    ],
+)
+def test_a_refusal_that_names_a_field_changes_it(message: str, changes: dict[str, Any] | None) -> None:
+    found = RequestTerms().after_refusal(message, body())
+    assert found == (None if changes is None else RequestTerms(**changes))
+
+
+def test_no_field_is_changed_twice_without_end() -> None:
+    terms, count = RequestTerms(), 0
+    message = "logprobs, max_tokens, temperature, seed and the system role are not supported"
+    while other := terms.after_refusal(message, terms.applied({**body(), "seed": 1})):
+        terms, count = other, count + 1
+    assert count == 6
+    assert terms.applied({**body(), "seed": 1}).keys() == {"messages", "max_completion_tokens", "stream", "model"}
+
+
+def test_usual_terms_leave_a_body_alone_and_others_leave_the_given_one() -> None:
+    usual = chat_body("m", "instructions", "state", "none", [1], 15)
+    assert RequestTerms().applied(usual) is usual
+    folded = RequestTerms(system_role=False, more_tokens=256).applied(usual)
+    assert folded["messages"] == [{"role": "user", "content": "instructions\n\nstate"}]
+    assert folded["max_tokens"] == usual["max_tokens"] + 256
+    assert [message["role"] for message in usual["messages"]] == ["system", "user"]
+
+
+@pytest.mark.parametrize(
+    ("most", "budgets"), [(0, []), (100, [100]), (2048, [256, 1024, 2048]), (4096, [256, 1024, 4096])]
+)
+def test_tokens_for_thought_are_raised_to_the_setting(most: int, budgets: list[int]) -> None:
+    terms, found = RequestTerms(), []
+    while other := terms.with_more_tokens(most):
+        terms = other
+        found.append(terms.more_tokens)
+    assert found == budgets
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b'{"error": {"message": "bad key sk-abc123def", "param": "model"}}', "model: bad key ***"),
+        (b'{"detail": [{"loc": ["body", "seed"], "msg": "no"}]}', "['body', 'seed']: no"),
+        (b"<html><style>p {}</style><h1>502</h1>Bad\n\ngateway</html>", "502 Bad gateway"),
+        (b"Incorrect key private-1 at http://user:pw@host", "Incorrect key *** at http://***host"),
+        (b"\xff\x00" * 1000, None),
+        (b"{" * 100_000, "{" * 200),
+    ],
+)
+def test_an_excerpt_is_short_readable_and_without_keys(content: bytes, expected: str | None) -> None:
+    found = excerpt(content, ("private-1",))
+    assert len(found) <= 200 and found.isprintable()
+    assert expected is None or found == expected
