@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import platform
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from pydantic import ValidationError
@@ -22,7 +23,23 @@ from service.config.settings import Settings, unknown_variables
 from shared.kit.validation_messages import problem_of
 from shared.wire.schemas import LLM_MODES
 
+if TYPE_CHECKING:
+    from service.llm.examination import Examination
+
 _ASKED_S = 3.0
+# A large model on a small machine reads its first prompt slowly.
+_EXAMINED_S = 120.0
+_LATE = (
+    "raise AICVDS_DEADLINE_MS, use a faster model, or turn its thoughts off "
+    """(AICVDS_LLM_EXTRA_BODY='{"reasoning_effort": "none"}')"""
+)
+_REMEDIES = {
+    "llm_status": "the server refuses: check AICVDS_LLM_URL (most end in /v1), AICVDS_LLM_MODEL and AICVDS_LLM_API_KEY",
+    "llm_error": "start the server, or correct AICVDS_LLM_URL (most end in /v1)",
+    "answer_format": "the model answers in another form: try another model, or raise AICVDS_LLM_THINKING_TOKENS",
+    "answer_sensor": "the model names a sensor that was not offered: try another model",
+    "answer_velocity": "the model names a velocity that does not exist: try another model",
+}
 _SUPPORTED = ((3, 11), (3, 13))
 
 
@@ -33,7 +50,10 @@ class Doctor:
     Each line has one finding. A line with !! says what to type. Nothing is changed. The settings are those that
     `aicvds serve` would have: the variables AICVDS_*.
 
+    An LLM server is asked as the edge asks it: the findings are its abilities, and the time of one decision.
+
     Try it:  aicvds doctor
+             aicvds doctor --llm-url http://localhost:11434/v1
 
     Exit code: 0 nothing is in the way, 1 something is.
     """
@@ -42,6 +62,8 @@ class Doctor:
     """Address that the edge is to listen on."""
     port: Annotated[int, tyro.conf.arg(metavar="1-65535")] = 8000
     """Port that the edge is to listen on."""
+    llm_url: Annotated[str | None, tyro.conf.arg(metavar="URL")] = None
+    """Address of an LLM server, as AICVDS_LLM_URL, to be judged before a flight."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +86,21 @@ def main(argv: list[str]) -> int:
         print(f"aicvds doctor: --port {options.port} is not between 1 and 65535", file=sys.stderr)
         return 2
     trouble = 0
-    for finding in findings(options.host, options.port):
+    for finding in findings(options.host, options.port, options.llm_url):
         print(finding, flush=True)
         trouble += finding.remedy is not None
     print(f"{trouble} in the way" if trouble else "Nothing is in the way. Next:  aicvds serve")
     return 1 if trouble else 0
 
 
-def findings(host: str, port: int) -> Iterator[Finding]:
+def findings(host: str, port: int, llm_url: str | None = None) -> Iterator[Finding]:
     """All findings, in the order in which a start would meet them."""
     yield versions()
     yield port_of(host, port)
     for name, meant in unknown_variables().items():
         yield Finding("settings", f"{name} is no setting and changes nothing{meant}", f"unset {name}")
     try:
-        settings = Settings()
+        settings = Settings() if llm_url is None else Settings(llm_url=llm_url)
     except ValidationError as error:
         for fault in error.errors():
             name = "AICVDS_" + "_".join(str(part) for part in fault["loc"]).upper()
@@ -87,7 +109,7 @@ def findings(host: str, port: int) -> Iterator[Finding]:
         return
     yield Finding("settings", f"mode {settings.mode}, deadline {settings.deadline_ms} ms, top-k {settings.top_k}")
     yield store_of(settings)
-    if settings.mode in LLM_MODES:
+    if settings.mode in LLM_MODES or llm_url:
         yield from (llm_servers(settings) if settings.llm_url else embedded(settings))
     yield planner(settings)
 
@@ -147,27 +169,49 @@ def store_of(settings: Settings) -> Finding:
 
 
 def llm_servers(settings: Settings) -> Iterator[Finding]:
-    """Whether each LLM server answers, and has the model."""
+    """The abilities of each LLM server and the time of one decision, asked as the edge asks."""
     for one in settings.each_server():
-        key = one.llm_api_key.get_secret_value() if one.llm_api_key else None
-        answer = _asked(f"{one.llm_url}/models", key)
-        if isinstance(answer, str):
-            yield Finding("LLM", f"{one.llm_url}: {answer}", "start the server, or correct AICVDS_LLM_URL or _API_KEY")
-            continue
-        models = answer.get("data")
-        if not isinstance(models, list):
-            yield Finding(
-                "LLM",
-                f"{one.llm_url}/models lists no models",
-                "check that the address ends in /v1, or set AICVDS_LLM_MODEL" if not one.llm_model else None,
-            )
-            continue
-        listed = [str(m.get("id"))[:200] for m in models if isinstance(m, dict)]
-        if one.llm_model and one.llm_model not in listed:
-            names = ", ".join(listed[:5]) or "no model"
-            yield Finding("LLM", f"{one.llm_url} lists {names}, not {one.llm_model}", "correct AICVDS_LLM_MODEL")
-            continue
-        yield Finding("LLM", f"{one.llm_url}: {one.llm_model or next(iter(listed), 'lists no model')}")
+        yield from _llm_server(one)
+
+
+def _llm_server(settings: Settings) -> Iterator[Finding]:
+    from service.llm.answers import NoDecision
+    from service.llm.examination import examine
+    from service.prompting.warm_up import warm_up
+
+    async def examined() -> Examination:
+        async with asyncio.timeout(_EXAMINED_S):
+            return await examine(settings, warm_up(settings))
+
+    try:
+        found = asyncio.run(examined())
+    except TimeoutError:
+        remedy = "start the server, or wait until it has loaded its model"
+        yield Finding("LLM", f"{settings.llm_url}: no answer in {_EXAMINED_S:g} s", remedy)
+        return
+    except NoDecision as error:
+        yield Finding("LLM", str(error), _REMEDIES.get(error.reason, _REMEDIES["llm_error"]))
+        return
+    able = found.abilities
+    yield Finding("LLM", f"{settings.llm_url}: {found.model or 'the default model of the server'}")
+    form = "as text that the edge checks" if able.constraint == "none" else f"constrained by {able.constraint}"
+    probabilities = {"none": "no token probabilities", "sampled": "token probabilities after sampling"}
+    likeliest = probabilities.get(able.logprobs, f"the {able.logprobs[4:]} likeliest tokens")
+    together = "several UAVs a call" if able.max_uavs_per_call > 1 else "one UAV a call"
+    yield Finding("LLM", f"answers {form}, {likeliest}, {together}{f'; with {found.terms}' if found.terms else ''}")
+    late = found.seconds * 1e3 > settings.deadline_ms
+    yield Finding("LLM", _timed(found, settings.deadline_ms), _LATE if late else None)
+
+
+def _timed(found: Examination, deadline_ms: int) -> str:
+    tokens = ""
+    if found.prompt_tokens is not None and found.completion_tokens is not None:
+        cached = f" ({found.cached_tokens} cached)" if found.cached_tokens is not None else ""
+        rate = (found.prompt_tokens + found.completion_tokens) / max(found.seconds, 1e-3)
+        tokens = (
+            f"; prompt {found.prompt_tokens} tokens{cached}, answer {found.completion_tokens}, {rate:,.0f} a second"
+        )
+    return f"a decision took {found.seconds:.2f} s of the deadline's {deadline_ms / 1e3:g} s{tokens}"
 
 
 def embedded(settings: Settings) -> Iterator[Finding]:
@@ -196,13 +240,12 @@ def planner(settings: Settings) -> Finding:
     return Finding("planner", f"numba {version('numba')}; {free_mb:,.0f} MB of disk free")
 
 
-def _asked(url: str, key: str | None = None) -> Any:
+def _asked(url: str) -> Any:
     """The JSON of a GET, or the reason of a failure, as text."""
     import httpx
 
-    headers = {"Authorization": f"Bearer {key}"} if key else {}
     try:
-        answer = httpx.get(url, headers=headers, timeout=_ASKED_S)
+        answer = httpx.get(url, timeout=_ASKED_S)
         answer.raise_for_status()
         found = answer.json()
     except httpx.HTTPStatusError as error:

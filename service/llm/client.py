@@ -19,6 +19,7 @@ from aiohttp.client_proto import ResponseHandler
 from pydantic_core import to_json
 from yarl import URL
 
+from service.config.settings import Settings
 from service.llm.answer_reading import completion_of
 from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.request_terms import RequestExtras, RequestTerms
@@ -104,6 +105,11 @@ class LLMClient:
             cookie_jar=aiohttp.DummyCookieJar(),
             auto_decompress=False,
         )
+
+    @property
+    def terms(self) -> RequestTerms:
+        """The changes of a request that the server has demanded."""
+        return self._terms
 
     async def close(self) -> None:
         """Close every connection."""
@@ -221,6 +227,23 @@ class LLMClient:
     def _failure(self, error: aiohttp.ClientError | OSError | ValueError) -> NoDecision:
         kind = Unreachable if isinstance(error, aiohttp.ClientConnectorError) else NoDecision
         return kind("llm_error", f"{self.base_url}: {connection_fault(error)}")
+
+
+def client_of(settings: Settings) -> LLMClient:
+    """The client of the one server that the settings name; raises :class:`NoDecision` as :class:`LLMClient` does."""
+    if settings.llm_url is None:
+        raise ValueError("the settings name no server")
+    return LLMClient(
+        settings.llm_url,
+        api_key=settings.llm_api_key.get_secret_value() if settings.llm_api_key else None,
+        session_header=settings.llm_session_header,
+        extras=RequestExtras(
+            settings.llm_extra_body,
+            settings.llm_extra_headers,
+            settings.llm_extra_query,
+            settings.llm_thinking_tokens,
+        ),
+    )
 
 
 def _proxy_to(url: str) -> dict[str, Any]:

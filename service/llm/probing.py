@@ -8,15 +8,26 @@ that fails means that the ability is absent, and only a plain completion says wh
 from __future__ import annotations
 
 import asyncio
+import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
-from service.llm.calibration import check_labels
-from service.llm.request_bodies import Constraint, TokenProbabilities, chat_body, label_body
+from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable, check_answer
+from service.llm.calibration import check_labels, probabilities
+from service.llm.request_bodies import (
+    WARM_UP_CHOICES,
+    Constraint,
+    TokenProbabilities,
+    WarmUp,
+    chat_body,
+    label_body,
+    warm_up_body,
+)
 
 if TYPE_CHECKING:
     from service.llm.client import LLMClient
+
+log = logging.getLogger(__name__)
 
 _TOGETHER_TIMEOUT_S = 15.0
 # More than the UAVs of any fleet.
@@ -117,6 +128,33 @@ async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
         raise
     except NoDecision:
         return None
+
+
+async def listed_model(client: LLMClient) -> str | None:
+    """The first model that the server lists; None, and the server's own default, if it gives no list.
+
+    Raises:
+        Unreachable: the server is gone.
+    """
+    try:
+        return next(iter(await client.models()), None)
+    except Unreachable:
+        raise
+    except NoDecision as error:
+        log.info("the server lists no models, so requests name none: %s", error)
+        return None
+
+
+async def first_answer(
+    client: LLMClient, model: str | None, warm_up: WarmUp, constraint: Constraint, logprobs: TokenProbabilities
+) -> Completion:
+    """The answer to the warm-up, checked as a decision's; raises :class:`NoDecision`."""
+    answer = await client.complete(warm_up_body(model, warm_up, constraint, logprobs))
+    if warm_up.labels is None:
+        check_answer(answer.text, *WARM_UP_CHOICES)
+    else:
+        probabilities(answer, [warm_up.labels])
+    return answer
 
 
 def probe_body(model: str | None, constraint: Constraint) -> dict[str, Any]:

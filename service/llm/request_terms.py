@@ -98,6 +98,18 @@ class RequestTerms:
             return replace(self, system_role=False)
         return None
 
+    def __str__(self) -> str:
+        """The changes in words; empty if there are none."""
+        changes = [
+            (self.max_tokens != "max_tokens", self.max_tokens),
+            (not self.temperature, "no temperature"),
+            (not self.seed, "no seed"),
+            (not self.system_role, "no system role"),
+            (self.top_logprobs < _USUAL.top_logprobs, f"{self.top_logprobs} token probabilities"),
+            (self.more_tokens > 0, f"{self.more_tokens} tokens of thought"),
+        ]
+        return ", ".join(text for changed, text in changes if changed)
+
     def with_more_tokens(self, most: int) -> RequestTerms | None:
         """These terms with the next larger number of tokens for thought; None if that would be more than ``most``."""
         more = next((budget for budget in (*_BUDGETS, most) if self.more_tokens < budget <= most), None)

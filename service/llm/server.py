@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import logging
 import time
 from collections.abc import Callable, Sequence
 from contextvars import Context
 from dataclasses import dataclass, replace
 from functools import partial
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
-from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable, check_answer
-from service.llm.calibration import probabilities
+from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.decision_priority import DecisionPriority
 from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
 from service.llm.model_file import ModelMissing
-from service.llm.probing import probe, probe_body
+from service.llm.probing import first_answer, listed_model, probe, probe_body
 from service.llm.request_bodies import (
     SEVERAL_LABELS_TEMPERATURE,
-    WARM_UP_CHOICES,
     Constraint,
     Rewriting,
     TokenProbabilities,
@@ -30,9 +30,7 @@ from service.llm.request_bodies import (
     chat_body,
     label_body,
     rewriting_body,
-    warm_up_body,
 )
-from service.llm.request_terms import RequestExtras
 from service.llm.usability import Usability
 from shared.wire.reasons import Reason
 from shared.wire.schemas import Readiness
@@ -272,20 +270,13 @@ class LlmServer:
 
     async def _connect(self) -> LLMClient:
         """Reach or load the LLM, probe its abilities, and send the warm-up."""
-        settings, http_client = self._settings, await asyncio.to_thread(_http_client)
+        settings, client_module = self._settings, await asyncio.to_thread(_client_module)
         if self._client is None and settings.llm_url is not None:
-            key = settings.llm_api_key.get_secret_value() if settings.llm_api_key else None
-            extras = RequestExtras(
-                settings.llm_extra_body,
-                settings.llm_extra_headers,
-                settings.llm_extra_query,
-                settings.llm_thinking_tokens,
-            )
-            header = settings.llm_session_header
-            self._client = http_client(settings.llm_url, api_key=key, session_header=header, extras=extras)
+            self._client = client_module.client_of(settings)
         elif self._client is None:
             self._embedded = await self._embed(settings)
-            self._client = http_client(self._embedded.base_url, api_key=self._embedded.api_key, trust_env=False)
+            key = self._embedded.api_key
+            self._client = client_module.LLMClient(self._embedded.base_url, api_key=key, trust_env=False)
             self.model = self.model or self._embedded.model
             self.bare_model = self.bare_model or self._embedded.bare_model
             self.notes_model = self.notes_model or self._embedded.notes_model
@@ -300,18 +291,13 @@ class LlmServer:
 
     async def _judge(self, client: LLMClient) -> None:
         """Send the warm-up, and check its answer as a decision's; raises :class:`NoDecision` or ``TimeoutError``."""
-        body = warm_up_body(self.model, self._warm_up, self.constraint, self.logprobs)
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
-            answer = await client.complete(body)
-        if self._warm_up.labels is None:
-            check_answer(answer.text, *WARM_UP_CHOICES)
-        else:
-            probabilities(answer, [self._warm_up.labels])
+            await first_answer(client, self.model, self._warm_up, self.constraint, self.logprobs)
 
     async def _find_abilities(self, client: LLMClient) -> None:
         """Ask the server for its model, unless the settings or the model file name one, and for its abilities."""
         if self._embedded is None and self._settings.llm_model is None:
-            self.model = self.bare_model = self.notes_model = await _listed_model(client)
+            self.model = self.bare_model = self.notes_model = await listed_model(client)
         found = await probe(client, self.model)
         self.constraint, self.logprobs = found.constraint, found.logprobs
         self.max_uavs_per_call = found.max_uavs_per_call
@@ -337,19 +323,6 @@ class LlmServer:
                 self.usability.probed(passed=True)
 
 
-async def _listed_model(client: LLMClient) -> str | None:
-    """The first model that the server lists; None, and the server's own default, if it gives no list."""
-    try:
-        return next(iter(await client.models()), None)
-    except Unreachable:
-        raise
-    except NoDecision as error:
-        log.info("the server lists no models, so requests name none: %s", error)
-        return None
-
-
-def _http_client() -> type[LLMClient]:
-    """The client's class, imported in a thread: importing aiohttp takes a fifth of a second."""
-    from service.llm.client import LLMClient
-
-    return LLMClient
+def _client_module() -> ModuleType:
+    """The client's module, imported in a thread: importing aiohttp takes a fifth of a second."""
+    return importlib.import_module("service.llm.client")

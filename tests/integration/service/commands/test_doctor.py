@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi import FastAPI
-from fastapi.responses import Response
+from fastapi.responses import JSONResponse, Response
 
 from service.commands import banner, doctor
 from service.config.settings import Settings
 from service.storage.locks import FileLock
 from tests.support.running import serving
-from tests.support.stub_llm import StubLlm
+from tests.support.stub_llm import StubLlm, said
 
 
 def free_port() -> int:
@@ -59,13 +60,34 @@ def test_a_locked_store_names_its_file(tmp_path: Path) -> None:
         held.close()
 
 
-def test_an_llm_server_must_have_the_model() -> None:
-    with serving(StubLlm("0 1").app) as url:
-        [there] = doctor.llm_servers(Settings(llm_url=f"{url}/v1"))
+class Thinking(StubLlm):
+    """Has one model, refuses ``max_tokens``, thinks for 200 tokens, and answers by a label or two integers."""
+
+    async def respond(self, body: dict[str, Any], probed: bool) -> Response:
+        if body.get("model") != "stub-1":
+            return JSONResponse({"error": {"message": f"no model {body.get('model')}"}}, 404)
+        if "max_tokens" in body:
+            return JSONResponse({"error": {"message": "unsupported", "param": "max_tokens"}}, 400)
+        if body["max_completion_tokens"] < 200:
+            return said("<think>Hm", finish_reason="length")
+        return said(f"<think>Hm</think>{self.answer}", {"prompt_tokens": 500, "completion_tokens": 201})
+
+
+def test_an_llm_server_is_asked_as_the_edge_asks_it() -> None:
+    with serving(Thinking("A").app) as url:
+        named, able, timed = doctor.llm_servers(Settings(llm_url=f"{url}/v1"))
+        late = [*doctor.llm_servers(Settings(llm_url=f"{url}/v1", deadline_ms=10))][-1]
         [other] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", llm_model="none-such"))
+        [useless] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", mode="llm"))
     [gone] = doctor.llm_servers(Settings(llm_url="http://127.0.0.1:1/v1"))
-    assert there.remedy is None and "stub-1" in there.found
-    assert other.remedy is not None and "not none-such" in other.found
+    assert {named.remedy, able.remedy} == {None}
+    assert "stub-1" in named.found
+    assert "no token probabilities" in able.found
+    assert "max_completion_tokens, 256 tokens of thought" in able.found
+    assert "prompt 500 tokens, answer 201" in timed.found
+    assert "of the deadline's 0.01 s" in late.found
+    assert other.remedy is not None and "no model none-such" in other.found
+    assert useless.remedy is not None and "another form" in useless.remedy and "'A'" in useless.found
     assert gone.remedy is not None
 
 
@@ -96,12 +118,13 @@ def test_an_address_that_is_none_is_said() -> None:
     "listed",
     [b'{"data": null}', b"[]", b'"text"', b'{"data": [null, 7, {"id": null}, {}]}', b"\xff\xfe", b"[" * 100_000, b"{}"],
 )
-def test_no_list_of_models_ends_in_a_traceback(listed: bytes) -> None:
+def test_a_server_needs_no_list_of_models(listed: bytes) -> None:
     app = FastAPI()
     app.get("/v1/models")(lambda: Response(listed, media_type="application/json"))
+    app.post("/v1/chat/completions")(StubLlm("A").complete)
     with serving(app) as url:
-        [found] = doctor.llm_servers(Settings(llm_url=f"{url}/v1", llm_model="m"))
-    assert str(found)
+        found = [*doctor.llm_servers(Settings(llm_url=f"{url}/v1"))]
+    assert len(found) == 3 and found[0].remedy is None and "the default model" in found[0].found
 
 
 @pytest.mark.parametrize("named", ["socks5://127.0.0.1:1", "gopher://x", "http://x:port", "::::"])

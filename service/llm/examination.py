@@ -1,0 +1,53 @@
+"""What an LLM server can do: asked as the edge asks it, with one decision, timed."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from service.config.settings import Settings
+from service.llm.client import client_of
+from service.llm.probing import Abilities, first_answer, listed_model, probe
+from service.llm.request_bodies import WarmUp
+
+# The second request finds the static block in the server's prefix cache, as decisions do.
+_REQUESTS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """The abilities of a server, and one decision of it.
+
+    Attributes:
+        terms: changes of a request that it demands, in words.
+        seconds: of the decision, with the static block in the prefix cache if the server has one.
+        prompt_tokens, cached_tokens, completion_tokens: of the decision; None if the server does not count them.
+    """
+
+    model: str | None
+    abilities: Abilities
+    terms: str
+    seconds: float
+    prompt_tokens: int | None
+    cached_tokens: int | None
+    completion_tokens: int | None
+
+
+async def examine(settings: Settings, warm_up: WarmUp) -> Examination:
+    """Examine the one server that the settings name.
+
+    Raises:
+        NoDecision: the server is gone, or its answer to the decision cannot be used; the text has its own words.
+    """
+    client = client_of(settings)
+    try:
+        model = settings.llm_model or await listed_model(client)
+        abilities = await probe(client, model)
+        for _ in range(_REQUESTS):
+            started = time.monotonic()
+            answer = await first_answer(client, model, warm_up, abilities.constraint, abilities.logprobs)
+            seconds = time.monotonic() - started
+        counts = answer.prompt_tokens, answer.cached_tokens, answer.completion_tokens
+        return Examination(model, abilities, str(client.terms), seconds, *counts)
+    finally:
+        await client.close()
