@@ -207,7 +207,8 @@ def _timed(found: Examination, deadline_ms: int) -> str:
     tokens = ""
     if found.prompt_tokens is not None and found.completion_tokens is not None:
         cached = f" ({found.cached_tokens} cached)" if found.cached_tokens is not None else ""
-        rate = (found.prompt_tokens + found.completion_tokens) / max(found.seconds, 1e-3)
+        read = found.prompt_tokens - (found.cached_tokens or 0)
+        rate = (read + found.completion_tokens) / max(found.seconds, 1e-3)
         tokens = (
             f"; prompt {found.prompt_tokens} tokens{cached}, answer {found.completion_tokens}, {rate:,.0f} a second"
         )

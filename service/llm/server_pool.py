@@ -78,8 +78,8 @@ class ServerPool:
 
     @property
     def statuses(self) -> Counter[str]:
-        """Number of servers by state."""
-        return Counter(server.status.llm for server in self._each)
+        """Number of servers by state; a ready one whose answers cannot be used is degraded."""
+        return Counter(server.readiness().llm for server in self._each)
 
     @property
     def breakers_open(self) -> int:

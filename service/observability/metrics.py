@@ -19,7 +19,7 @@ _DECISION_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1,
 _OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1)
 _SHARE_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
 _EXCESS_BUCKETS_DB = (-20, -10, -6, -3, -1, 0, 1, 3, 6, 10, 15, 20, 30, 40)
-_STATUSES = ("loading", "ready", "unavailable", "off")
+_STATUSES = ("loading", "ready", "degraded", "unavailable", "off")
 
 
 class Metrics:
