@@ -6,15 +6,16 @@ from collections.abc import Callable
 
 from shared.kit.own_code import imported
 from simulator.errors import UsageError
-from simulator.policies.eof import EarliestOverflowFirst
-from simulator.policies.max_gain import MaximumGain
-from simulator.policies.mpc import RecedingHorizonPolicy
-from simulator.policies.mpc_formula import FormulaPlanner
-from simulator.policies.nearest import NearestNeighbour
+from simulator.policies.hand_written import (
+    EarliestOverflowFirst,
+    MaximumGain,
+    NearestNeighbour,
+    RandomChoice,
+    RoundRobin,
+    WeightedQueueChannel,
+)
+from simulator.policies.mpc import FormulaPlanner, RecedingHorizonPolicy
 from simulator.policies.policy import Policy
-from simulator.policies.random_choice import RandomChoice
-from simulator.policies.round_robin import RoundRobin
-from simulator.policies.wqcs import WeightedQueueChannel
 
 _POLICIES: dict[str, Callable[[], Policy]] = {
     "random": RandomChoice,

@@ -7,8 +7,7 @@ import pytest
 
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
-from simulator.policies.mpc import RecedingHorizonPolicy
-from simulator.policies.mpc_formula import FormulaPlanner
+from simulator.policies.mpc import FormulaPlanner, RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 
 pytestmark = pytest.mark.usefixtures("brief")
