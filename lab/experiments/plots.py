@@ -1,7 +1,7 @@
 """The figures of a ``results.json`` in a two-column paper's width: PNG, SVG and PDF with reproducible bytes.
 
 Bands and whiskers are 95% intervals over seeds; small dots are single seeds. A scheme has the same colour, dash and
-marker in every figure (see ``simulator.reporting.figures.POLICIES``).
+marker in every figure (see ``LOOKS``).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator, Symmetric
 
 from lab.experiments.result import Figure, Interval, Result
 from simulator.reporting.figure_style import DOUBLE_IN, RC, SINGLE_IN
-from simulator.reporting.figures import GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
+from simulator.reporting.figures import BLUE, GREEN, INK, ORANGE, POLICIES, PURPLE, RED, SKY, plain
 from simulator.reporting.wording import NAMES
 
 Format = Literal["png", "svg", "pdf"]
@@ -35,9 +35,33 @@ LOG_PAST = 30.0
 # The ratio of the smallest to the largest mean from which points replace bars, which would all have similar lengths.
 ALIKE = 0.75
 BOUND_LABEL = "clairvoyant bound (proven)"
-BOUND = POLICIES["bound"]
 
 Style = tuple[str, Any, str]
+# Colour, dash and marker of each scheme.
+LOOKS: dict[str, Style] = {
+    **POLICIES,
+    "eof_fast": (ORANGE, (0, (1, 1)), "p"),
+    "wqcs_fast": (GREEN, "-.", "<"),
+    "madqn": (RED, "-", "P"),
+    "mappo": (PURPLE, "-", "*"),
+    "bound": (INK, (0, (4, 2)), "|"),
+    "llm": (BLUE, "-", "o"),
+    "guided": (BLUE, "--", "d"),
+    "value": (BLUE, ":", "8"),
+    "value_reach": (SKY, "-", "8"),
+    "edge_policy": (BLUE, "-.", "H"),
+    "edge_planner": (INK, "-.", "h"),
+    "guided_chance": (PURPLE, "--", "1"),
+    "guided_worst": (RED, "--", "2"),
+    "guided_alone": (BLUE, "-.", "d"),
+    "guided_alone_chance": (PURPLE, ":", "1"),
+    "guided_alone_worst": (RED, ":", "2"),
+    "llm_all": (SKY, "--", "s"),
+    "llm_random_start": (SKY, "-", "^"),
+    "llm_chance": (SKY, ":", "1"),
+    "value_random_start": (GREEN, "--", "D"),
+}
+BOUND = LOOKS["bound"]
 
 _PRINT: dict[Any, Any] = {
     **RC,
@@ -59,7 +83,7 @@ _UNDATED: dict[str, dict[str, Any]] = {
     "svg": {"Date": None, "Creator": None},
     "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
 }
-# Styles of schemes without an entry in POLICIES, all different.
+# Styles of schemes without an entry in LOOKS, all different.
 _OTHERS: tuple[Style, ...] = tuple(
     (colour, dash, marker)
     for dash, markers in (("-", "sd^vX"), ("--", "oP<>*"), (":", "Dh8pv"), ("-.", "X^sod"))
@@ -112,8 +136,8 @@ def label_of(result: Result, name: str) -> str:
 def styles(result: Result) -> dict[str, Style]:
     """Colour, dash and marker of every scheme, all different."""
     names = [*result.schemes, *(name for name in result.curves if name not in result.schemes)]
-    others = (style for style in _OTHERS * (1 + len(names) // len(_OTHERS)) if style not in POLICIES.values())
-    return {name: POLICIES[name] if name in POLICIES else next(others) for name in names}
+    others = (style for style in _OTHERS * (1 + len(names) // len(_OTHERS)) if style not in LOOKS.values())
+    return {name: LOOKS[name] if name in LOOKS else next(others) for name in names}
 
 
 def measured(result: Result, name: str, measure: str) -> Interval | None:
@@ -272,7 +296,7 @@ def _sweep(result: Result, figure: Figure) -> mpl.Figure | None:
 
 def _sweep_panel(axes: Axes, result: Result, measure: str, points: Sequence[tuple[float, str]]) -> None:
     found = [(at, i) for at, name in points if (i := measured(result, name, measure))]
-    colour, dash, marker = POLICIES["llm"]
+    colour, dash, marker = LOOKS["llm"]
     gap = min((b - a for (a, _), (b, _) in zip(points, points[1:], strict=False) if b > a), default=1.0)
     for at, interval in found:
         seeds = [value for value in interval.values if _finite(value)]

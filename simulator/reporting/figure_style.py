@@ -47,13 +47,13 @@ _UNDATED: dict[str, dict[str, Any]] = {
 _THEMED = {"#ffffff": "var(--card)", "#000000": "var(--ink)", "#222222": "var(--ink)", "#dddddd": "var(--line)"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PaperFigure:
-    """One figure in a paper's width; ``inline`` is its SVG for the page."""
+    """One figure in a paper's width; ``inline`` is its SVG for the page, once it is drawn."""
 
     name: str
     figure: Figure
-    inline: str
+    inline: str = ""
 
     def write(self, folder: Path) -> list[Path]:
         """Write ``NAME.svg`` and ``NAME.pdf`` with reproducible bytes; raises ``OSError``."""
@@ -65,14 +65,15 @@ class PaperFigure:
 
 
 @contextmanager
-def paper_figure(name: str, height_in: float, panels: tuple[int, int], out: list[PaperFigure]) -> Iterator[list[Axes]]:
-    """Yield a new figure's panels, and after the context append the figure to ``out``; one panel fills one column."""
+def paper_figure(name: str, height_in: float, panels: tuple[int, int]) -> Iterator[tuple[PaperFigure, list[Axes]]]:
+    """Yield a new figure and its panels, which are drawn within the context; one panel fills one column."""
     # A constant salt makes the IDs, and so the whole text, the same on every run.
     with matplotlib.style.context(["default", {**RC, "svg.hashsalt": name}]):
         width_in = SINGLE_IN if panels == (1, 1) else DOUBLE_IN
         figure = Figure(figsize=(width_in, height_in), layout="compressed")
-        yield list(figure.subplots(*panels, squeeze=False).flat)
-        out.append(PaperFigure(name, figure, _inline_svg(figure, name, width_in)))
+        drawn = PaperFigure(name, figure)
+        yield drawn, list(figure.subplots(*panels, squeeze=False).flat)
+        drawn.inline = _inline_svg(figure, name, width_in)
 
 
 def _inline_svg(figure: Figure, name: str, width_in: float) -> str:

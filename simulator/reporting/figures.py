@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import XAxis, YAxis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
@@ -35,29 +36,9 @@ POLICIES = {
     "wqcs": (GREEN, ":", "^"),
     "round_robin": (PURPLE, "-.", "D"),
     "random": (SKY, (0, (5, 1, 1, 1)), "v"),
-    "eof_fast": (ORANGE, (0, (1, 1)), "p"),
-    "wqcs_fast": (GREEN, "-.", "<"),
     "max_gain": (RED, "--", ">"),
     "nearest": (GREY, "-.", "X"),
-    "madqn": (RED, "-", "P"),
-    "mappo": (PURPLE, "-", "*"),
     "mpc": (INK, "-", "h"),
-    "bound": (INK, (0, (4, 2)), "|"),
-    "llm": (BLUE, "-", "o"),
-    "guided": (BLUE, "--", "d"),
-    "value": (BLUE, ":", "8"),
-    "value_reach": (SKY, "-", "8"),
-    "edge_policy": (BLUE, "-.", "H"),
-    "edge_planner": (INK, "-.", "h"),
-    "guided_chance": (PURPLE, "--", "1"),
-    "guided_worst": (RED, "--", "2"),
-    "guided_alone": (BLUE, "-.", "d"),
-    "guided_alone_chance": (PURPLE, ":", "1"),
-    "guided_alone_worst": (RED, ":", "2"),
-    "llm_all": (SKY, "--", "s"),
-    "llm_random_start": (SKY, "-", "^"),
-    "llm_chance": (SKY, ":", "1"),
-    "value_random_start": (GREEN, "--", "D"),
 }
 OTHER_POLICY = (GREY, "-", "x")
 SOURCES = {"llm": BLUE, "guided": PURPLE, "value": GREEN, "policy": ORANGE, "onboard": RED}
@@ -68,16 +49,15 @@ LABEL_OFFSET = 0.06
 _HALO = [withStroke(linewidth=2.5, foreground="white")]
 
 
-def _integers(axes: Axes, x: bool = True, y: bool = True) -> None:
-    if x:
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
-    if y:
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
+def _integers(*axis: XAxis | YAxis) -> None:
+    for each in axis:
+        each.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 5, 10]))
 
 
-def _legend_above(axes: Axes) -> None:
+def _legend_above(axes: Axes, columns: int = 3) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    axes.figure.legend(handles, labels, loc="outside upper center", ncols=3)
+    if handles:
+        axes.figure.legend(handles, labels, loc="outside upper center", ncols=columns)
 
 
 def plain(axes: Axes) -> None:
@@ -99,8 +79,7 @@ def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[D
     rows = -(-shown // columns)
     trips = [d.rtt_ms for d in decisions if d.rtt_ms is not None]
     scale = Normalize(min(trips), max(trips)) if trips else Normalize(0.0, 1.0)
-    out: list[PaperFigure] = []
-    with paper_figure("latency-map", 2.1 * rows + 0.4, (rows, columns), out) as panels:
+    with paper_figure("latency-map", 2.1 * rows + 0.4, (rows, columns)) as (drawn, panels):
         for extra in panels[shown:]:
             extra.set_visible(False)
         for uav in range(shown):
@@ -120,7 +99,7 @@ def latency_map(scenario: Scenario, sensor_xy: np.ndarray, decisions: Sequence[D
         keys = [_key(source) for source in SOURCES if source in present]
         keys.append(Line2D([], [], color=INK, marker="s", linestyle="", label="sensor"))
         figure.legend(handles=keys, loc="outside lower center", ncols=len(keys))
-    return out[0]
+    return drawn
 
 
 def _key(source: str) -> Line2D:
@@ -164,12 +143,12 @@ def _map_trajectory(axes: Axes, scenario: Scenario, uav: int, mine: Sequence[Dec
     return [tail, tip, label]
 
 
-def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, paper_figure: list[np.ndarray]) -> None:
+def _map_sensors(axes: Axes, scenario: Scenario, sensor_xy: np.ndarray, occupied: list[np.ndarray]) -> None:
     few = len(sensor_xy) <= 20
     axes.scatter(
         sensor_xy[:, 0], sensor_xy[:, 1], marker="s", s=27 if few else 6, color=INK, edgecolors="white", zorder=5
     )
-    occupied = [*paper_figure, *sensor_xy]
+    occupied = [*occupied, *sensor_xy]
     reach = LABEL_OFFSET * scenario.area_m
     angles = np.arange(8) * np.pi / 4 + np.pi / 4
     for j, at in enumerate(sensor_xy if few else ()):
@@ -202,8 +181,7 @@ def latency_per_step(decisions: Sequence[Decision]) -> PaperFigure:
     for d in decisions:
         if d.rtt_ms is not None:
             trips[d.source][d.step].append(d.rtt_ms)
-    out: list[PaperFigure] = []
-    with paper_figure("latency-steps", 2.2, (1, 1), out) as (axes,):
+    with paper_figure("latency-steps", 2.2, (1, 1)) as (drawn, (axes,)):
         for source in (name for name in SOURCES if name in trips):
             by_step, colour = trips[source], SOURCES[source]
             steps = sorted(by_step)
@@ -213,14 +191,14 @@ def latency_per_step(decisions: Sequence[Decision]) -> PaperFigure:
             axes.plot(
                 steps, medians, color=colour, marker=MARKERS[source], ms=4, linestyle="", label=source, clip_on=False
             )
+        _legend_above(axes)
         if trips:
-            _legend_above(axes)
             axes.set_ylim(bottom=0)
         axes.set_xlabel("step")
         axes.set_ylabel("round trip (ms)")
         plain(axes)
-        _integers(axes, y=False)
-    return out[0]
+        _integers(axes.xaxis)
+    return drawn
 
 
 def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> PaperFigure:
@@ -229,8 +207,7 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Pap
         ("lost packets", lambda t: t.lost_packets),
         ("loss events", lambda t: t.failures + t.overflows),
     )
-    out: list[PaperFigure] = []
-    with paper_figure("losses", 4.8, (2, 2), out) as panels:
+    with paper_figure("losses", 4.8, (2, 2)) as (drawn, panels):
         for row, (title, measure) in enumerate(measures):
             for name, tally in tallies.items():
                 colour, dash, marker = POLICIES.get(name, OTHER_POLICY)
@@ -244,14 +221,12 @@ def losses(tallies: Mapping[str, Sequence[Tally]], names: dict[str, str]) -> Pap
             panels[2 * row + 1].set_ylabel(f"{title}, cumulative")
         for axes in panels:
             plain(axes)
-            _integers(axes)
+            _integers(axes.xaxis, axes.yaxis)
             axes.set_ylim(bottom=0)
         for axes in panels[2:]:
             axes.set_xlabel("step")
-        handles, labels = panels[0].get_legend_handles_labels()
-        if handles:
-            panels[0].figure.legend(handles, labels, loc="outside upper center", ncols=len(handles))
-    return out[0]
+        _legend_above(panels[0], max(1, len(tallies)))
+    return drawn
 
 
 def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
@@ -261,8 +236,7 @@ def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
         if d.tokens is not None:
             by_step[d.step].append(d.tokens)
     steps = sorted(by_step)
-    out: list[PaperFigure] = []
-    with paper_figure("tokens", 2.7, (1, 2), out) as panels:
+    with paper_figure("tokens", 2.7, (1, 2)) as (drawn, panels):
         for axes, sent, full, title in (
             (panels[0], "prompt", "uncompressed", "whole prompt"),
             (panels[1], "state", "state_uncompressed", "state block"),
@@ -277,47 +251,37 @@ def tokens_per_step(decisions: Sequence[Decision]) -> PaperFigure:
             axes.set_xlabel("step")
             axes.set_ylim(bottom=0)
             plain(axes)
-            _integers(axes)
+            _integers(axes.xaxis, axes.yaxis)
         panels[0].set_ylabel("tokens a decision")
-        handles, labels = panels[0].get_legend_handles_labels()
-        panels[0].figure.legend(handles, labels, loc="outside upper center", ncols=2)
-    return out[0]
+        _legend_above(panels[0], 2)
+    return drawn
 
 
 def visits(decisions: Sequence[Decision], sensors: int) -> PaperFigure:
     """Visits of each sensor as stacked bars: successful and failed ones."""
     served = np.array(visits_per_sensor(decisions, sensors))
     tried = np.bincount([d.sensor_id for d in decisions], minlength=sensors)[:sensors]
-    out: list[PaperFigure] = []
-    with paper_figure("visits", 2.2, (1, 1), out) as (axes,):
+    with paper_figure("visits", 2.2, (1, 1)) as (drawn, (axes,)):
         at = np.arange(sensors)
         axes.bar(at, served, color=BLUE, label="served")
         missed = np.flatnonzero(tried > served)
-        axes.bar(
-            missed,
-            (tried - served)[missed],
-            bottom=served[missed],
-            color="white",
-            edgecolor=RED,
-            hatch="////",
-            label="failed",
-        )
+        unserved = (tried - served)[missed]
+        axes.bar(missed, unserved, bottom=served[missed], color="white", edgecolor=RED, hatch="////", label="failed")
         axes.axhline(served.mean(), color=INK, linewidth=1, linestyle=":", label="mean served")
         if sensors <= 20:
             axes.set_xticks(at)
         axes.set_xlabel("sensor")
         axes.set_ylabel("visits")
         plain(axes)
-        _integers(axes, x=False)
+        _integers(axes.yaxis)
         _legend_above(axes)
-    return out[0]
+    return drawn
 
 
 def deciders(decisions: Sequence[Decision]) -> PaperFigure:
     """The sources of the decisions of each step, as stacked bars."""
     steps = sorted({d.step for d in decisions})
-    out: list[PaperFigure] = []
-    with paper_figure("deciders", 2.0, (1, 1), out) as (axes,):
+    with paper_figure("deciders", 2.0, (1, 1)) as (drawn, (axes,)):
         below = np.zeros(len(steps))
         for source, colour in SOURCES.items():
             counts = np.array([sum(d.step == s and d.source == source for d in decisions) for s in steps], dtype=float)
@@ -327,7 +291,6 @@ def deciders(decisions: Sequence[Decision]) -> PaperFigure:
         axes.set_xlabel("step")
         axes.set_ylabel("decisions")
         plain(axes)
-        _integers(axes)
-        if steps:
-            _legend_above(axes)
-    return out[0]
+        _integers(axes.xaxis, axes.yaxis)
+        _legend_above(axes)
+    return drawn
