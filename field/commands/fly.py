@@ -145,7 +145,7 @@ def job_from_options(options: Fly) -> FieldJob:
     require_mavsdk()
     site = checked_site(options)
     from field.vehicles.field_run import FieldJob
-    from field.vehicles.named_radio import SIMULATED, radio_named
+    from field.vehicles.simulated_radio import SIMULATED, radio_named
 
     step_s = site.scenario.step_s / options.speedup
     patience_s = min(MOST_PATIENCE_S, step_s / 2) if options.patience_s is None else options.patience_s

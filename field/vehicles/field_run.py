@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from field.errors import VehicleError
 from field.vehicles.field_flight import FieldFlight, RealFlight
 from field.vehicles.field_pilot import FieldPilot
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.mavlink_vehicle import mavlink_vehicle
 from field.vehicles.mission_clock import MissionClock
 from field.vehicles.radio import Radio
-from field.vehicles.take_off import wait_for_missions
-from field.vehicles.uploaded_path import check_uploaded
 from shared.client.edge_client import API_KEY, AsyncEdgeClient
 from shared.client.errors import EdgeError
 from shared.wire.schemas import Mode
+from simulator.errors import UsageError
 from simulator.records.decision import Decision
-from simulator.records.decision_log import DecisionLog
-from simulator.records.request_log import RequestLog, with_edge_defaults
+from simulator.records.mission_logs import DecisionLog, RequestLog, with_edge_defaults
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
+from simulator.sites.plans.mission_path import MissionItem, path_of
 from simulator.sites.site import Site
 
 
@@ -159,3 +161,73 @@ def cancel_on_signals() -> Iterator[None]:
     finally:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.remove_signal_handler(number)
+
+
+POLL_S = 0.2
+
+
+async def wait_for_missions(
+    uavs: Sequence[FieldUav], wait_s: float, on_wait: Callable[[int, str], None] = lambda uav, why: None
+) -> None:
+    """Wait until each UAV is in the air and flies its mission.
+
+    Args:
+        wait_s: the longest wait, seconds.
+        on_wait: called once for each new cause of the wait.
+
+    Raises:
+        VehicleError: after ``wait_s`` seconds one still does not; the text says why.
+    """
+    ends = time.monotonic() + wait_s
+    reported: dict[int, str] = {}
+    while True:
+        await asyncio.gather(*(uav.update(POLL_S) for uav in uavs))
+        waiting = {uav.index: (uav, uav.unavailable_reason) for uav in uavs if uav.unavailable_reason is not None}
+        if not waiting:
+            return
+        for index, (uav, why) in waiting.items():
+            uav.landed = False
+            if why is not None and reported.get(index) != why:
+                reported[index] = why
+                on_wait(index, why)
+            if time.monotonic() >= ends:
+                raise VehicleError(
+                    f"{uav.vehicle.name}: after {wait_s:g} s UAV {index} does not fly its mission: {why}; arm it, take "
+                    "off and start the mission, or give a longer --wait-s"
+                )
+        await asyncio.sleep(POLL_S)
+
+
+# MAVLink sends positions to the centimetre, and a plan may have been drawn on a map again.
+TOLERANCE_M = 2.0
+
+
+def check_uploaded(items: Sequence[MissionItem], site: Site, uav: int, vehicle: str) -> float:
+    """Compare a vehicle's mission with the trajectory of a UAV.
+
+    Returns:
+        The height of the lowest waypoint above the take-off place, m; infinite where none has one above that.
+
+    Raises:
+        UsageError: the mission is no path of straight legs, or another path; the text names the waypoint.
+    """
+    assert site.frame is not None, "a site with vehicles has a place on the globe"
+    remedy = "upload the plan that `aicvds world export --plan` writes, or take this one over by `aicvds world import`"
+    try:
+        path = path_of(items)
+    except ValueError as error:
+        raise UsageError(f"{vehicle}: its mission cannot be flown: {error}") from None
+    flown, route = site.frame.metres(path.trajectory).tolist(), site.scenario.routes[uav]
+    for index, (here, there) in enumerate(zip(flown, route, strict=False)):
+        gap = math.dist(here, there)
+        if not gap <= TOLERANCE_M:
+            raise UsageError(
+                f"{vehicle}: waypoint {index} of its mission is {gap:,.0f} m from that of trajectory {uav} in the "
+                f"world; {remedy}"
+            )
+    if len(flown) != len(route):
+        raise UsageError(
+            f"{vehicle}: its mission's path has {len(flown)} waypoints, trajectory {uav} of the world has "
+            f"{len(route)}; {remedy}"
+        )
+    return min((height for height in path.altitudes_m if height is not None), default=math.inf)

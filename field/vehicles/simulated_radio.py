@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from field.vehicles.radio import Beacon, Collected, Spot
+from field.vehicles.radio import Beacon, Collected, Radio, Spot
+from shared.kit.own_code import imported
 from shared.world.channel import FloatArray, Links, channel_gain_db
 from shared.world.scenario import Point
 from shared.world.step_rule import joules_a_packet, transfer
+from simulator.errors import UsageError
 from simulator.sites.site import Site
 from simulator.world.sensors import Sensors, Streams
 
@@ -65,3 +67,23 @@ class SimulatedRadio:
     def _distances(self, position: Point) -> FloatArray:
         offset = self._sensors.positions - position
         return np.hypot(offset[:, 0], offset[:, 1])
+
+
+SIMULATED = "simulated"
+
+
+def radio_named(name: str, site: Site, seed: int) -> Radio:
+    """The radio of the option ``--radio``: ``simulated``, or ``MODULE:NAME``, a callable that takes the site.
+
+    Raises:
+        UsageError: there is no such module or callable.
+    """
+    if name == SIMULATED:
+        return SimulatedRadio(site, seed)
+    if ":" not in name:
+        raise UsageError(f"--radio {name}: write simulated, or MODULE:NAME of your own, such as my_radio:Radio")
+    try:
+        make: Callable[[Site], Radio] = imported(name)
+    except ValueError as error:
+        raise UsageError(f"--radio {name}: {error}") from None
+    return make(site)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulator.bound.true_problem import relaxed_problem, targets, true_problem, velocities_towards
+from simulator.records.summary import LossBound
 from simulator.sites.site import Site
 
 # The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
@@ -102,3 +103,33 @@ def _chased(world: PipelineWorld, steps: int | None, work: float) -> NDArray[np.
         actions.append(chosen)
         world.step({agent: chosen[uav] for agent, uav in world.live.items()})
     return np.array(actions)
+
+
+# UAVs x sensors x steps. With 30,000, as in scenario `dense`, building the model already takes half a minute.
+MOST_CHOICES = 6_000
+
+
+def mission_bound(site: Site, seed: int, steps_flown: int, time_limit_s: float) -> LossBound | str:
+    """The fewest packets that a fleet could have lost in this world, or the reason why that is unknown.
+
+    Args:
+        site: the scenario, and its trace if it has one.
+        seed: of the world.
+        steps_flown: of the mission; the bound is that of whole missions.
+        time_limit_s: of the search. Ctrl-C ends it too, with the best so far.
+    """
+    scenario = site.scenario
+    if steps_flown < scenario.steps:
+        return "the mission ended before its last step"
+    if scenario.uavs * scenario.sensors * scenario.steps > MOST_CHOICES:
+        return "this world is too large for a short search; try `aicvds bound`"
+    from simulator.bound.solver import Interrupted
+
+    try:
+        try:
+            bound = clairvoyant(site, seed, time_limit_s)
+        except Interrupted as stopped:
+            bound = confirmed(site, seed, stopped.plan)
+    except ModuleNotFoundError:
+        return "OR-Tools is not installed; pip install 'aic-vds[bound]'"
+    return LossBound(lower_bound=bound.lower_bound, best_flight=bound.lost_packets, seconds=round(bound.seconds, 3))

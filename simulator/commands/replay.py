@@ -26,8 +26,7 @@ from simulator.errors import INTERRUPTED, UsageError
 from simulator.flying.edge_session import DEFAULT_TIMEOUT_S, NETWORK_SLACK_S, await_edge
 from simulator.flying.job import new_mission_id
 from simulator.records.decision import Decision
-from simulator.records.decision_log import read_decisions
-from simulator.records.request_log import read_requests
+from simulator.records.mission_logs import read_decisions, read_requests
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out, refuse_old_result
 from simulator.reporting.replay_agreement import Compared, Prices, ReplaySummary, agreement, by_source, show, side
 

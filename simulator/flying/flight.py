@@ -10,8 +10,8 @@ from pydantic_core import PydanticSerializationError
 
 from simulator.flying.pilots import Pilot, PilotChoice
 from simulator.records.decision import Decision
-from simulator.records.decision_log import DecisionLog
 from simulator.records.flight import Flight, exchange_fields
+from simulator.records.mission_logs import DecisionLog
 from simulator.records.track import Instant
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld

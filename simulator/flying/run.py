@@ -17,10 +17,9 @@ from shared.wire.schemas import LLM_MODES
 from simulator.errors import INTERRUPTED
 from simulator.flying.edge_session import await_edge, create_or_check_mission, job_client, probe_client, radio_link
 from simulator.flying.job import Job
-from simulator.records.decision_log import DecisionLog
 from simulator.records.flight import Flight
+from simulator.records.mission_logs import DecisionLog, RequestLog, with_edge_defaults
 from simulator.records.operator import OperatorRecord, recount_deadlines
-from simulator.records.request_log import RequestLog, with_edge_defaults
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out
 from simulator.records.summary import BySource, Summary, sources_text, summarise
 from simulator.reporting.results import write_results
@@ -194,7 +193,7 @@ def _with_bound(job: Job, flight: Flight, summary: Summary, console: Console) ->
     """The summary with the bound on the losses, unless none is wanted."""
     if not job.bound_s:
         return summary
-    from simulator.bound.mission_bound import mission_bound
+    from simulator.bound.clairvoyant_bound import mission_bound
 
     with console.status("Searching for the least that could have been lost"):
         bound = mission_bound(job.site, job.seed, flight.steps_flown, job.bound_s)

@@ -14,7 +14,7 @@ import pytest
 from field.vehicles.field_uav import LEAST_SPEED_M_S
 from simulator.commands.replay import read_logged_mission
 from simulator.records.decision import Decision
-from simulator.records.decision_log import read_decisions
+from simulator.records.mission_logs import read_decisions
 from simulator.records.real_uavs import sums_by_uav
 from simulator.records.summary import Summary
 from simulator.sites.plans.plan_folder import export_plans

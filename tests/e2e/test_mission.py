@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from simulator.records.decision_log import read_decisions
+from simulator.records.mission_logs import read_decisions
 from tests.support.processes import run, serving_edge
 
 pytestmark = pytest.mark.long

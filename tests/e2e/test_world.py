@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from simulator.records.decision_log import read_decisions
+from simulator.records.mission_logs import read_decisions
 from tests.conftest import Edge
 from tests.support.places import ROOT
 from tests.support.processes import run, run_here

@@ -26,7 +26,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(autouse=True)
 def unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Flights search no bound on their losses, which takes longer than most of them."""
-    monkeypatch.setattr("simulator.bound.mission_bound.mission_bound", lambda *_: "a test leaves it out")
+    monkeypatch.setattr("simulator.bound.clairvoyant_bound.mission_bound", lambda *_: "a test leaves it out")
 
 
 @pytest.fixture

@@ -36,11 +36,10 @@ from shared.world.scenario import Point, Scenario
 from shared.world.trajectory import trajectories
 from simulator.errors import UsageError
 from simulator.sites.fence import Fence
-from simulator.sites.files.gains import read_gains
 from simulator.sites.files.overrides import read_overrides
 from simulator.sites.files.reading import quoted
+from simulator.sites.files.recordings import read_gains, read_trace
 from simulator.sites.files.survey import Survey, check_complete, read_survey
-from simulator.sites.files.trace import read_trace
 from simulator.sites.projection import Frame, centre_of, fit_square, to_metres
 from simulator.sites.site import Site
 

@@ -13,16 +13,14 @@ import numpy as np
 import pytest
 
 from field.errors import VehicleError
-from field.vehicles.field_run import FieldJob, run_field_mission
+from field.vehicles.field_run import FieldJob, check_uploaded, run_field_mission, wait_for_missions
 from field.vehicles.field_uav import FieldUav
 from field.vehicles.mavlink_vehicle import MavlinkVehicle, mavlink_vehicle
 from field.vehicles.simulated_radio import SimulatedRadio
-from field.vehicles.take_off import wait_for_missions
-from field.vehicles.uploaded_path import check_uploaded
 from shared.client.edge_client import EdgeClient
 from simulator.commands.replay import read_logged_mission
 from simulator.records.decision import Decision
-from simulator.records.decision_log import read_decisions
+from simulator.records.mission_logs import read_decisions
 from simulator.records.summary import Summary
 from simulator.sites.files.world_folder import site_from_folder
 from simulator.sites.plans.plan_folder import export_plans

@@ -16,8 +16,7 @@ import pytest
 from shared.wire.schemas import DecideRequest, MissionSpec
 from simulator.commands import replay, simulate
 from simulator.commands.replay import read_logged_mission
-from simulator.records.decision_log import read_decisions
-from simulator.records.request_log import read_requests
+from simulator.records.mission_logs import read_decisions, read_requests
 from simulator.reporting.replay_agreement import ReplaySummary
 from tests.conftest import Edge
 from tests.support.edge_stub import EdgeStub, stub_edge

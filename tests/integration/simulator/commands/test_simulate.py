@@ -11,7 +11,7 @@ import pytest
 from shared.wire.schemas import MissionSpec
 from shared.world.scenario import SCENARIOS
 from simulator.commands import simulate
-from simulator.records.decision_log import read_decisions
+from simulator.records.mission_logs import read_decisions
 from simulator.records.run_folder import DRAWN
 from simulator.records.summary import LossBound, Summary
 from tests.support.edge_stub import EdgeStub, stub_edge
@@ -88,7 +88,7 @@ def test_the_bound_is_searched_unless_it_is_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = LossBound(lower_bound=2, best_flight=2, seconds=0.5)
-    monkeypatch.setattr("simulator.bound.mission_bound.mission_bound", lambda *_: found)
+    monkeypatch.setattr("simulator.bound.clairvoyant_bound.mission_bound", lambda *_: found)
     arguments = ["--policy", "eof", "--steps", "2", "--out", str(tmp_path)]
     assert simulate.main(arguments) == 0
     assert summary_in(tmp_path).bound == found

@@ -14,8 +14,8 @@ from simulator.flying.flight import fly
 from simulator.flying.pilots import EdgePilot, LocalPilot, PilotChoice
 from simulator.flying.rollout import BASELINES, baselines, rollout
 from simulator.policies.registry import policy_named
-from simulator.records.decision_log import DecisionLog, read_decisions
 from simulator.records.flight import Flight
+from simulator.records.mission_logs import DecisionLog, read_decisions
 from simulator.records.summary import FlightFacts, Summary, summarise
 from simulator.sites.site import Site
 from simulator.world.environment import PipelineWorld

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from simulator.records.decision import Decision
-from simulator.records.decision_log import DecisionLog, read_decisions
+from simulator.records.mission_logs import DecisionLog, read_decisions
 
 
 def decision(**changes: object) -> Decision:

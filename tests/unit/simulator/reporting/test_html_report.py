@@ -16,8 +16,7 @@ from simulator.records.flight import Flight
 from simulator.records.summary import LossBound, Summary, summarise
 from simulator.reporting import figures
 from simulator.reporting.figure_style import PaperFigure
-from simulator.reporting.html_report import costliest, drawings, render_report, write_report
-from simulator.reporting.playback import playback
+from simulator.reporting.html_report import costliest, drawings, playback, render_report, write_report
 from simulator.reporting.wording import llm_notice, policy_labels
 from simulator.sites.site import Site
 

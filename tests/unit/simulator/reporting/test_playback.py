@@ -12,7 +12,7 @@ from simulator.flying.flight import fly
 from simulator.flying.pilots import LocalPilot
 from simulator.records import track
 from simulator.records.flight import Flight
-from simulator.reporting.playback import playback
+from simulator.reporting.html_report import playback
 from simulator.sites.site import Site
 
 

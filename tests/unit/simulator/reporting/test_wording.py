@@ -16,7 +16,7 @@ from simulator.records.operator import OperatorRecord
 from simulator.records.real_uavs import RealUavs, sums_by_uav
 from simulator.records.summary import BySource, LossBound, Summary, summarise
 from simulator.reporting.comparison import MissionResult, caution
-from simulator.reporting.terminal_table import show
+from simulator.reporting.results import show
 from simulator.reporting.wording import (
     bound_text,
     deciders_text,
