@@ -10,15 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self, TypeVar
+from typing import IO, Generic, Self, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from shared.wire.missions import MissionStatus
 from shared.wire.schemas import DecideRequest, MissionSpec
 from simulator.records.decision import Decision
 
 Line = TypeVar("Line")
+Entry = TypeVar("Entry", bound=BaseModel)
 
 
 def read_lines(path: Path, line: TypeAdapter[Line]) -> list[Line]:
@@ -43,12 +44,8 @@ def read_lines(path: Path, line: TypeAdapter[Line]) -> list[Line]:
     return parsed
 
 
-class DecisionLog:
-    """Appends decisions to a new file and flushes each one, so that a killed mission loses at most half a line.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+class _Log(Generic[Entry]):
+    """A new file of JSON lines; raises ``OSError`` if it cannot be written."""
 
     def __init__(self, path: Path) -> None:
         self._file: IO[str] = path.open("w", encoding="utf-8")
@@ -59,10 +56,18 @@ class DecisionLog:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._file.close()
 
-    def append(self, decision: Decision) -> None:
+    def append(self, entry: Entry) -> None:
         """Write one line."""
-        self._file.write(decision.model_dump_json() + "\n")
+        self._file.write(entry.model_dump_json() + "\n")
         self._file.flush()
+
+
+class DecisionLog(_Log[Decision]):
+    """Appends decisions to a new file and flushes each one, so that a killed mission loses at most half a line.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
 
     def rewrite(self, decisions: Iterable[Decision]) -> None:
         """Replace the file's lines by these, after an interrupt that may have torn the last line."""
@@ -85,7 +90,7 @@ def read_decisions(path: Path) -> list[Decision]:
 _LINE: TypeAdapter[MissionSpec | DecideRequest] = TypeAdapter(MissionSpec | DecideRequest)
 
 
-class RequestLog:
+class RequestLog(_Log[DecideRequest]):
     """Writes the spec, then each request when it is sent, and flushes each line.
 
     Raises:
@@ -93,19 +98,8 @@ class RequestLog:
     """
 
     def __init__(self, path: Path, spec: MissionSpec) -> None:
-        self._file: IO[str] = path.open("w", encoding="utf-8")
+        super().__init__(path)
         self._file.write(spec.model_dump_json() + "\n")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._file.close()
-
-    def append(self, request: DecideRequest) -> None:
-        """Write one line."""
-        self._file.write(request.model_dump_json() + "\n")
-        self._file.flush()
 
 
 def with_edge_defaults(spec: MissionSpec, status: MissionStatus) -> MissionSpec:
