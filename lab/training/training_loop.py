@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from lab.exploration.rollouts import read_rollouts
+from lab.training.modules import Modules
 from lab.training.options import Pretrain
 from lab.training.reward import Reward
 from lab.training.rollout_examples import Choices, Example, ExampleBatch, replay
 from lab.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
-from service.learning.initial_weights import initial_weights, save
-from service.learning.modules import Modules
+from service.learning.initial_weights import initial_weights
 from shared.world.scenario import Scenario
 
 
@@ -42,7 +42,7 @@ def pretrain(args: Pretrain, console: Console) -> None:
     for recording in recordings:
         console.print(_report(modules, recording, args, levels))
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    save(modules, args.out)
+    modules.save(args.out)
 
 
 @dataclass(frozen=True)

@@ -4,47 +4,58 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from service.learning.modules import Modules, Weights
+from service.learning.modules import WIDTH, Weights
+from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
 from shared.wire.schemas import Features, Init
 
 # The weights of preset `paper` by velocity level; preset `reach` has none.
 _LEVEL_TENSORS = ("velocity.out.weight", "velocity.out.bias")
 
 
-def initial_modules(init: Init, preset: Features, levels: int, seed: int) -> Modules:
-    """Modules of a feature preset for velocities 0..levels - 1, pretrained, or random by seed.
+def initial_weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
+    """The weights of :func:`initial_parameters`; all missions share the pretrained ones."""
+    return _pretrained(preset, levels) if init == "pretrained" else _weights(init, preset, levels, seed)
+
+
+def initial_parameters(init: Init, preset: Features, levels: int, seed: int) -> dict[str, Tensor]:
+    """Parameters by name, in the modules' order, for velocities 0..levels - 1, pretrained, or random by seed.
 
     The shipped weights have 0..14 m/s; a scenario with a lower limit uses the first levels.
     """
-    modules = Modules(preset, levels, seed)
-    if init == "pretrained":
-        weights = _packaged(preset)
-        if preset == "paper":
-            weights = {k: v[:levels] if k in _LEVEL_TENSORS else v for k, v in weights.items()}
-        modules.load_state_dict(weights)
-    return modules
-
-
-def initial_weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
-    """The weights of :func:`initial_modules`; all missions share the pretrained ones."""
-    return (
-        _pretrained(preset, levels) if init == "pretrained" else initial_modules(init, preset, levels, seed).weights()
-    )
+    if init == "random":
+        return _random(preset, levels, seed)
+    weights = _packaged(preset)
+    return {k: v[:levels] if preset == "paper" and k in _LEVEL_TENSORS else v for k, v in weights.items()}
 
 
 @cache
 def _pretrained(preset: Features, levels: int) -> Weights:
-    return initial_modules("pretrained", preset, levels, seed=0).weights()
+    return _weights("pretrained", preset, levels, seed=0)
 
 
-def save(modules: Modules, path: Path) -> None:
-    """Write the modules' weights with the name of their feature preset."""
-    torch.save({"features": modules.preset, "weights": modules.state_dict()}, path)
+def _weights(init: Init, preset: Features, levels: int, seed: int) -> Weights:
+    return Weights.of(preset, {k: v.numpy() for k, v in initial_parameters(init, preset, levels, seed).items()})
+
+
+def _random(preset: Features, levels: int, seed: int) -> dict[str, Tensor]:
+    """As torch draws the parameters of linear layers; its own generator does not change."""
+    features = FEATURES[preset]
+    level_features, outputs = (1, levels) if preset == "paper" else (LEVEL_FEATURES, 1)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        layers = {
+            "attention.query": nn.Linear(features, WIDTH, bias=False),
+            "attention.key": nn.Linear(features, WIDTH, bias=False),
+            "attention.value": nn.Linear(features, WIDTH, bias=False),
+            "attention.score": nn.Linear(WIDTH, 1),
+            "velocity.hidden": nn.Linear(WIDTH + level_features, WIDTH),
+            "velocity.out": nn.Linear(WIDTH, outputs),
+        }
+    return {f"{name}.{key}": p for name, layer in layers.items() for key, p in layer.state_dict().items()}
 
 
 @cache

@@ -1,23 +1,24 @@
 """The attention and velocity modules, which score a mission's sensors and the velocities for each of them.
 
-Decisions use :class:`Weights`, a frozen copy of the parameters, with numpy or, for many sensors,
-:mod:`service.learning.softmax_means`. :class:`Modules` are the same computations as torch modules, for training
-offline.
+Decisions compute with numpy or, for many sensors, :mod:`service.learning.softmax_means`. The laboratory has the same
+computations as torch modules, for training offline.
+
+The attention has one head of width d' = 32: ``Q, K, V = X W_q, X W_k, X W_v``; ``Z = softmax(Q K^T / sqrt(d')) V``; a
+sensor's score is ``s = w z + b``. In preset ``paper`` the velocities' values are those of the paper,
+``u = W_2 relu(W_1 [z, distance] + b_1) + b_2``. In preset ``reach`` they are ``u_v = w_2 relu(W_1 [z, a_v] + b_1) + b_2``
+with the same weights for every level v, where ``a_v`` is a row of :meth:`State.approaches`: a scenario may have any
+number of levels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
-import torch
-from torch import Tensor, nn
-from torch.nn import functional
 
 from service.learning.softmax_means import Array, softmax, softmax_means
-from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
 from shared.wire.schemas import Features
 
 WIDTH = 32
@@ -95,13 +96,19 @@ class Weights:
         self.layout, self.flat = layout, flat
         self.parameters = layout.arrays(flat)
 
+    @classmethod
+    def of(cls, preset: Features, parameters: Mapping[str, Array]) -> Self:
+        """A copy of the parameters by name, in the modules' order."""
+        layout = Layout(preset, parameters)
+        return cls(layout, layout.flat(list(parameters.values())))
+
     @property
     def attention(self) -> dict[str, Array]:
         """The attention module's parameters by name."""
         return {name: getattr(self.parameters, name) for name in _ATTENTION}
 
     def attend(self, features: Array) -> Attended:
-        """Scores and contexts of n sensors' features ``(n, d)``, as :class:`Attention`."""
+        """Scores and contexts of n sensors' features ``(n, d)``."""
         return self._attend_few(features) if len(features) < _MANY else self._attend_many(features)
 
     def _attend_few(self, features: Array) -> Attended:
@@ -153,12 +160,11 @@ class Layout:
 
     __slots__ = ("_shapes", "_starts", "names", "preset", "size")
 
-    def __init__(self, preset: Features, named: Iterable[tuple[str, Tensor]]) -> None:
+    def __init__(self, preset: Features, parameters: Mapping[str, Array]) -> None:
         self.preset = preset
-        names, parameters = zip(*named, strict=True)
-        self.names: tuple[str, ...] = names
-        self._shapes = tuple(tuple(p.shape) for p in parameters)
-        ends = np.cumsum([p.numel() for p in parameters]).tolist()
+        self.names = tuple(parameters)
+        self._shapes = tuple(p.shape for p in parameters.values())
+        ends = np.cumsum([p.size for p in parameters.values()]).tolist()
         self._starts = (0, *ends)
         self.size: int = ends[-1]
 
@@ -172,94 +178,3 @@ class Layout:
         if [p.shape for p in parameters] != list(self._shapes):
             raise ValueError(f"the parameters do not have the shapes of preset {self.preset} at these velocity levels")
         return np.concatenate([np.ravel(p) for p in parameters])
-
-
-class Attention(nn.Module):
-    """Scaled dot-product attention over the sensors, one head of width d' = 32, and a linear score.
-
-    ``Q, K, V = X W_q, X W_k, X W_v``; ``Z = softmax(Q K^T / sqrt(d')) V``; ``s = Z w + b``. Callers pass the
-    admissible sensors only, or a mask of them: a masked sensor never reaches the softmax. torch's fused kernel makes
-    no J x J tensor.
-    """
-
-    def __init__(self, features: int, width: int = WIDTH) -> None:
-        super().__init__()
-        self.query = nn.Linear(features, width, bias=False)
-        self.key = nn.Linear(features, width, bias=False)
-        self.value = nn.Linear(features, width, bias=False)
-        self.score = nn.Linear(width, 1)
-
-    def forward(self, x: Tensor, admissible: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Scores ``(..., n)`` and contexts ``(..., n, d')`` of n sensors' features ``(..., n, d)``.
-
-        Args:
-            admissible: ``(..., n)`` booleans; the results of the other sensors are meaningless. Default: all are true.
-        """
-        # Only for four axes (batch, head, n, d') torch selects the kernel without an n x n tensor.
-        n, d = x.shape[-2:]
-        wide = x.reshape(-1, 1, n, d)
-        mask = None if admissible is None else admissible.reshape(-1, 1, 1, n)
-        z = functional.scaled_dot_product_attention(self.query(wide), self.key(wide), self.value(wide), attn_mask=mask)
-        z = z.reshape(*x.shape[:-1], -1)
-        return self.score(z)[..., 0], z
-
-
-class VelocityScorer(nn.Module):
-    """``u = W_2 relu(W_1 [z_j, distance] + b_1) + b_2``, one value for each velocity level, as in the paper."""
-
-    def __init__(self, levels: int, width: int = WIDTH) -> None:
-        super().__init__()
-        self.hidden = nn.Linear(width + 1, width)
-        self.out = nn.Linear(width, levels)
-
-    def forward(self, z: Tensor, distance: Tensor) -> Tensor:
-        """Values ``(..., levels)`` from the context ``(..., d')`` and the normalised distance ``(..., 1)``."""
-        values: Tensor = self.out(torch.relu(self.hidden(torch.cat([z, distance], dim=-1))))
-        return values
-
-
-class ReachVelocityScorer(nn.Module):
-    """``u_v = w_2 relu(W_1 [z_j, a_v] + b_1) + b_2``, with the same weights for every velocity level v.
-
-    ``a_v`` is a row of :meth:`State.approaches`, the effects of flying at v. So a scenario may have any number of
-    levels.
-    """
-
-    def __init__(self, level_features: int, width: int = WIDTH) -> None:
-        super().__init__()
-        self.hidden = nn.Linear(width + level_features, width)
-        self.out = nn.Linear(width, 1)
-
-    def forward(self, z: Tensor, levels: Tensor) -> Tensor:
-        """Values ``(..., levels)`` from the context ``(..., d')`` and the levels' features ``(..., levels, 4)``."""
-        context = z[..., None, :].expand(*levels.shape[:-1], z.shape[-1])
-        values: Tensor = self.out(torch.relu(self.hidden(torch.cat([context, levels], dim=-1))))
-        return values[..., 0]
-
-
-class Modules(nn.Module):
-    """The attention and velocity modules of one feature preset, which are trained jointly."""
-
-    def __init__(self, preset: Features, levels: int, seed: int) -> None:
-        super().__init__()
-        self.preset: Features = preset
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            self.attention = Attention(FEATURES[preset])
-            self.velocity = VelocityScorer(levels) if preset == "paper" else ReachVelocityScorer(LEVEL_FEATURES)
-
-    def evaluate(self, sample: Sample) -> tuple[Tensor, Tensor]:
-        """Scores ``(n,)`` of the sensors, and values ``(levels,)`` of the velocities for the chosen sensor."""
-        scores, z = self.attention(torch.from_numpy(sample.features))
-        return scores, self.velocity(z[sample.chosen], torch.from_numpy(sample.approach).to(z.dtype))
-
-    def loss(self, sample: Sample, reward: float) -> Tensor:
-        """``(s_j - r)^2 + (u_v - r)^2`` for the chosen sensor j and velocity v, r = -c."""
-        scores, values = self.evaluate(sample)
-        loss: Tensor = (scores[sample.chosen] - reward) ** 2 + (values[sample.velocity] - reward) ** 2
-        return loss
-
-    def weights(self) -> Weights:
-        """A copy of the parameters for decisions."""
-        layout = Layout(self.preset, self.named_parameters())
-        return Weights(layout, layout.flat([p.detach().numpy() for p in self.parameters()]))

@@ -45,7 +45,7 @@ def adam_step(weights: Array, moments: Moments, gradient: Array, learning_rate: 
 
 
 def descend(weights: Parameters, sample: Sample, reward: float, into: Parameters) -> float:
-    """The loss ``(s_j - r)^2 + (u_v - r)^2`` of :meth:`Modules.loss`, and its gradient.
+    """The loss ``(s_j - r)^2 + (u_v - r)^2`` and its gradient.
 
     The loss depends on the chosen sensor's score only. So the work grows with the number of sensors, whereas the
     backward pass of the whole attention grows with its square.

@@ -7,13 +7,13 @@ import torch
 
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import Header, RolloutStep, read_rollouts, write_rollouts
+from lab.training.modules import Modules
 from lab.training.reward import Reward
 from lab.training.rollout_examples import Example, ExampleBatch, replay
 from lab.training.teacher_agreement import recall, references
 from lab.training.training_loop import losses
 from service.learning import initial_weights as checkpoints
-from service.learning.initial_weights import initial_modules, initial_weights, save
-from service.learning.modules import Modules
+from service.learning.initial_weights import initial_weights
 from shared.wire.schemas import Features
 from shared.world.scenario import SCENARIOS, Scenario
 from tests.support.processes import run_lab, run_lab_here
@@ -67,7 +67,7 @@ def test_a_scenario_with_a_lower_speed_limit_takes_the_levels_that_it_has(featur
     slow = PAPER.model_copy(update={"max_velocity": 8})
     header = Header(scenario=slow, missions=1, behaviour="test")
     sample = next(replay(header, explore(slow, 50_000), Reward("immediate"), features))[0].sample
-    scores, values = initial_modules("pretrained", features, 9, seed=0).evaluate(sample)
+    scores, values = Modules(features, 9, seed=0, init="pretrained").evaluate(sample)
     assert scores.shape == (len(sample.features),)
     assert values.shape == (9,)
 
@@ -83,7 +83,7 @@ def test_a_batch_loses_what_its_examples_lose_one_by_one(features: Features, unt
 
 def test_a_checkpoint_of_another_preset_is_not_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "checkpoints").mkdir()
-    save(Modules("paper", 15, seed=0), tmp_path / "checkpoints" / "reach.pt")
+    Modules("paper", 15, seed=0).save(tmp_path / "checkpoints" / "reach.pt")
     monkeypatch.setattr(checkpoints, "files", lambda package: tmp_path)
     with pytest.raises(ValueError, match=r"reach\.pt has modules of the feature preset paper"):
         checkpoints._packaged.__wrapped__("reach")

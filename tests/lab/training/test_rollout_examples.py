@@ -10,11 +10,12 @@ import torch
 
 from lab.exploration.exploration import explore
 from lab.exploration.rollouts import Header, Reference, RolloutStep
+from lab.training.modules import Modules
 from lab.training.reward import Reward, fleet_cost
 from lab.training.rollout_examples import Example, ExampleBatch, TeacherDecision, replay
 from lab.training.teacher_agreement import recall, references, velocity_agreement, velocity_error
 from lab.training.training_loop import losses
-from service.learning.modules import Modules, Sample
+from service.learning.modules import Sample
 from tests.support.missions import PAPER
 
 SHORT = PAPER.model_copy(update={"steps": 12})

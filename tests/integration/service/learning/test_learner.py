@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from lab.training.modules import Modules
 from service.learning.initial_weights import initial_weights
 from service.learning.learner import Learner
-from service.learning.modules import Modules, Sample
+from service.learning.modules import Sample
 from service.learning.training_step import descend
 from shared.features.augmented_state import FEATURES, LEVEL_FEATURES
 from shared.wire.schemas import Features

@@ -4,7 +4,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from service.learning.modules import Attention, Modules, top_k
+from lab.training.modules import Attention, Modules
+from service.learning.modules import top_k
 
 
 def reference(
