@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from service.edge.compilation import load_for_event_loop
-from service.prompting import row_kinds
+from service.prompting import unpruned_state
 from service.prompting.unpruned_state import UnprunedState
 from shared.belief import beacon_updates, expected_queues, link_expectations, record_updates
 from shared.belief.fleet_belief import FleetBelief
@@ -26,7 +26,7 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
         link_expectations.transfer,
         link_expectations.know_rings,
         link_expectations.formula_transfers,
-        row_kinds.count_kinds,
+        unpruned_state.count_kinds,
     ]
     load_for_event_loop()
     assert {function.__name__: len(function.signatures) for function in functions} == {  # type: ignore[attr-defined]
