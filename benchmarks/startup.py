@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.harness import Goal, Options, Report, environment, in_turn, run
 from lab.experiments.intervals import ratio_of_medians
-from service.api.openapi_examples import REQUESTS
+from service.api.openapi import REQUESTS
 
 GOAL_RATIO, GOAL_HELP_S = 1.5, 0.3
 AICVDS = str(Path(sys.executable).with_name("aicvds"))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
-from service.deciding.llm_timeout import QueryLimits
 from service.deciding.stopwatch import Deadline
 from service.llm.answers import Completion, NoDecision, check_answer, raised
 from service.llm.calibration import LabelReader
@@ -25,6 +26,44 @@ log = logging.getLogger(__name__)
 
 # Consecutive late queries about a whole fleet after which the LLM is asked about one UAV at a time.
 _LATE = 2
+# The most that a query may take after SIGTERM, so that every UAV is answered before the process is killed.
+_CLOSING_S = 4.0
+
+
+class QueryLimits:
+    """Bounds the queries to the LLM in number and in time.
+
+    Args:
+        most: the largest number of waiting queries.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._waiting: set[asyncio.Timeout] = set()
+        self._closing = False
+
+    def hurry(self) -> None:
+        """Shorten the limits because the service is closing: a waiting query gets a few more seconds."""
+        self._closing = True
+        ends = asyncio.get_running_loop().time() + _CLOSING_S
+        for limit in self._waiting:
+            # A limit that has just expired cannot be changed.
+            if not limit.expired():
+                limit.reschedule(min(limit.when() or ends, ends))
+
+    async def within(self, query: Callable[[], Awaitable[Completion]], deadline: Deadline) -> Completion:
+        """The query's answer; raises ``NoDecision`` after the deadline, or if too many queries are waiting."""
+        if len(self._waiting) >= self._most:
+            raise NoDecision("llm_busy", f"{self._most} decisions wait for it already")
+        limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))
+        try:
+            async with limit:
+                self._waiting.add(limit)
+                return await query()
+        except TimeoutError:
+            raise NoDecision("llm_timeout", "no answer within the deadline") from None
+        finally:
+            self._waiting.discard(limit)
 
 
 @dataclass(frozen=True, slots=True)

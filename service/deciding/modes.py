@@ -9,18 +9,40 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, ClassVar, Protocol
 
+import numpy as np
+
 from service.deciding.attended_state import AttendedState
 from service.deciding.decision_task import Choice, DecisionTask, Fallback
 from service.deciding.deliberation import Deliberation, candidates_of, template_of
 from service.deciding.llm_query import LlmQueries
 from service.deciding.rollout_evaluator import Evaluation
-from service.deciding.verifier import verify
 from service.llm.answers import Completion, NoDecision
 from service.prompting.candidates import CandidateSet
 from service.prompting.prompt import Prompt
 from shared.wire.schemas import Mode as ModeName
+from shared.world.actions import Action
 
 log = logging.getLogger(__name__)
+
+
+def verify(state: AttendedState, answer: Action) -> None:
+    """Raises :class:`NoDecision` if the answer breaks a rule; mode ``guided`` weighs each answer instead.
+
+    No packets can be collected from a sensor out of the UAV's reach after the step, or with a flat battery, and a
+    transmission from a sensor that another UAV has reserved fails. A sensor out of reach is allowed while no admissible
+    sensor is in reach at any velocity.
+    """
+    mission, (sensor, velocity) = state.mission, answer
+    if sensor in mission.reservations.of_others(state.step, state.uav_id):
+        raise NoDecision("answer_reserved", f"another UAV has sensor {sensor} meanwhile")
+    if mission.spec.verify == "off":
+        return
+    if mission.belief.battery[sensor] <= 0:
+        raise NoDecision("rule_battery", f"the battery of sensor {sensor} is flat")
+    likely = state.reach.likely
+    row = int(np.flatnonzero(state.state.ids == sensor)[0])
+    if not likely[velocity, row] and likely[:, state.state.admissible].any():
+        raise NoDecision("rule_reach", f"sensor {sensor} is out of reach after a step at {velocity} m/s")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ The prompt is a conversation with worked examples that resemble the note. Where 
 is constrained to the orders that the note's numbers allow. The answer is parsed strictly in any case; an answer that
 does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
 LLM no note is compiled. An embedded LLM with the orders' adapter reads the note differently: see
-:mod:`service.guidance.note_readings`.
+:mod:`service.guidance.note_compiler`.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
 time and serves decisions first.
@@ -14,17 +14,19 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from service.guidance.lettered_orders import NoteReading
+from service.guidance.lettered_orders import STATIC, NoteReading, grammar, meaning
+from service.guidance.note_numbers import LetteredNote
 from service.guidance.note_orders import INSTRUCTION, BadOrders, parse_orders, similar_examples
-from service.guidance.note_readings import read_note
 from service.guidance.operator_guidance import OperatorGuidance
 from service.guidance.order_grammar import constrain_orders
-from service.llm.answers import NoDecision
-from service.llm.request_bodies import Rewriting
+from service.llm.answers import Completion, NoDecision
+from service.llm.request_bodies import Constraint, Rewriting
 from service.llm.server_pool import ServerPool
 from shared.planning.orders import Guidance, Impossible
 from shared.world.scenario import Scenario
@@ -39,6 +41,75 @@ _ANSWER_S = 60.0
 _TIMEOUT_S = 300.0
 _POLL_S = 0.2
 _NOT_JUDGED = "How well this LLM reads notes is not known: compare each order with the note."
+
+_READINGS = 3
+# An answer is certain if the joint probability of its tokens is at least this. Of 160 made-up notes of held-out
+# phrasings the adapter that ships read 20 with this certainty, all correctly; at 0.98 it read 25, 2 of them wrongly, at
+# 0.8 64 and 8.
+_SURE = 0.99
+_MOST_TOKENS = 96
+_LIKELIEST = 5
+_DIFFER = "The note can be read in more than one way."
+_UNLIKELY = "The LLM is not sure of this reading."
+
+
+async def read_note(note: str, scenario: Scenario, llm: ServerPool) -> NoteReading:
+    """The note's reading.
+
+    Raises:
+        BadOrders: most answers are no orders, or the note is unclear.
+        Impossible: most answers order something that the fleet cannot do.
+        NoDecision: the LLM gave no answer.
+    """
+    found: list[tuple[NoteReading | BadOrders | Impossible, float]] = []
+    for seed in range(_READINGS):
+        try:
+            lettered = LetteredNote.of(note, seed)
+        except ValueError as error:
+            raise BadOrders(str(error)) from None
+        answer = await llm.rewrite(_request(lettered), temperature=0.0, seed=seed)
+        found.append((_checked(answer.text, lettered, scenario), _probability(answer)))
+    return _most(found)
+
+
+def _request(note: LetteredNote) -> Rewriting:
+    def constrain(_: Constraint) -> dict[str, object]:
+        likeliest = {"logprobs": True, "top_logprobs": _LIKELIEST}
+        return {"grammar": grammar(note), "max_tokens": _MOST_TOKENS, **likeliest}
+
+    return Rewriting(STATIC, [], note.text, constrain)
+
+
+def _checked(answer: str, note: LetteredNote, scenario: Scenario) -> NoteReading | BadOrders | Impossible:
+    try:
+        reading = meaning(answer, note, scenario)
+        reading.guidance.check(scenario)
+    except (BadOrders, Impossible) as error:
+        return error
+    return reading
+
+
+def _probability(answer: Completion) -> float:
+    """The joint probability of the answer's tokens; 0 if the server gives none."""
+    if not answer.positions:
+        return 0.0
+    return math.prod(position.likeliest.get(position.token.strip(), 0.0) for position in answer.positions)
+
+
+def _most(found: Sequence[tuple[NoteReading | BadOrders | Impossible, float]]) -> NoteReading:
+    """The most frequent reading, the likelier of equal ones; raises the most frequent error."""
+    texts = [str(one) if isinstance(one, Exception) else one.guidance.model_dump_json() for one, _ in found]
+    often = Counter(texts)
+    best = max(range(len(found)), key=lambda i: (often[texts[i]], found[i][1]))
+    reading = found[best][0]
+    if isinstance(reading, Exception):
+        raise reading
+    doubts = list(reading.doubts)
+    if len(often) > 1:
+        doubts.append(_DIFFER)
+    elif min(probability for _, probability in found) < _SURE:
+        doubts.append(_UNLIKELY)
+    return NoteReading(reading.guidance, tuple(doubts))
 
 
 class NoteOwner(Protocol):

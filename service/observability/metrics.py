@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 
+import numpy as np
+from numpy.typing import ArrayLike
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, Summary
+from prometheus_client.core import Metric
 from prometheus_client.platform_collector import PlatformCollector
 from prometheus_client.process_collector import ProcessCollector
+from prometheus_client.registry import Collector
 
-from service.observability.array_histogram import ArrayHistogram
 from shared.belief.gain_measurements import Measured
 from shared.wire.readings import ReadingResult
 from shared.wire.schemas import DecideResponse
@@ -20,6 +23,38 @@ _OVERHEAD_BUCKETS = (0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.02, 0.0
 _SHARE_BUCKETS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1)
 _EXCESS_BUCKETS_DB = (-20, -10, -6, -3, -1, 0, 1, 3, 6, 10, 15, 20, 30, 40)
 _STATUSES = ("loading", "ready", "degraded", "unavailable", "off")
+
+
+class ArrayHistogram(Collector):
+    """A histogram without labels; prometheus_client's own takes one value a call.
+
+    Args:
+        buckets: upper bounds, ascending; the last bucket is without a bound.
+    """
+
+    def __init__(self, name: str, documentation: str, registry: CollectorRegistry, buckets: Sequence[float]) -> None:
+        self._name, self._documentation = name, documentation
+        self._bounds = np.array(buckets, dtype=np.float64)
+        self._labels = [*(str(float(bound)) for bound in buckets), "+Inf"]
+        self._counts = np.zeros(len(self._labels), dtype=np.int64)
+        self._sum = 0.0
+        registry.register(self)
+
+    def observe(self, values: ArrayLike) -> None:
+        """Count values ``(n,)``; a value that equals a bound is in the bound's bucket."""
+        taken = np.asarray(values, dtype=np.float64)
+        self._counts += np.bincount(self._bounds.searchsorted(taken), minlength=len(self._counts))
+        self._sum += float(np.add.reduce(taken))
+
+    def collect(self) -> Iterable[Metric]:
+        """The histogram as it is now."""
+        # HistogramMetricFamily has neither count nor sum where a bound is negative.
+        metric = Metric(self._name, self._documentation, "histogram")
+        for label, below in zip(self._labels, np.cumsum(self._counts).tolist(), strict=True):
+            metric.add_sample(f"{self._name}_bucket", {"le": label}, below)
+        metric.add_sample(f"{self._name}_count", {}, int(self._counts.sum()))
+        metric.add_sample(f"{self._name}_sum", {}, self._sum)
+        yield metric
 
 
 class Metrics:

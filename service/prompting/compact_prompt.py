@@ -130,7 +130,7 @@ class CompactTemplate(GuidedTemplate):
     """The template of the compact prompt; its rows are shuffled, and its letters carry no rank.
 
     It has no note. The caller gives :meth:`candidates` a state in which the note's orders are queues:
-    :mod:`service.guidance.orders_as_queues`.
+    :mod:`service.deciding.prompt_view`.
     """
 
     # The adapter is trained on soft targets: 0.23 is the mean of its highest probability among some 20 candidates. In

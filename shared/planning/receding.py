@@ -20,7 +20,6 @@ from shared.planning.fleet_problem import FleetProblem, Found, with_fixed
 from shared.planning.greedy import look_ahead
 from shared.planning.orders import NO_GUIDANCE, Guidance
 from shared.planning.queue_chains import Arriving, QueueChains, queue_chains
-from shared.planning.ways import steps_to
 from shared.world.actions import Action
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
@@ -49,6 +48,30 @@ _RUNS = [(start, heat) for heat in (0.05, 0.15, 0.05) for start in (0, 1)]
 # Packets: the least first temperature; the expected loss after the first run from which more runs are worth it; and the
 # better start's expected loss from which all runs start together.
 _LEAST_HEAT, _WORTH_RUNS, _WORTH_AT_ONCE = 0.02, 0.1, 1.0
+
+# The index of a place that does not exist.
+_NOWHERE = 10**9
+
+
+def steps_to(good: NDArray[np.bool_], stride: int, sums: int, fastest: int) -> IntArray:
+    """The steps at full speed to the next good place for each sensor, ``(sums, J)``, from velocities' sums 0, 1, ...
+
+    Args:
+        good: shape ``(P, J)``, whether a place is good, at the sums 0, ``stride``, ``2 stride``, ...
+        stride: between two places, as a sum of velocities.
+        sums: C.
+        fastest: the velocity.
+
+    Returns:
+        the steps; more than any way has if no good place follows.
+    """
+    count = len(good)
+    place = np.where(good, np.arange(count)[:, None], _NOWHERE)
+    following = np.minimum.accumulate(place[::-1], axis=0)[::-1]
+    summed = np.arange(sums)
+    here = np.minimum(-(-summed // stride), count - 1)
+    way = following[here] * stride - summed[:, None]
+    return np.asarray(-(-np.maximum(way, 0) // fastest))
 
 
 @dataclass(frozen=True, eq=False)

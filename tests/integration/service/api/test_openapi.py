@@ -9,7 +9,7 @@ import jsonschema_rs
 import pytest
 
 from service.api.app import create_app
-from service.api.openapi_examples import ANSWERS, REQUESTS
+from service.api.openapi import ANSWERS, REQUESTS
 from service.config.settings import Settings
 from tests.conftest import Edge
 

@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from service.deciding.attended_state import AttendedState
-from service.deciding.verifier import verify
+from service.deciding.modes import verify
 from service.llm.answers import NoDecision
 from service.mission.mission import Mission
 from shared.wire.schemas import MissionSpec

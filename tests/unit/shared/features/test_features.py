@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import pdtrc
 
-from shared.world.poisson_tail import above_poisson
 from shared.world.scenario import SCENARIOS, Scenario
-from shared.world.urgency import overflow_probability, urgency
+from shared.world.urgency import above_poisson, overflow_probability, urgency
 
 PAPER = SCENARIOS["paper"]
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from shared.belief.fleet_belief import FleetBelief
 from shared.planning.annealing import Annealing
-from shared.planning.receding import RecedingHorizon
-from shared.planning.ways import steps_to
+from shared.planning.receding import RecedingHorizon, steps_to
 from shared.world.scenario import Scenario
 from shared.world.trajectory import Trajectory, trajectories
 
