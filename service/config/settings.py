@@ -98,7 +98,7 @@ class Settings(BaseSettings):
     llm_extra_body: JsonObject = Field(default_factory=dict)
     # Further headers of each request to the server, a JSON object of texts: {"api-key": "..."} for Azure.
     llm_extra_headers: JsonTexts = Field(default_factory=dict, repr=False)
-    # Further parameters of the server's URLs, a JSON object of texts: {"api-version": "2024-10-21"}.
+    # Further parameters of the server's URLs, a JSON object of texts: {"api-version": "preview"}.
     llm_extra_query: JsonTexts = Field(default_factory=dict, repr=False)
     # Most tokens that a model may think before its answer. The edge begins without any, and raises them when an answer
     # ends before it has begun. 0: never.

@@ -97,7 +97,7 @@ class LlmServer:
         self.constraint: Constraint = "none"
         self.logprobs: TokenProbabilities = "none"
         self.max_uavs_per_call = 1
-        self.usability = Usability()
+        self.usability = Usability(self._probe_again)
         self._breaker = CircuitBreaker()
         self._silence = SilenceCounter(settings.deadline_ms / 2e3)
         self._priority = DecisionPriority()
@@ -129,6 +129,7 @@ class LlmServer:
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
+        await self.usability.close()
         if self._client is not None:
             await self._client.close()
         if self._embedded is not None:
@@ -302,25 +303,13 @@ class LlmServer:
         self.constraint, self.logprobs = found.constraint, found.logprobs
         self.max_uavs_per_call = found.max_uavs_per_call
 
-    def record_unusable(self, fault: NoDecision) -> None:
-        """Count an answer that a decision cannot use; a degraded server is probed again, as it may have changed."""
-        self.usability.unusable(fault)
-        if self.usability.degraded and self.status.llm == "ready" and not self.recovering:
-            self._task = asyncio.create_task(self._probe_again(), name="llm-probe-again", context=Context())
-
     async def _probe_again(self) -> None:
-        """While the answers are unusable: ask for model and abilities again, and for a decision."""
-        while self._client is not None and self.usability.degraded:
-            await asyncio.sleep(self.usability.pause_s)
-            try:
-                async with asyncio.timeout(_PROBE_TIMEOUT_S):
-                    await self._find_abilities(self._client)
-                await self._judge(self._client)
-            except (NoDecision, TimeoutError) as error:
-                log.info("the LLM's answers are still unusable: %s", error or "none in time")
-                self.usability.probed(passed=False)
-            else:
-                self.usability.probed(passed=True)
+        """Probe a ready server whose answers cannot be used: it may have another model now."""
+        if self._client is None or self.status.llm != "ready":
+            raise NoDecision("llm_unavailable", self.status.llm)
+        async with asyncio.timeout(_PROBE_TIMEOUT_S):
+            await self._find_abilities(self._client)
+        await self._judge(self._client)
 
 
 def _client_module() -> ModuleType:

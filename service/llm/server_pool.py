@@ -98,7 +98,7 @@ class ServerPool:
         if fault is None:
             server.usability.usable()
         elif fault.reason in LLM_FAILURES and fault.reason != "llm_timeout":
-            server.record_unusable(fault)
+            server.usability.unusable(fault)
 
     def start(self) -> None:
         """Begin to load or reach all servers, unless the LLM is off."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections.abc import Awaitable, Callable
+from contextvars import Context
 
 from service.llm.answers import NoDecision
 
@@ -17,31 +20,36 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 30.0, 480.0
 
 
 class Usability:
-    """Counts the decisions in a row for which a server's answer could not be used.
+    """Counts the decisions in a row for which a server's answer could not be used, and probes a degraded server.
+
+    Args:
+        probe: asks the server for its model, its abilities and a decision; raises :class:`NoDecision` or
+            ``TimeoutError`` if the answer cannot be used.
 
     Attributes:
         degraded: why the LLM's answers are unusable, with the beginning of the last one; None if they are usable.
-        pause_s: seconds until a degraded server is probed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, probe: Callable[[], Awaitable[None]]) -> None:
+        self._probe = probe
         self._unusable = 0
+        # After a passed probe the first unusable answer degrades the server again.
         self._suspect = False
+        self._pause_s = _FIRST_PAUSE_S
+        self._task: asyncio.Task[None] | None = None
         self.degraded: str | None = None
-        self.pause_s = _FIRST_PAUSE_S
+
+    async def close(self) -> None:
+        """Stop probing."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
 
     def usable(self) -> None:
         """Count a decision's answer that passed every check."""
         self._suspect = False
-        self.pause_s = _FIRST_PAUSE_S
+        self._pause_s = _FIRST_PAUSE_S
         self._restore()
-
-    def probed(self, passed: bool) -> None:
-        """Count a probe of a degraded server; if it passed, the first unusable answer degrades the server again."""
-        self.pause_s = min(_LONGEST_PAUSE_S, 2.0 * self.pause_s)
-        if passed:
-            self._suspect = True
-            self._restore()
 
     def unusable(self, why: NoDecision) -> None:
         """Count a refusal, or an answer that failed a check; the error's text has the answer's beginning."""
@@ -53,6 +61,21 @@ class Usability:
         if self.degraded is None:
             log.warning("LLM degraded: %s cannot be used, the last (%s): %s", number, why.reason, quoted)
         self.degraded = f"{number} cannot be used, the last ({why.reason}): {quoted}"
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._probe_again(), name="llm-probe-again", context=Context())
+
+    async def _probe_again(self) -> None:
+        """Pause and probe until the answers can be used; each pause is twice as long, up to eight minutes."""
+        while self.degraded is not None:
+            await asyncio.sleep(self._pause_s)
+            self._pause_s = min(_LONGEST_PAUSE_S, 2.0 * self._pause_s)
+            try:
+                await self._probe()
+            except (NoDecision, TimeoutError) as error:
+                log.info("the LLM's answers are still unusable: %s", error or "none in time")
+            else:
+                self._suspect = True
+                self._restore()
 
     def _restore(self) -> None:
         self._unusable = 0

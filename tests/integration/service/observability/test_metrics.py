@@ -62,7 +62,7 @@ def test_without_an_llm_no_breaker_is_open(edge: Edge) -> None:
     by_status = {series: n for series, n in told.items() if series.startswith("aicvds_llm_servers")}
     assert by_status == {
         f'aicvds_llm_servers{{status="{status}"}}': float(status == "off")
-        for status in ("loading", "ready", "unavailable", "off")
+        for status in ("loading", "ready", "degraded", "unavailable", "off")
     }
 
 
