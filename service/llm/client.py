@@ -142,7 +142,7 @@ class LLMClient:
         Args:
             session: an ID shared by completions with a common prefix, which a router may send to the same server.
         """
-        terms = self._terms
+        terms = known = self._terms
         while True:
             sent = terms.applied(body)
             # Each token may come with the likeliest tokens of its position.
@@ -158,15 +158,15 @@ class LLMClient:
             else:
                 other = terms.with_more_tokens(self._extras.most_tokens) if answer.unfinished else None
                 if other is None:
-                    if not answer.unfinished:
+                    # An older call must not bring back what a later one has learned.
+                    if terms is not known and not answer.unfinished:
                         self._remember(terms)
                     return answer
             terms = other
 
     def _remember(self, terms: RequestTerms) -> None:
-        if terms != self._terms:
-            log.warning("%s: requests follow the server's refusals and limits from now on: %s", self.base_url, terms)
-            self._terms = terms
+        log.warning("%s: requests follow the server's refusals and limits from now on: %s", self.base_url, terms)
+        self._terms = terms
 
     async def _call(
         self,
@@ -194,9 +194,11 @@ class LLMClient:
         except (aiohttp.ClientError, OSError, ValueError) as error:
             raise self._failure(error) from error
         if status != 200:
-            said = f" to {location.split('?')[0][:200]}" if status in _REDIRECTS else excerpt(content, self._secrets)
             kind = NotUnderstood if status in _NOT_UNDERSTOOD else NoDecision
-            raise kind("llm_status", f"{self.base_url}: HTTP {status}{': ' * (status not in _REDIRECTS)}{said}")
+            target = location.split("?")[0] if status in _REDIRECTS else ""
+            said = excerpt(target.encode() or content, self._secrets)
+            detail = f" to {said}" if target else f": {said}" if said else ""
+            raise kind("llm_status", f"{self.base_url}: HTTP {status}{detail}")
         try:
             return json.loads(content)
         except (ValueError, RecursionError):

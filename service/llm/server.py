@@ -249,13 +249,8 @@ class LlmServer:
             try:
                 client = await self._connect()
                 self.status = ServerStatus("ready")
-                log.info(
-                    "LLM ready: %s at %s, constraint %s, token probabilities %s",
-                    self.model,
-                    client.base_url,
-                    self.constraint,
-                    self.logprobs,
-                )
+                abilities = f"constraint {self.constraint}, token probabilities {self.logprobs}"
+                log.info("LLM ready: %s at %s, %s", self.model, client.base_url, abilities)
                 return
             except (ModelMissing, AdapterUnusable, LoadFailed) as error:
                 self.status = ServerStatus("unavailable", str(error))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import ssl
 from typing import Any
@@ -66,7 +67,8 @@ def connection_fault(error: aiohttp.ClientError | OSError | ValueError) -> str:
         return f"the proxy answers HTTP {error.status}"
     if isinstance(error, aiohttp.ClientConnectorError):
         inner = error.os_error
-        found = getattr(inner, "reason", None) or inner.strerror or type(inner).__name__
+        system = os.strerror(inner.errno) if inner.errno is not None and inner.errno > 0 else inner.strerror
+        found = getattr(inner, "reason", None) or system or type(inner).__name__
         proxy = "the proxy of the environment: " if isinstance(error, aiohttp.ClientProxyConnectionError) else ""
         return f"{proxy}{type(error).__name__}: {found}"
     return type(error).__name__

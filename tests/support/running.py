@@ -44,16 +44,22 @@ class _Server(uvicorn.Server):
 
 
 @contextmanager
-def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
-    """Serve the application by a real uvicorn with the edge's limits on headers; yields its base URL."""
+def serving(app: ASGIApp, port: int = 0, certificate: str | None = None) -> Iterator[str]:
+    """Serve the application by a real uvicorn with the edge's limits on headers; yields its base URL.
+
+    Args:
+        certificate: a PEM file with a key and a certificate, to serve HTTPS.
+    """
     config = uvicorn.Config(
         app,
         interface="asgi3",
         host="127.0.0.1",
         port=port,
         log_level="warning",
-        http=BoundedHttpProtocol,
+        # The edge itself serves no TLS; its limits look at the socket.
+        http=BoundedHttpProtocol if certificate is None else "h11",
         ws="none",
+        ssl_certfile=certificate,
     )
     server = _Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
@@ -64,7 +70,7 @@ def serving(app: ASGIApp, port: int = 0) -> Iterator[str]:
         time.sleep(0.002)
     port = server.servers[0].sockets[0].getsockname()[1]
     try:
-        yield f"http://127.0.0.1:{port}"
+        yield f"http{'s' if certificate else ''}://127.0.0.1:{port}"
     finally:
         server.end()
         thread.join(PATIENCE_S)

@@ -28,7 +28,7 @@ def test_each_line_is_json_and_names_the_mission_and_decision_and_no_secret(tmp_
     keys = tmp_path / "keys.json"
     key = run("keys", "add", "fleet", "--file", str(keys), "--scopes", "decide", "admin").stdout.strip()
     with (
-        listening(misbehaving(saying(b"500 Oops", b"secret-of-the-server"))) as llm,
+        listening(misbehaving(saying(b"500 Oops", b"no such key: secret-of-the-llm"))) as llm,
         serving_edge(
             AICVDS_MODE="llm",
             AICVDS_LLM_URL=f"{llm}/v1",
@@ -52,7 +52,7 @@ def test_each_line_is_json_and_names_the_mission_and_decision_and_no_secret(tmp_
     # What is logged on the way says whose decision it is about.
     opened = next(line for line in lines if "failed too often" in line["event"])
     assert (opened["mission_id"], opened["step"], opened["level"]) == ("test", 2, "warning")
-    for secret in (key, "secret-of-the-llm", "secret-of-the-server"):
+    for secret in (key, "secret-of-the-llm"):
         assert secret not in output
 
 
