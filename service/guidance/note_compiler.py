@@ -3,8 +3,11 @@
 The prompt is a conversation with worked examples that resemble the note. Where the server can constrain its answer, it
 is constrained to the orders that the note's numbers allow. The answer is parsed strictly in any case; an answer that
 does not match the note, or that the fleet cannot follow, is refused, and the LLM is asked again a few times. Without an
-LLM no note is compiled. An embedded LLM with the orders' adapter reads the note differently: see
-:mod:`service.guidance.note_compiler`.
+LLM no note is compiled.
+
+An embedded LLM with the orders' adapter reads the note three times, each time with other letters for its numbers, so
+that an answer caused by a letter does not recur. The most frequent reading is the note's. It has doubts if another one
+differs or a token of an answer was unlikely.
 
 Compiling runs concurrently with decisions, and no decision waits for it. The embedded model answers one request at a
 time and serves decisions first.

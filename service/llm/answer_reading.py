@@ -24,8 +24,11 @@ _FENCE = re.compile(r"\A\s*```[a-zA-Z]*\s*\n?(.*?)\n?\s*```\s*\Z", re.DOTALL)
 _BLANKS = str.maketrans({"Ġ": " ", "▁": " ", "Ċ": "\n"})
 
 
-def completion_of(answer: Any, base_url: str) -> Completion:
+def completion_of(answer: Any, base_url: str, secrets: tuple[str, ...] = ()) -> Completion:
     """The completion of a server's JSON answer.
+
+    Args:
+        secrets: texts that no error may quote, as the key that was sent.
 
     Raises:
         NoDecision: the answer is an error object, or has no text, not even an empty one.
@@ -35,7 +38,7 @@ def completion_of(answer: Any, base_url: str) -> Completion:
         message = choice["message"]
         content, reasoning = message.get("content"), message.get("reasoning_content") or message.get("reasoning")
     except (AttributeError, KeyError, IndexError, TypeError):
-        said = excerpt_of(answer)
+        said = excerpt_of(answer, secrets)
         detail = f"a 200 that is no chat completion{f': {said!r}' if said else ''}"
         raise NoDecision("llm_error", f"{base_url}: {detail}") from None
     cut = choice.get("finish_reason") == "length"

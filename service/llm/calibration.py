@@ -115,8 +115,8 @@ class LabelReader:
     def read(self, completion: Completion, static: str, lists: Sequence[Collection[str]]) -> list[dict[str, float]]:
         """The labels' probabilities by list, calibrated once the bias is known; raises :class:`NoDecision`."""
         measured = probabilities(completion, lists)
-        bias = self.bias(completion.model, static, len(lists)) if _by_label(completion, lists) else None
-        if bias is None:
+        bias = self.bias(completion.model, static, len(lists))
+        if bias is None or not _by_label(completion, lists):
             return measured
         return [calibrated(*pair) for pair in zip(measured, bias, strict=True)]
 

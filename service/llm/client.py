@@ -150,7 +150,8 @@ class LLMClient:
             if self._extras.body:
                 sent = {**sent, **self._extras.body}
             try:
-                answer = completion_of(await self._call("POST", self._completions, sent, most, session), self.base_url)
+                found = await self._call("POST", self._completions, sent, most, session)
+                answer = completion_of(found, self.base_url, self._secrets)
             except NotUnderstood as refused:
                 other = terms.after_refusal(str(refused), sent)
                 if other is None:

@@ -14,8 +14,7 @@ log = logging.getLogger(__name__)
 # Answers in a row that cannot be used. A small model errs now and then.
 _DEGRADED = 5
 _MOST_QUOTED = 200
-
-
+# Until a degraded server is probed.
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 30.0, 480.0
 
 

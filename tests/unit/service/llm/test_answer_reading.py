@@ -69,3 +69,8 @@ def test_an_answer_cut_off_before_it_begins_is_unfinished(content: str | None, t
 def test_no_completion_is_named_in_the_servers_words(body: Any, words: str) -> None:
     with pytest.raises(NoDecision, match=words):
         completion_of(body, "url")
+
+
+def test_no_error_quotes_the_key() -> None:
+    with pytest.raises(NoDecision, match="bad key \\*\\*\\*"):
+        completion_of({"error": {"message": "bad key private-1"}}, "url", ("private-1",))
