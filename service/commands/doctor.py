@@ -192,13 +192,8 @@ def _llm_server(settings: Settings) -> Iterator[Finding]:
     except NoDecision as error:
         yield Finding("LLM", str(error), _REMEDIES.get(error.reason, _REMEDIES["llm_error"]))
         return
-    able = found.abilities
     yield Finding("LLM", f"{settings.llm_url}: {found.model or 'the default model of the server'}")
-    form = "as text that the edge checks" if able.constraint == "none" else f"constrained by {able.constraint}"
-    probabilities = {"none": "no token probabilities", "sampled": "token probabilities after sampling"}
-    likeliest = probabilities.get(able.logprobs, f"the {able.logprobs[4:]} likeliest tokens")
-    together = "several UAVs a call" if able.max_uavs_per_call > 1 else "one UAV a call"
-    yield Finding("LLM", f"answers {form}, {likeliest}, {together}{f'; with {found.terms}' if found.terms else ''}")
+    yield Finding("LLM", f"{found.abilities}{f'; with {found.terms}' if found.terms else ''}")
     late = found.seconds * 1e3 > settings.deadline_ms
     yield Finding("LLM", _timed(found, settings.deadline_ms), _LATE if late else None)
 

@@ -12,7 +12,7 @@ from functools import partial
 from service.deciding.attended_state import AttendedState
 from service.deciding.deliberation import LlmAdvice, candidates_of, template_of
 from service.deciding.stopwatch import Deadline
-from service.llm.answers import Completion, NoDecision, check_answer, raised
+from service.llm.answers import Busy, Completion, NoDecision, check_answer, raised
 from service.llm.calibration import LabelReader
 from service.llm.server_pool import ServerPool
 from service.mission.mission import Mission
@@ -52,14 +52,24 @@ class QueryLimits:
                 limit.reschedule(min(limit.when() or ends, ends))
 
     async def within(self, query: Callable[[], Awaitable[Completion]], deadline: Deadline) -> Completion:
-        """The query's answer; raises ``NoDecision`` after the deadline, or if too many queries are waiting."""
+        """The query's answer, after the pause that the server asks for if the deadline leaves time for it.
+
+        Raises:
+            NoDecision: no answer before the deadline, or too many queries are waiting.
+        """
         if len(self._waiting) >= self._most:
             raise NoDecision("llm_busy", f"{self._most} decisions wait for it already")
         limit = asyncio.timeout(min(deadline.left(), _CLOSING_S if self._closing else math.inf))
         try:
             async with limit:
                 self._waiting.add(limit)
-                return await query()
+                while True:
+                    try:
+                        return await query()
+                    except Busy as busy:
+                        if busy.pause_s >= deadline.left():
+                            raise
+                        await asyncio.sleep(busy.pause_s)
         except TimeoutError:
             raise NoDecision("llm_timeout", "no answer within the deadline") from None
         finally:
@@ -138,7 +148,7 @@ class LlmQueries:
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve this many UAVs: mode ``guided``, a capable server, a sufficient context."""
         server = self._llm.serving(mission.mission_id)
-        able = server.status.llm == "ready" and uavs <= server.max_uavs_per_call
+        able = server.status.llm == "ready" and uavs <= server.abilities.max_uavs_per_call
         return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
 
     async def ask_for_fleet(
@@ -181,7 +191,7 @@ class LlmQueries:
         self._late = self._late + 1 if reason == "llm_timeout" else 0
         if reason is not None and (self._late == 0 or self._late >= _LATE):
             log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
-            self._llm.serving(mission.mission_id).max_uavs_per_call = uavs - 1
+            self._llm.serving(mission.mission_id).abilities.max_uavs_per_call = uavs - 1
             self._late = 0
 
     async def _query(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -31,6 +32,23 @@ class NotUnderstood(NoDecision):
 
 class Unreachable(NoDecision):
     """No server accepts connections at the address."""
+
+
+class Busy(NoDecision):
+    """The server asks for a pause (RFC 9110, 10.2.3).
+
+    Attributes:
+        until: end of the pause, a moment of ``time.monotonic``.
+    """
+
+    def __init__(self, detail: str, until: float) -> None:
+        super().__init__("llm_status", detail)
+        self.until = until
+
+    @property
+    def pause_s(self) -> float:
+        """Seconds of the pause that are left."""
+        return max(0.0, self.until - time.monotonic())
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import functools
 import json
 import logging
+import time
+from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +23,9 @@ from yarl import URL
 
 from service.config.settings import Settings
 from service.llm.answer_reading import completion_of
-from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
+from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.request_terms import RequestExtras, RequestTerms
-from service.llm.server_words import connection_fault, excerpt, excerpt_of
+from service.llm.server_words import connection_fault, excerpt, excerpt_of, pause_of
 
 # Far above any regular completion of two integers; an endless body must not fill the memory.
 _MAX_RESPONSE_BYTES, _BYTES_A_TOKEN = 256 * 1024, 8 * 1024
@@ -183,23 +185,27 @@ class LLMClient:
             headers = {self._session_header: session}
         exchange = _Exchange(most)
         try:
-            status, location, content = await self._exchange(method, url, sent, headers, exchange)
+            status, head, content = await self._exchange(method, url, sent, headers, exchange)
         except (aiohttp.ServerDisconnectedError, ConnectionResetError, aiohttp.ClientOSError) as error:
             if not exchange.reused or exchange.answered or isinstance(error, aiohttp.ClientConnectorError):
                 raise self._failure(error) from error
             # The server closed an idle connection as the request was sent (aiohttp 9138): it has not seen the request.
             try:
-                status, location, content = await self._exchange(method, url, sent, headers, _Exchange(most))
+                status, head, content = await self._exchange(method, url, sent, headers, _Exchange(most))
             except (aiohttp.ClientError, OSError, ValueError) as again:
                 raise self._failure(again) from again
         except (aiohttp.ClientError, OSError, ValueError) as error:
             raise self._failure(error) from error
         if status != 200:
             kind = NotUnderstood if status in _NOT_UNDERSTOOD else NoDecision
-            target = location.split("?")[0] if status in _REDIRECTS else ""
+            target = head.get("Location", "").split("?")[0] if status in _REDIRECTS else ""
             said = excerpt(target.encode() or content, self._secrets)
             detail = f" to {said}" if target else f": {said}" if said else ""
-            raise kind("llm_status", f"{self.base_url}: HTTP {status}{detail}")
+            text = f"{self.base_url}: HTTP {status}{detail}"
+            pause_s = pause_of(head)
+            if pause_s is None or kind is NotUnderstood:
+                raise kind("llm_status", text)
+            raise Busy(f"{text} (no requests for {pause_s:.3g} s)", time.monotonic() + pause_s)
         try:
             return json.loads(content)
         except (ValueError, RecursionError):
@@ -208,8 +214,8 @@ class LLMClient:
 
     async def _exchange(
         self, method: str, url: URL, sent: bytes | None, headers: dict[str, str], exchange: _Exchange
-    ) -> tuple[int, str, bytearray]:
-        """Status, ``Location`` and body of the answer to one request."""
+    ) -> tuple[int, Mapping[str, str], bytearray]:
+        """Status, headers and body of the answer to one request."""
         content, options = bytearray(), self._proxy
         if headers:
             options = {**options, "headers": {**options.get("headers", {}), **headers}}
@@ -225,7 +231,7 @@ class LLMClient:
                 content += chunk
                 if len(content) > exchange.most:
                     raise NoDecision("llm_error", f"{self.base_url}: more than {exchange.most} bytes")
-        return response.status, response.headers.get("Location", ""), content
+        return response.status, response.headers, content
 
     def _failure(self, error: aiohttp.ClientError | OSError | ValueError) -> NoDecision:
         kind = Unreachable if isinstance(error, aiohttp.ClientConnectorError) else NoDecision

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 from service.config.settings import Settings
 from service.llm.client import client_of
-from service.llm.probing import Abilities, first_answer, listed_model, probe
+from service.llm.probing import Abilities, first_decision, listed_model, probe
 from service.llm.request_bodies import WarmUp
-
-# The second request finds the static block in the server's prefix cache, as decisions do.
-_REQUESTS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +39,7 @@ async def examine(settings: Settings, warm_up: WarmUp) -> Examination:
     try:
         model = settings.llm_model or await listed_model(client)
         abilities = await probe(client, model)
-        for _ in range(_REQUESTS):
-            started = time.monotonic()
-            answer = await first_answer(client, model, warm_up, abilities.constraint, abilities.logprobs)
-            seconds = time.monotonic() - started
+        answer, seconds = await first_decision(client, model, warm_up, abilities)
         counts = answer.prompt_tokens, answer.cached_tokens, answer.completion_tokens
         return Examination(model, abilities, str(client.terms), seconds, *counts)
     finally:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -41,9 +42,9 @@ _PROBABILITIES: tuple[TokenProbabilities, ...] = ("sampled", "top_20", "top_5")
 _PASSES = 2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Abilities:
-    """A server's abilities.
+    """A server's abilities; ``str()`` has them in words.
 
     Attributes:
         constraint: the kind of constraint that it obeys.
@@ -51,9 +52,16 @@ class Abilities:
         max_uavs_per_call: number of UAVs that one call may decide for.
     """
 
-    constraint: Constraint
-    logprobs: TokenProbabilities
-    max_uavs_per_call: int
+    constraint: Constraint = "none"
+    logprobs: TokenProbabilities = "none"
+    max_uavs_per_call: int = 1
+
+    def __str__(self) -> str:
+        form = "as text that the edge checks" if self.constraint == "none" else f"constrained by {self.constraint}"
+        named = {"none": "no token probabilities", "sampled": "token probabilities after sampling"}
+        likeliest = named.get(self.logprobs, f"the {self.logprobs[4:]} likeliest tokens")
+        together = "several UAVs a call" if self.max_uavs_per_call > 1 else "one UAV a call"
+        return f"answers {form}, {likeliest}, {together}"
 
 
 async def probe(client: LLMClient, model: str | None) -> Abilities:
@@ -145,16 +153,25 @@ async def listed_model(client: LLMClient) -> str | None:
         return None
 
 
-async def first_answer(
-    client: LLMClient, model: str | None, warm_up: WarmUp, constraint: Constraint, logprobs: TokenProbabilities
-) -> Completion:
-    """The answer to the warm-up, checked as a decision's; raises :class:`NoDecision`."""
-    answer = await client.complete(warm_up_body(model, warm_up, constraint, logprobs))
-    if warm_up.labels is None:
-        check_answer(answer.text, *WARM_UP_CHOICES)
-    else:
-        probabilities(answer, [warm_up.labels])
-    return answer
+async def first_decision(
+    client: LLMClient, model: str | None, warm_up: WarmUp, able: Abilities, enough_s: float = 0.0
+) -> tuple[Completion, float]:
+    """The answer to the warm-up, checked as a decision's, and its seconds; raises :class:`NoDecision`.
+
+    An answer that takes longer than ``enough_s`` is asked for again: then the server's prefix cache has the static
+    block, as it has in decisions.
+    """
+    for _ in range(2):
+        started = time.monotonic()
+        answer = await client.complete(warm_up_body(model, warm_up, able.constraint, able.logprobs))
+        seconds = time.monotonic() - started
+        if warm_up.labels is None:
+            check_answer(answer.text, *WARM_UP_CHOICES)
+        else:
+            probabilities(answer, [warm_up.labels])
+        if seconds <= enough_s:
+            break
+    return answer, seconds
 
 
 def probe_body(model: str | None, constraint: Constraint) -> dict[str, Any]:

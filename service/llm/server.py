@@ -15,17 +15,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
-from service.llm.answers import Completion, NoDecision, NotUnderstood, Unreachable
+from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
 from service.llm.decision_priority import DecisionPriority
 from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
 from service.llm.model_file import ModelMissing
-from service.llm.probing import first_answer, listed_model, probe, probe_body
+from service.llm.probing import Abilities, first_decision, listed_model, probe, probe_body
 from service.llm.request_bodies import (
     SEVERAL_LABELS_TEMPERATURE,
-    Constraint,
     Rewriting,
-    TokenProbabilities,
     WarmUp,
     chat_body,
     label_body,
@@ -74,9 +72,8 @@ class LlmServer:
         model, bare_model: name of the model, once it is known, with its adapter and without.
         notes_model: name of the model that reads notes.
         reads_letters: whether that model has the orders' adapter, which reads notes whose numbers are letters.
-        constraint: the kind of constraint that the server obeys.
-        logprobs: the probabilities of tokens that the server gives.
-        max_uavs_per_call: number of UAVs that one call may decide for.
+        abilities: what its probes found.
+        decision_s: duration of the last probe's decision; None before it.
     """
 
     def __init__(
@@ -94,9 +91,9 @@ class LlmServer:
         self._task: asyncio.Task[None] | None = None
         self.model = self.bare_model = self.notes_model = settings.llm_model
         self.reads_letters = False
-        self.constraint: Constraint = "none"
-        self.logprobs: TokenProbabilities = "none"
-        self.max_uavs_per_call = 1
+        self.abilities = Abilities()
+        self.decision_s: float | None = None
+        self._busy: Busy | None = None
         self.usability = Usability(self._probe_again)
         self._breaker = CircuitBreaker()
         self._silence = SilenceCounter(settings.deadline_ms / 2e3)
@@ -107,6 +104,11 @@ class LlmServer:
         """Whether an LLM that is not ready may become ready without a restart."""
         return self._task is not None and not self._task.done()
 
+    @property
+    def paused(self) -> bool:
+        """Whether the server asks for no requests at present."""
+        return self._busy is not None and self._busy.pause_s > 0.0
+
     def readiness(self) -> Readiness:
         """The answer of ``/readyz``."""
         ready = self.status.llm == "ready"
@@ -115,9 +117,15 @@ class LlmServer:
             decides=self._settings.mode if ready else "policy",
             llm="degraded" if ready and self.usability.degraded else self.status.llm,
             model=self.model,
-            constraint=self.constraint if ready else None,
+            constraint=self.abilities.constraint if ready else None,
+            abilities=self._in_words() if ready else None,
+            decision_ms=self.decision_s and round(self.decision_s * 1e3, 1),
             detail=self.usability.degraded if ready else self.status.detail,
         )
+
+    def _in_words(self) -> str:
+        terms = "" if self._client is None else str(self._client.terms)
+        return f"{self.abilities}; with {terms}" if terms else str(self.abilities)
 
     def start(self) -> None:
         """Begin to load or reach the LLM, unless it is off."""
@@ -141,7 +149,7 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = chat_body(self.model, system, user, self.constraint, sensor_ids, velocities)
+        body = chat_body(self.model, system, user, self.abilities.constraint, sensor_ids, velocities)
         return await self._decide(mission_id, body, self._silence)
 
     async def ask_labels(self, mission_id: str, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
@@ -150,10 +158,10 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = label_body(self.model, system, user, self.constraint, lists, self.logprobs)
+        body = label_body(self.model, system, user, self.abilities.constraint, lists, self.abilities.logprobs)
         # The silence of a call for several UAVs says nothing about calls for one.
         answer = await self._decide(mission_id, body, self._silence if len(lists) == 1 else None)
-        if self.logprobs != "sampled" or len(lists) == 1:
+        if self.abilities.logprobs != "sampled" or len(lists) == 1:
             return answer
         positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
         return replace(answer, positions=positions)
@@ -167,7 +175,7 @@ class LlmServer:
             ValueError: ``wanted.constrain`` finds nothing to rewrite.
             NoDecision: no answer, with the reason.
         """
-        body = rewriting_body(self.model, wanted, wanted.constrain(self.constraint), temperature, seed)
+        body = rewriting_body(self.model, wanted, wanted.constrain(self.abilities.constraint), temperature, seed)
         ask = partial(self._ask_about_note, body)
         return await ask() if self._embedded is None else await self._priority.answer(ask)
 
@@ -177,8 +185,8 @@ class LlmServer:
         try:
             with self._priority.decision():
                 answer = await self._ask(body, mission_id)
-        except NotUnderstood:
-            # The fault is the request's, not the server's.
+        except (NotUnderstood, Busy):
+            # The fault is the request's, or will be over by itself.
             raise
         except NoDecision as error:
             self._failed(error.reason)
@@ -211,8 +219,13 @@ class LlmServer:
     async def _complete(self, body: dict[str, Any], mission_id: str | None = None) -> Completion:
         if self._client is None or self.status.llm != "ready":
             raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
+        if self._busy is not None and self.paused:
+            raise Busy(str(self._busy), self._busy.until)
         try:
             return await self._client.complete(body, mission_id)
+        except Busy as busy:
+            self._busy = busy
+            raise
         except Unreachable as gone:
             if self.status.llm == "ready":
                 self.status = ServerStatus("unavailable", str(gone))
@@ -235,7 +248,7 @@ class LlmServer:
             await asyncio.sleep(self._breaker.pause_s)
             try:
                 async with asyncio.timeout(_PROBE_TIMEOUT_S):
-                    await self._client.complete(probe_body(self.model, self.constraint))
+                    await self._client.complete(probe_body(self.model, self.abilities.constraint))
             except (NoDecision, TimeoutError) as error:
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
@@ -249,8 +262,10 @@ class LlmServer:
             try:
                 client = await self._connect()
                 self.status = ServerStatus("ready")
-                abilities = f"constraint {self.constraint}, token probabilities {self.logprobs}"
-                log.info("LLM ready: %s at %s, %s", self.model, client.base_url, abilities)
+                log.info("LLM ready: %s at %s, %s", self.model, client.base_url, self._in_words())
+                if self.decision_s is not None and self.decision_s * 1e3 > self._settings.deadline_ms:
+                    text = "LLM too slow: a decision took %.2f s, the deadline is %d ms"
+                    log.warning(text, self.decision_s, self._settings.deadline_ms)
                 return
             except (ModelMissing, AdapterUnusable, LoadFailed) as error:
                 self.status = ServerStatus("unavailable", str(error))
@@ -288,15 +303,14 @@ class LlmServer:
     async def _judge(self, client: LLMClient) -> None:
         """Send the warm-up, and check its answer as a decision's; raises :class:`NoDecision` or ``TimeoutError``."""
         async with asyncio.timeout(_PROBE_TIMEOUT_S):
-            await first_answer(client, self.model, self._warm_up, self.constraint, self.logprobs)
+            enough_s = self._settings.deadline_ms / 1e3
+            _, self.decision_s = await first_decision(client, self.model, self._warm_up, self.abilities, enough_s)
 
     async def _find_abilities(self, client: LLMClient) -> None:
         """Ask the server for its model, unless the settings or the model file name one, and for its abilities."""
         if self._embedded is None and self._settings.llm_model is None:
             self.model = self.bare_model = self.notes_model = await listed_model(client)
-        found = await probe(client, self.model)
-        self.constraint, self.logprobs = found.constraint, found.logprobs
-        self.max_uavs_per_call = found.max_uavs_per_call
+        self.abilities = await probe(client, self.model)
 
     async def _probe_again(self) -> None:
         """Probe a ready server whose answers cannot be used: it may have another model now."""

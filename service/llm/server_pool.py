@@ -125,7 +125,7 @@ class ServerPool:
 
     def _first(self, mission_id: str, call: Call, uavs: int = 1) -> Answer:
         """The first answer of the ready servers."""
-        ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
+        ready = [each for each in self._each if each.status.llm == "ready" and each.abilities.max_uavs_per_call >= uavs]
         if len(ready) > 1:
             # A stable sort: where every server is full, the order is as without a limit.
             ready = sorted(self._ordered(mission_id, ready), key=self._reluctance)
@@ -164,7 +164,7 @@ class ServerPool:
         raise failure or NoDecision("llm_unavailable", "there is no server")
 
     def _reluctance(self, server: LlmServer) -> tuple[bool, bool]:
-        return server.usability.degraded is not None, self._calls[server] >= self._slots
+        return server.paused or server.usability.degraded is not None, self._calls[server] >= self._slots
 
     def _ordered(self, mission_id: str, servers: list[LlmServer]) -> list[LlmServer]:
         """Servers in a mission's order: the one of the settings, or by rendezvous hashing."""

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import ssl
+import time
+from collections.abc import Mapping
+from email.utils import parsedate_to_datetime
 from typing import Any
 
 import aiohttp
 
 _MOST = 200
 _READ = 8 * 1024
+_SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 480.0
 _KEYS = re.compile(r"(bearer\s+|\b(?:sk|key|hf|gsk|nvapi|xai|pk)[-_])[^\s\"'<>]+|(?<=://)[^\s/@]+@", re.IGNORECASE)
 _TAGS = re.compile(r"<(script|style).*?</\1>|<[^>]*>", re.IGNORECASE | re.DOTALL)
 
@@ -55,6 +60,20 @@ def _message(answer: Any) -> str:
             named = answer.get("param") or answer.get("loc")
             return f"{named}: {found}" if named and str(named) not in found else found
     return ""
+
+
+def pause_of(headers: Mapping[str, str]) -> float | None:
+    """Seconds of a refusal's ``Retry-After``, 0.1 to 480; None if there is none that can be read."""
+    value = headers.get("Retry-After", "")
+    try:
+        seconds = float(value)
+    except ValueError:
+        try:
+            until = parsedate_to_datetime(value)
+        except ValueError:
+            return None
+        seconds = until.timestamp() - time.time()
+    return min(max(seconds, _SHORTEST_PAUSE_S), _LONGEST_PAUSE_S) if math.isfinite(seconds) else None
 
 
 def connection_fault(error: aiohttp.ClientError | OSError | ValueError) -> str:

@@ -383,4 +383,6 @@ class Readiness(Wire):
     model: str | None = None
     standing_by: int = Field(0, description="further healthy LLM servers")
     constraint: str | None = Field(None, description="how the server constrains the LLM to the answer's form")
+    abilities: str | None = Field(None, description="what the LLM server can do, and the requests that it demands")
+    decision_ms: float | None = Field(None, description="duration of the decision by which the server was last probed")
     detail: str | None = None

@@ -294,3 +294,63 @@ def test_a_renamed_model_is_asked_for_again(edge: Edge, report: Report, monkeypa
         until(lambda: client.get("/readyz").json()["model"] == "new")
         assert wait_for(client, "ready")["detail"] is None
         assert client.post("/decide", json=report(step=5)).json()["source"] == "llm"
+
+
+@pytest.mark.parametrize("pause", ["0.2", "Sat, 28 Nov 2020 06:00:00 GMT"])
+def test_a_pause_that_the_deadline_leaves_time_for_is_obeyed(edge: Edge, report: Report, pause: str) -> None:
+    """429 with ``Retry-After``, in seconds or as a date: RFC 9110, 10.2.3; OpenAI, Anthropic and Azure send it."""
+    busy = False
+
+    def limits_its_rate(body: Body) -> Response | str:
+        nonlocal busy
+        busy = not busy and body["messages"][-1]["content"] not in ("Say hello.", FIRST)
+        return Response("{}", 429, {"Retry-After": pause}) if busy else "0 7"
+
+    with serving(Plain(limits_its_rate).app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1", deadline_ms=30_000)
+        wait_for(client, "ready")
+        sources = [client.post("/decide", json=report(step=step)).json()["source"] for step in range(3)]
+    assert sources == ["llm"] * 3
+
+
+def test_a_server_is_left_alone_for_the_pause_that_it_asks_for(edge: Edge, report: Report) -> None:
+    real = 0
+
+    def has_no_quota(body: Body) -> Response | str:
+        nonlocal real
+        if body["messages"][-1]["content"] in ("Say hello.", FIRST):
+            return "0 7"
+        real += 1
+        error = {"error": {"message": "You exceeded your current quota"}}
+        return JSONResponse(error, 429, {"Retry-After": "3600"})
+
+    with serving(Plain(has_no_quota).app) as url, serving(Plain(lambda body: "0 7").app) as spare:
+        alone = edge(mode="llm", llm_url=f"{url}/v1")
+        wait_for(alone, "ready")
+        answers = [alone.post("/decide", json=report(step=step)).json() for step in range(5)]
+        ready = wait_for(alone, "degraded")
+        pair = edge(mode="llm", llm_url=f"{url}/v1,{spare}/v1")
+        wait_for(pair, "ready")
+        sources = [pair.post("/decide", json=report(step=step)).json()["source"] for step in range(3)]
+    assert [answer["reason"] for answer in answers] == ["llm_status"] * 5
+    assert "exceeded your current quota (no requests for 480 s)" in ready["detail"]
+    assert sources == ["llm"] * 3
+    # One request of each edge.
+    assert real == 2
+
+
+def test_readyz_says_how_the_server_answers_and_what_it_demands(edge: Edge) -> None:
+    def thinks_at_length(body: Body) -> Response | str:
+        if "max_tokens" in body:
+            return refused("Use 'max_completion_tokens' instead of max_tokens.", "max_tokens")
+        if body["max_completion_tokens"] < 1024:
+            return JSONResponse({"choices": [{"message": {"content": ""}, "finish_reason": "length"}]})
+        return "<think>far</think>0 7"
+
+    with serving(Plain(thinks_at_length).app) as url:
+        ready = wait_for(edge(mode="llm", llm_url=f"{url}/v1"), "ready")
+    demands = "with max_completion_tokens, 1024 tokens of thought"
+    assert (
+        ready["abilities"] == f"answers as text that the edge checks, no token probabilities, one UAV a call; {demands}"
+    )
+    assert ready["decision_ms"] > 0

@@ -8,7 +8,7 @@ import pytest
 
 from service.llm.request_bodies import chat_body, label_body
 from service.llm.request_terms import RequestTerms
-from service.llm.server_words import excerpt
+from service.llm.server_words import excerpt, pause_of
 
 
 def body() -> dict[str, Any]:
@@ -77,3 +77,16 @@ def test_an_excerpt_is_short_readable_and_without_keys(content: bytes, expected:
     found = excerpt(content, ("private-1",))
     assert len(found) <= 200 and found.isprintable()
     assert expected is None or found == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "seconds"),
+    [("3", 3.0), ("0.5", 0.5), ("0", 0.1), ("-4", 0.1), ("1e9", 480.0), ("nan", None), ("soon", None), ("", None)],
+)
+def test_a_pause_is_bounded_and_nonsense_is_none(value: str, seconds: float | None) -> None:
+    assert pause_of({"Retry-After": value} if value else {}) == seconds
+
+
+def test_a_pause_may_be_a_date() -> None:
+    assert pause_of({"Retry-After": "Fri, 31 Dec 2100 23:59:59 GMT"}) == 480.0
+    assert pause_of({"Retry-After": "Fri, 31 Dec 1999 23:59:59 GMT"}) == 0.1
