@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ from simulator.sites.site import Site
 # The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
 if TYPE_CHECKING:
     from shared.planning.fleet_problem import FleetProblem
-    from simulator.bound.solver import News, Plan
+    from simulator.bound.solver import Plan
     from simulator.world.environment import PipelineWorld
 
 # For each flight tried in wind: the steps of its plans (None: all remaining ones), and the deterministic seconds of
@@ -25,9 +24,7 @@ if TYPE_CHECKING:
 _CHASES = ((10, 0.3), (None, 3.0))
 
 
-def clairvoyant(
-    site: Site, seed: int, time_limit_s: float = 60.0, workers: int = 8, on_news: Callable[[News], None] | None = None
-) -> Plan:
+def clairvoyant(site: Site, seed: int, time_limit_s: float = 60.0, workers: int = 8) -> Plan:
     """Bound one world with all its arrivals, links, wind and faults known.
 
     The bound omits batteries where a link's strength decides the energy of a packet, which can only lower it. The
@@ -38,7 +35,6 @@ def clairvoyant(
         seed: of the world.
         time_limit_s: of the search; the bound and the flight are valid whenever it ends, but depend on the machine.
         workers: threads of the solver, for worlds that one thread does not solve quickly.
-        on_news: called with each better plan or bound, from a thread of the solver.
 
     Raises:
         RuntimeError: the world lost another number of packets than the plan, so one of the two is wrong.
@@ -47,7 +43,7 @@ def clairvoyant(
     """
     from simulator.bound.solver import least_loss
 
-    return confirmed(site, seed, least_loss(problem_of(site, seed), time_limit_s, workers, on_news))
+    return confirmed(site, seed, least_loss(problem_of(site, seed), time_limit_s, workers))
 
 
 def confirmed(site: Site, seed: int, plan: Plan) -> Plan:

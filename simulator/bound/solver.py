@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -47,13 +47,6 @@ class Budget:
     work: float = math.inf
     seconds: float = math.inf
     workers: int = 1
-
-
-class News(NamedTuple):
-    """The progress of a search: the best plan's lost packets, as the model counts them, and the proven bound so far."""
-
-    lost_packets: float
-    lower_bound: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +92,6 @@ def plan(
     budget: Budget,
     links: Links = "exact",
     hint: IntArray | None = None,
-    on_news: Callable[[News], None] | None = None,
 ) -> Plan:
     """Search once.
 
@@ -109,7 +101,6 @@ def plan(
         links: how exactly to take the capacity of links; see :class:`~simulator.bound.formulation.Formulation`.
         hint: actions ``(H, I, 2)`` to start from, by default the greedy plan's. They become the plan unless the search
             finds better ones.
-        on_news: called with each better plan or bound, from a thread of the solver.
 
     Returns:
         The best plan found; otherwise the hint.
@@ -132,7 +123,7 @@ def plan(
         formulation.hint(best.actions)
         left = budget.seconds - (time.perf_counter() - begun)
         now = replace(budget, work=budget.work * share, seconds=max(left, 0.0))
-        search = _search(formulation, now, strategy, on_news)
+        search = _search(formulation, now, strategy)
         better = best if search.actions is None else min(best, _flown(problem, search.actions), key=_lost)
         best = replace(better, lower_bound=max(best.lower_bound, search.lower_bound))
         if search.proven or search.interrupted:
@@ -143,9 +134,7 @@ def plan(
     return best
 
 
-def least_loss(
-    problem: FleetProblem, seconds: float, workers: int = 8, on_news: Callable[[News], None] | None = None
-) -> Plan:
+def least_loss(problem: FleetProblem, seconds: float, workers: int = 8) -> Plan:
     """The plan of the fewest lost packets and the best bound that can be proven in about ``seconds``.
 
     The search starts from a greedy plan. It first searches quickly with uniform links, too strong for the bound and too
@@ -157,7 +146,7 @@ def least_loss(
     begun = time.perf_counter()
     start = best = _flown(problem, look_ahead(problem))
     try:
-        for best in _improved(problem, start, seconds, workers, on_news):
+        for best in _improved(problem, start, seconds, workers):
             if best.optimal:
                 break
     except KeyboardInterrupt:
@@ -165,9 +154,7 @@ def least_loss(
     return replace(best, seconds=time.perf_counter() - begun)
 
 
-def _improved(
-    problem: FleetProblem, best: Plan, seconds: float, workers: int, on_news: Callable[[News], None] | None
-) -> Iterator[Plan]:
+def _improved(problem: FleetProblem, best: Plan, seconds: float, workers: int) -> Iterator[Plan]:
     """The best plan and bound after each of several searches; Ctrl-C may interrupt the last one."""
     begun = time.perf_counter()
     quick = Budget(work=_QUICK_WORK)
@@ -187,7 +174,7 @@ def _improved(
             return
         now = replace(budget, seconds=max(left * share, 0.01))
         try:
-            found = plan(problem, now, links, best.actions, _of_all(on_news, best, links))
+            found = plan(problem, now, links, best.actions)
         except Interrupted as stopped:
             yield _better(best, stopped.plan, links)
             raise
@@ -224,19 +211,6 @@ def _better(best: Plan, found: Plan, links: Links) -> Plan:
     return replace(min(best, found, key=_lost), lower_bound=max(best.lower_bound, proven))
 
 
-def _of_all(on_news: Callable[[News], None] | None, best: Plan, links: Links) -> Callable[[News], None] | None:
-    """Turn the news of one search into news of all searches, without the promises of too strong or too weak links."""
-    if on_news is None:
-        return None
-
-    def pass_on(news: News) -> None:
-        lost = best.lost_packets if links == "hopeful" else min(best.lost_packets, news.lost_packets)
-        proven = best.lower_bound if links == "cautious" else max(best.lower_bound, news.lower_bound)
-        on_news(News(lost, proven))
-
-    return pass_on
-
-
 class _Search(NamedTuple):
     """The result of one run of the solver; ``actions`` is ``None`` if it found no plan."""
 
@@ -255,9 +229,7 @@ def _lost(plan: Plan) -> int:
     return plan.lost_packets
 
 
-def _search(
-    formulation: Formulation, budget: Budget, strategy: Mapping[str, Any], on_news: Callable[[News], None] | None
-) -> _Search:
+def _search(formulation: Formulation, budget: Budget, strategy: Mapping[str, Any]) -> _Search:
     from ortools.sat.python import cp_model
 
     solver = cp_model.CpSolver()
@@ -272,15 +244,9 @@ def _search(
     if budget.seconds < math.inf:
         solver.parameters.max_time_in_seconds = budget.seconds
 
-    class Listener(cp_model.CpSolverSolutionCallback):
-        def on_solution_callback(self) -> None:
-            if on_news is not None:
-                on_news(News(self.objective_value, self.best_objective_bound))
-
     # Python handles Ctrl-C, not the solver.
     solver.parameters.catch_sigint_signal = False
-    listener = Listener() if on_news is not None else None
-    status, stopped = _solved(solver, formulation.model, listener, budget)
+    status, stopped = _solved(solver, formulation.model, budget)
     found = status in (cp_model.OPTIMAL, cp_model.FEASIBLE)
     actions = formulation.actions(solver.value) if found else None
     # Lost packets are whole numbers; any fraction is the solver's rounding.
@@ -288,15 +254,15 @@ def _search(
     return _Search(actions, bound, status == cp_model.OPTIMAL, stopped)
 
 
-def _solved(solver: Any, model: Any, listener: Any, budget: Budget) -> tuple[Any, bool]:
+def _solved(solver: Any, model: Any, budget: Budget) -> tuple[Any, bool]:
     """The solver's status, and whether Ctrl-C ended the search.
 
     Python handles Ctrl-C only between instructions of the main thread, so a long search runs in another thread.
     """
     if budget.seconds == math.inf:
-        return solver.solve(model, listener), False
+        return solver.solve(model), False
     with ThreadPoolExecutor(1) as solving:
-        search = solving.submit(solver.solve, model, listener)
+        search = solving.submit(solver.solve, model)
         try:
             return search.result(), False
         except KeyboardInterrupt:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from rich.console import Console
 from tyro.conf import arg
@@ -14,10 +14,6 @@ from simulator.commands.options import check_between, check_seed, site_from_opti
 from simulator.commands.running import command_main
 from simulator.records.record import Record
 from simulator.records.run_folder import naming_out
-
-# The world and OR-Tools take seconds to import; `--help` and bad use answer without them.
-if TYPE_CHECKING:
-    from simulator.bound.solver import News
 
 
 @dataclass(frozen=True)
@@ -90,15 +86,9 @@ def _run(options: BoundOptions, console: Console) -> int:
     from simulator.flying.rollout import rollout
     from simulator.policies.registry import policy_named
 
-    with console.status("Searching for the best flight") as status:
-
-        def show_news(news: News) -> None:
-            status.update(
-                f"Searching: best so far {news.lost_packets:.0f}, proven at least {news.lower_bound:.0f} lost"
-            )
-
+    with console.status("Searching for the best flight; Ctrl-C ends the search"):
         try:
-            bound = clairvoyant(site, options.seed, options.time_limit_s, on_news=show_news)
+            bound = clairvoyant(site, options.seed, options.time_limit_s)
         except Interrupted as stopped:
             bound = confirmed(site, options.seed, stopped.plan)
     eof = sum(tally.lost_packets for tally in rollout(site.world(), policy_named("eof"), options.seed))
