@@ -37,10 +37,8 @@ class Site:
     sensor_names: tuple[str, ...] = ()
     fences: tuple[Fence, ...] = ()
 
-    def world(self, cost: Cost = "default", render_mode: str | None = None) -> PipelineWorld:
+    def world(self, cost: Cost = "default") -> PipelineWorld:
         """A new world on this site."""
         from simulator.world.environment import PipelineWorld
 
-        return PipelineWorld(
-            self.scenario, arrivals=self.arrivals, gains=self.gains, cost=cost, render_mode=render_mode
-        )
+        return PipelineWorld(self.scenario, arrivals=self.arrivals, gains=self.gains, cost=cost)

@@ -114,10 +114,11 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
 
     Raises:
         ValueError: ``step`` before ``reset`` or after the end, without an action of a live agent, or with an action out
-            of bounds (the world does not change then); ``render`` without ``render_mode="rgb_array"``; an unknown cost.
+            of bounds (the world does not change then); an unknown cost.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": ["rgb_array"], "render_fps": 4}
+    metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": []}
+    render_mode: str | None = None
 
     def __init__(
         self,
@@ -126,12 +127,10 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         arrivals: IntArray | None = None,
         gains: GainTrace | None = None,
         cost: Cost = "default",
-        render_mode: str | None = None,
     ) -> None:
         self.scenario = scenario
         self.arrivals = arrivals
         self.gains = gains
-        self.render_mode = render_mode
         self.possible_agents = [f"uav_{i}" for i in range(scenario.uavs)]
         self._index = {agent: uav for uav, agent in enumerate(self.possible_agents)}
         self.agents: list[str] = []
@@ -212,16 +211,6 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             ValueError: before the first ``reset``.
         """
         return np.asarray(self._worlds.state()[0])
-
-    def render(self) -> NDArray[np.uint8]:
-        """The map as an RGB image, shape ``(600, 600, 3)``: trajectories, UAVs, and sensors filled by their queues."""
-        if self.render_mode != "rgb_array":
-            raise ValueError(f"render_mode is {self.render_mode!r}: only 'rgb_array' can be rendered")
-        if not hasattr(self, "sensors"):
-            raise ValueError("render before reset")
-        from simulator.world.rendering import render_map
-
-        return render_map(self.scenario, len(self.tally), self.sensors, self.fleet)
 
     def _own(self, observed: Observation) -> dict[str, Observation]:
         """A copy of every live UAV's observation."""

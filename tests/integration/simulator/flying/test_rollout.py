@@ -112,8 +112,8 @@ class Watched(Site):
 
     made: list[PipelineWorld] = field(default_factory=list)
 
-    def world(self, cost: Cost = "default", render_mode: str | None = None) -> PipelineWorld:
-        self.made.append(super().world(cost, render_mode))
+    def world(self, cost: Cost = "default") -> PipelineWorld:
+        self.made.append(super().world(cost))
         return self.made[-1]
 
 

@@ -11,7 +11,6 @@ from pettingzoo.test import (  # type: ignore[import-untyped]
     max_cycles_test,
     parallel_api_test,
     parallel_seed_test,
-    render_test,
 )
 from pettingzoo.utils import parallel_to_aec  # type: ignore[import-untyped]
 
@@ -69,10 +68,6 @@ def test_pettingzoos_cycles() -> None:
         env=lambda max_cycles: parallel_to_aec(with_steps(max_cycles)),
     )
     max_cycles_test(made)
-
-
-def test_pettingzoos_rendering() -> None:
-    render_test(lambda render_mode: parallel_to_aec(PipelineWorld(SCENARIOS["pipeline"], render_mode=render_mode)))
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -351,16 +346,3 @@ def test_other_faults_have_clear_errors() -> None:
         PipelineWorld(cost="eq5")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="state before reset"):
         PipelineWorld().state()
-    with pytest.raises(ValueError, match="render before reset"):
-        PipelineWorld(render_mode="rgb_array").render()
-    with pytest.raises(ValueError, match="render_mode is None"):
-        small_world().render()
-
-
-def test_a_picture_shows_the_queues() -> None:
-    world = PipelineWorld(SMALL, render_mode="rgb_array")
-    world.reset(seed=0)
-    full = world.render()
-    step(world, (0, 0), (1, 0))
-    assert full.shape == (600, 600, 3)
-    assert np.count_nonzero(full != world.render()) > 100
