@@ -153,12 +153,12 @@ def simulate(options: Simulate, command: str, console: Console) -> int:
     )
     refuse_old_result(job.out, options.overwrite)
     metrics = FlightMetrics(site.scenario.steps)
-    with serve_metrics(metrics, options.metrics_host, options.metrics_port) as server:
+    with serve_metrics(metrics, options.metrics_host, options.metrics_port) as scrapes:
         code = run_mission(job, console, metrics=metrics)
         # All results are written: Ctrl-C only ends this wait.
-        if server is not None and code != INTERRUPTED:
+        if scrapes is not None and code != INTERRUPTED:
             with console.status("Waiting until Prometheus has the last numbers"), suppress(KeyboardInterrupt):
-                server.await_last_scrape()
+                scrapes.await_last()
     return code
 
 

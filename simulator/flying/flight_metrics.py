@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from socketserver import ThreadingMixIn
-from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from typing import TYPE_CHECKING
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, make_wsgi_app
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client.core import Metric
 from prometheus_client.process_collector import ProcessCollector
+from prometheus_client.registry import Collector
 
 from simulator.errors import UsageError
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from simulator.records.flight import Flight
 
 LONGEST_LAST_SCRAPE_S = 20.0
+# From the reading of the last numbers to the end of their answer.
+_ANSWER_S = 0.3
 _ROUND_TRIP_BUCKETS = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 3, 5, 10, 30, 60)
 
 
@@ -63,79 +65,28 @@ class FlightMetrics:
         self._flown.set(flight.steps_flown)
 
 
-class _Server(ThreadingMixIn, WSGIServer):
-    daemon_threads = True
+class Scrapes(Collector):
+    """Counts the scrapes of a registry, and has no numbers of its own."""
 
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self._scraped, self._any = threading.Event(), False
+        registry.register(self)
 
-class _Quiet(WSGIRequestHandler):
-    # Seconds until a silent connection is closed.
-    timeout = 10
+    def collect(self) -> Iterable[Metric]:
+        """Note a scrape."""
+        self._any = True
+        self._scraped.set()
+        return ()
 
-    def log_message(self, format: str, *args: object) -> None:
-        """Log no scrape."""
-
-
-class _CountedBody:
-    """A response body that calls ``on_sent`` after its last byte, when the server closes it."""
-
-    def __init__(self, body: Iterable[bytes], on_sent: Callable[[], None]) -> None:
-        self._body = body
-        self.close = on_sent
-
-    def __iter__(self) -> Iterator[bytes]:
-        return iter(self._body)
-
-
-class MetricsServer:
-    """An HTTP server in a thread that answers Prometheus and counts the scrapes.
-
-    Raises:
-        UsageError: the address is unusable or in use.
-    """
-
-    def __init__(self, registry: CollectorRegistry, host: str, port: int) -> None:
-        self._app = make_wsgi_app(registry)
-        self._scrapes = 0
-        self._scraped = threading.Condition()
-        try:
-            self._server = make_server(host, port, self._answer, server_class=_Server, handler_class=_Quiet)
-        except OSError as error:
-            raise UsageError(
-                f"--metrics-port {port} on {host}: {error.strerror}; choose another, or 0 for none"
-            ) from None
-        self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)
-        self._thread.start()
-
-    @property
-    def port(self) -> int:
-        """The port on which it listens."""
-        return self._server.server_port
-
-    def _answer(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        return _CountedBody(self._app(environ, start_response), self._count)
-
-    def _count(self) -> None:
-        with self._scraped:
-            self._scrapes += 1
-            self._scraped.notify_all()
-
-    def await_last_scrape(self) -> None:
+    def await_last(self) -> None:
         """Wait for one more scrape, if there was any, so that Prometheus has the flight's final numbers."""
-        deadline = time.monotonic() + LONGEST_LAST_SCRAPE_S
-        with self._scraped:
-            before = self._scrapes
-            while before and self._scrapes == before and (remaining_s := deadline - time.monotonic()) > 0:
-                self._scraped.wait(remaining_s)
-
-    def close(self) -> None:
-        """Stop the server and its thread."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+        self._scraped.clear()
+        if self._any and self._scraped.wait(LONGEST_LAST_SCRAPE_S):
+            time.sleep(_ANSWER_S)
 
 
 @contextmanager
-def serve_metrics(metrics: FlightMetrics, host: str, port: int) -> Iterator[MetricsServer | None]:
+def serve_metrics(metrics: FlightMetrics, host: str, port: int) -> Iterator[Scrapes | None]:
     """Within the context, serve the metrics to Prometheus; port 0 serves none.
 
     Raises:
@@ -144,8 +95,13 @@ def serve_metrics(metrics: FlightMetrics, host: str, port: int) -> Iterator[Metr
     if port == 0:
         yield None
         return
-    server = MetricsServer(metrics.registry, host, port)
+    scrapes = Scrapes(metrics.registry)
     try:
-        yield server
+        server, _ = start_http_server(port, host, metrics.registry)
+    except OSError as error:
+        raise UsageError(f"--metrics-port {port} on {host}: {error.strerror}; choose another, or 0 for none") from None
+    try:
+        yield scrapes
     finally:
-        server.close()
+        server.shutdown()
+        server.server_close()
