@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 import httpx
-from pydantic import ValidationError
 
 from field.lorawan.mqtt_metrics import MqttMetrics
 from field.lorawan.pending_readings import PendingReading, ReadingBuffer
-from shared.wire.problem import Problem
-from shared.wire.readings import MAX_AGE_S, ReadingsRequest, ReadingsResponse, SensorReading
+from shared.client.edge_client import EdgeClient
+from shared.client.errors import EdgeError, EdgeProtocolError, EdgeRefused
+from shared.wire.readings import MAX_AGE_S, ReadingResult, ReadingsRequest, SensorReading
 
 log = logging.getLogger(__name__)
 
@@ -23,18 +23,13 @@ _BATCH_SIZE = 500
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 30.0
 # Answers to readings that the edge can never take.
 _PERMANENT_STATUS = frozenset((400, 413, 415, 422))
-_MISDIRECTED = 421
-
-
-class EdgeUnavailable(Exception):
-    """The edge did not answer, or cannot serve now; the text says why."""
 
 
 class EdgeSender:
     """Sends the buffered readings to an edge; one thread uses it.
 
     Args:
-        edge: base URL, without a slash at its end.
+        edge: base URL.
         key: an API key with the scope ``readings``, if the edge needs one.
         retry_s: pause before readings of a mission that is unknown or has not begun are sent again.
     """
@@ -48,12 +43,8 @@ class EdgeSender:
         transport: httpx.BaseTransport | None = None,
         retry_s: float = 5.0,
     ) -> None:
-        headers = {"Content-Type": "application/json"} | ({} if key is None else {"Authorization": f"Bearer {key}"})
-        # A proxy named in the environment cannot reach an edge on this machine.
-        beyond = httpx.URL(edge).host not in ("localhost", "127.0.0.1", "::1")
-        self._http = httpx.Client(
-            base_url=edge, headers=headers, timeout=_TIMEOUT_S, transport=transport, trust_env=beyond
-        )
+        # A retry would send what is old by then: the next call sends the newest readings.
+        self._client = EdgeClient(edge, timeout_s=_TIMEOUT_S, attempts=1, api_key=key, transport=transport)
         self._pending = pending
         self._metrics = metrics
         self._retry_s = retry_s
@@ -63,7 +54,7 @@ class EdgeSender:
 
     def close(self) -> None:
         """Close the connections."""
-        self._http.close()
+        self._client.close()
 
     def send_pending(self) -> float:
         """Send all buffered readings once; returns the seconds to wait before the next call."""
@@ -79,7 +70,7 @@ class EdgeSender:
                         self._send(mission_id, readings[start : start + _BATCH_SIZE])
                     self._pause_s = 0.0
                 del due[mission_id]
-        except EdgeUnavailable as error:
+        except EdgeError as error:
             # The edge counts those that it already has as duplicates.
             for unsent in due.values():
                 self._pending.put_back(unsent)
@@ -90,38 +81,32 @@ class EdgeSender:
         return _FIRST_PAUSE_S
 
     def _send(self, mission_id: str, readings: Sequence[PendingReading]) -> None:
-        """Send readings of one mission, one by one where the edge refuses them together; raises ``EdgeUnavailable``."""
-        body = ReadingsRequest(readings=[_to_wire(reading) for reading in readings]).model_dump_json(exclude_none=True)
+        """Send readings of one mission, one by one where the edge refuses them together; raises ``EdgeError``."""
+        body = ReadingsRequest(readings=[_to_wire(reading) for reading in readings])
         try:
-            answer = self._http.post(f"/missions/{mission_id}/readings", content=body)
-            if answer.status_code == _MISDIRECTED and "Location" in answer.headers:
-                # Of several edges, another one has the mission.
-                answer = self._http.post(answer.headers["Location"], content=body)
-        except httpx.HTTPError as error:
-            raise EdgeUnavailable(str(error) or type(error).__name__) from None
-        # 409: the edge cannot load the mission from its store; only deleting the mission cures that.
-        if answer.status_code in (404, 409):
-            self._put_back(mission_id, readings, "no_mission")
-        elif answer.status_code in _PERMANENT_STATUS:
-            if len(readings) == 1:
-                self._count_refused(readings[0], answer)
+            answer = self._client.send_readings(mission_id, body)
+        except EdgeRefused as refused:
+            # 409: the edge cannot load the mission from its store; only deleting the mission cures that.
+            if refused.status in (404, 409):
+                self._put_back(mission_id, readings, "no_mission")
+            elif refused.status not in _PERMANENT_STATUS:
+                raise
+            elif len(readings) == 1:
+                self._count_refused(readings[0], refused)
             else:
                 for reading in readings:
                     self._send(mission_id, [reading])
-        elif answer.is_success:
-            self._count_results(mission_id, readings, answer)
         else:
-            raise EdgeUnavailable(f"{answer.status_code} {_problem(answer)}")
+            self._count_results(mission_id, readings, answer.results)
 
-    def _count_results(self, mission_id: str, readings: Sequence[PendingReading], answer: httpx.Response) -> None:
-        try:
-            results = ReadingsResponse.model_validate_json(answer.content).results
-            answered = list(zip(readings, results, strict=True))
-        except ValueError:
-            raise EdgeUnavailable("the answer has no result for each reading: is that an AIC-VDS edge?") from None
+    def _count_results(
+        self, mission_id: str, readings: Sequence[PendingReading], results: Sequence[ReadingResult]
+    ) -> None:
+        if len(results) != len(readings):
+            raise EdgeProtocolError("the answer has no result for each reading: is that an AIC-VDS edge?")
         early = []
         now = datetime.now(UTC)
-        for reading, result in answered:
+        for reading, result in zip(readings, results, strict=True):
             if result == "early":
                 early.append(reading)
                 continue
@@ -136,13 +121,13 @@ class EdgeSender:
         self._retry_at[mission_id] = time.monotonic() + self._retry_s
         self._pending.put_back(list(readings))
 
-    def _count_refused(self, reading: PendingReading, answer: httpx.Response) -> None:
+    def _count_refused(self, reading: PendingReading, refused: EdgeRefused) -> None:
         self._metrics.readings.labels("refused").inc()
         sensor = f"sensor {reading.sensor_id} of mission {reading.mission_id}"
         # A wrong mapping refuses every reading of its sensor; its first line in the log is enough.
         if sensor not in self._reported_sensors:
             self._reported_sensors.add(sensor)
-            log.warning("%s: the edge refuses its readings: %s", sensor, _problem(answer))
+            log.warning("%s: the edge refuses its readings: %s", sensor, refused.detail)
 
 
 def _to_wire(reading: PendingReading) -> SensorReading:
@@ -154,10 +139,3 @@ def _to_wire(reading: PendingReading) -> SensorReading:
         age_s=min(max(0.0, age_s), MAX_AGE_S),
         message_id=reading.message_id,
     )
-
-
-def _problem(answer: httpx.Response) -> str:
-    try:
-        return Problem.model_validate_json(answer.content).detail
-    except ValidationError:
-        return answer.text.strip()[:200]

@@ -129,7 +129,8 @@ def test_readings_go_to_the_edge_that_has_the_mission() -> None:
     def edges(request: httpx.Request) -> httpx.Response:
         asked.append(request.url.host)
         if request.url.host != "owner":
-            return httpx.Response(421, headers={"Location": f"http://owner:8000{request.url.path}"})
+            problem = {"title": "Misdirected", "status": 421, "detail": "there", "owner": "http://owner:8000"}
+            return httpx.Response(421, json=problem)
         assert request.headers["Authorization"] == "Bearer k3y"
         return httpx.Response(200, json={"results": ["merged"], "step": 3})
 
