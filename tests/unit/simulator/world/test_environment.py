@@ -1,18 +1,11 @@
-"""The world: PettingZoo's own tests, small worlds computed by hand, and faults."""
+"""The world: small worlds computed by hand, and faults."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from pettingzoo.test import (  # type: ignore[import-untyped]
-    max_cycles_test,
-    parallel_api_test,
-    parallel_seed_test,
-)
-from pettingzoo.utils import parallel_to_aec  # type: ignore[import-untyped]
 
 from shared.world.channel import channel_gain_db
 from shared.world.scenario import SCENARIOS, Scenario
@@ -47,41 +40,6 @@ def step(world: PipelineWorld, *actions: tuple[int, int]) -> Any:
 
 def with_steps(steps: int) -> PipelineWorld:
     return PipelineWorld(SMALL.model_copy(update={"steps": steps}))
-
-
-# ---- PettingZoo
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_pettingzoos_api(name: str) -> None:
-    parallel_api_test(PipelineWorld(SCENARIOS[name]), num_cycles=100)
-
-
-@pytest.mark.parametrize("name", ["paper", "field"])
-def test_pettingzoos_seeding(name: str) -> None:
-    parallel_seed_test(lambda: PipelineWorld(SCENARIOS[name]))
-
-
-def test_pettingzoos_cycles() -> None:
-    made = SimpleNamespace(
-        parallel_env=lambda max_cycles: with_steps(max_cycles),
-        env=lambda max_cycles: parallel_to_aec(with_steps(max_cycles)),
-    )
-    max_cycles_test(made)
-
-
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_observations_and_state_stay_inside_their_spaces(name: str) -> None:
-    world = PipelineWorld(SCENARIOS[name])
-    rng = np.random.default_rng(0)
-    observations, _ = world.reset(seed=1)
-    for _ in range(world.scenario.steps):
-        for agent, observation in observations.items():
-            for key, space in world.observation_space(agent).items():
-                assert space.contains(observation[key]), (agent, key)  # type: ignore[literal-required]
-        assert world.state_space.contains(world.state())
-        actions = {a: (rng.integers(world.scenario.sensors), rng.integers(15)) for a in world.agents}
-        observations, *_ = world.step(actions)
 
 
 # ---- one step, by hand

@@ -1,22 +1,50 @@
-"""The observation space of a world's UAV."""
+"""The simulated world as a PettingZoo environment, for learning policies."""
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
 from shared.world.channel import path_loss_db
-from shared.world.scenario import Scenario
-from shared.world.trajectory import Trajectory
+from shared.world.scenario import SCENARIOS, Scenario
+from shared.world.trajectory import Trajectory, trajectories
+from simulator.world.environment import PipelineWorld
+from simulator.world.observation import Cost, Observation
 from simulator.world.true_channel import LOSS_BOUNDS_DB, mean_only
 from simulator.world.truth import LARGEST_ERROR
 
 
-def observation_space(scenario: Scenario, path: Trajectory, recorded_gains: bool) -> spaces.Dict:
-    """The space of :class:`simulator.world.PipelineWorld` for a UAV on that trajectory."""
+class PettingZooWorld(PipelineWorld, ParallelEnv[str, Observation, NDArray[np.int64]]):  # type: ignore[misc]
+    """:class:`PipelineWorld` as a ``ParallelEnv`` with spaces; the action mask is in the infos."""
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "pipeline_v0", "render_modes": []}
+    render_mode: str | None = None
+
+    def __init__(self, scenario: Scenario = SCENARIOS["paper"], *, cost: Cost = "default") -> None:
+        super().__init__(scenario, cost=cost)
+        self.state_space = spaces.Box(-np.inf, np.inf, (1 + 2 * scenario.uavs + 4 * scenario.sensors,), np.float32)
+        self._spaces = dict(
+            zip(self.possible_agents, (_space(scenario, path) for path in trajectories(scenario)), strict=True)
+        )
+        self._actions = spaces.MultiDiscrete([scenario.sensors, scenario.max_velocity + 1])
+
+    def observation_space(self, agent: str) -> spaces.Dict:
+        """The agent's observation space; the trajectories, hence the bounds of ``position``, differ between agents."""
+        return self._spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.MultiDiscrete:
+        """The agent's action space."""
+        return self._actions
+
+
+def _space(scenario: Scenario, path: Trajectory) -> spaces.Dict:
+    """The observation space of a UAV on that trajectory."""
     count = scenario.sensors
-    modelled = mean_only(scenario) and not recorded_gains
-    quietest, loudest = _gain_bounds(scenario) if modelled else (-LOSS_BOUNDS_DB[1], -LOSS_BOUNDS_DB[0])
+    quietest, loudest = _gain_bounds(scenario) if mean_only(scenario) else (-LOSS_BOUNDS_DB[1], -LOSS_BOUNDS_DB[0])
     # The wind carries a UAV at most twice as far as still air would let it fly.
     stretch = 2.0 if scenario.wind_mps or scenario.gust_mps else 1.0
     farthest = path.length_m + stretch * scenario.steps * scenario.max_velocity * scenario.step_s

@@ -1,0 +1,53 @@
+"""The world in PettingZoo's own tests, and its spaces."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pettingzoo.test import (  # type: ignore[import-untyped]
+    max_cycles_test,
+    parallel_api_test,
+    parallel_seed_test,
+)
+from pettingzoo.utils import parallel_to_aec  # type: ignore[import-untyped]
+
+from lab.pettingzoo_world import PettingZooWorld
+from shared.world.scenario import SCENARIOS
+
+
+def with_steps(steps: int) -> PettingZooWorld:
+    return PettingZooWorld(SCENARIOS["paper"].model_copy(update={"steps": steps}))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_pettingzoos_api(name: str) -> None:
+    parallel_api_test(PettingZooWorld(SCENARIOS[name]), num_cycles=100)
+
+
+@pytest.mark.parametrize("name", ["paper", "field"])
+def test_pettingzoos_seeding(name: str) -> None:
+    parallel_seed_test(lambda: PettingZooWorld(SCENARIOS[name]))
+
+
+def test_pettingzoos_cycles() -> None:
+    made = SimpleNamespace(
+        parallel_env=lambda max_cycles: with_steps(max_cycles),
+        env=lambda max_cycles: parallel_to_aec(with_steps(max_cycles)),
+    )
+    max_cycles_test(made)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_observations_and_state_stay_inside_their_spaces(name: str) -> None:
+    world = PettingZooWorld(SCENARIOS[name])
+    rng = np.random.default_rng(0)
+    observations, _ = world.reset(seed=1)
+    for _ in range(world.scenario.steps):
+        for agent, observation in observations.items():
+            for key, space in world.observation_space(agent).items():
+                assert space.contains(observation[key]), (agent, key)  # type: ignore[literal-required]
+        assert world.state_space.contains(world.state())
+        actions = {a: (rng.integers(world.scenario.sensors), rng.integers(15)) for a in world.agents}
+        observations, *_ = world.step(actions)
