@@ -28,7 +28,7 @@ from simulator.flying.job import new_mission_id
 from simulator.records.decision import Decision
 from simulator.records.mission_logs import read_decisions, read_requests
 from simulator.records.run_folder import DECISIONS, REQUESTS, fresh_folder, naming_out, refuse_old_result
-from simulator.reporting.replay_agreement import Compared, Prices, ReplaySummary, agreement, by_source, show, side
+from simulator.reporting.replay_agreement import Compared, ReplaySummary, agreement, by_source, show, side
 
 REPLAY, REPLAYED = "replay.json", "replayed.jsonl"
 
@@ -50,10 +50,6 @@ class Replay:
       aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value --top-k 3
 
       aicvds replay runs/first --edge http://127.0.0.1:8000 --mode value
-
-    With the costs of both missions at a provider's prices:
-
-      aicvds replay runs/first --edge URL --price-input 0.15 --price-cached 0.075 --price-output 0.6
 
     No UAV flies: the states are the logged ones, whatever the new decisions. A replay therefore measures agreement,
     tokens, latency and cost, and no losses. A logged outcome is fed back only if the decision is the same; the cost of
@@ -89,12 +85,6 @@ class Replay:
     """Worked examples in the prompt, 0 to 20."""
     deadline_ms: Annotated[int | None, arg(metavar="MS", help_behavior_hint="")] = None
     """Milliseconds that the edge may take for one decision, 10 to 60000. Default: as in each request."""
-    price_input: Annotated[float | None, arg(metavar="USD", help_behavior_hint="")] = None
-    """US dollars a million prompt tokens. Default: the cost is each edge's estimate by its own prices."""
-    price_cached: Annotated[float | None, arg(metavar="USD", help_behavior_hint="")] = None
-    """US dollars a million prompt tokens read from a prefix cache. Default: --price-input."""
-    price_output: Annotated[float | None, arg(metavar="USD", help_behavior_hint="")] = None
-    """US dollars a million tokens of the answer. Default: --price-input."""
     wait_s: Annotated[float, arg(metavar="S")] = 120.0
     """Seconds to wait for the edge and its LLM."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
@@ -168,7 +158,7 @@ def replay(options: Replay, command: str, console: Console) -> int:
         replayer = Replayer(client, mission_id, options.deadline_ms)
         code = _replay_all(replayer, logged, out, console)
     facts = {"run": str(options.run), "edge": edge, "mission_id": mission_id, "command": command}
-    summary = summarise(logged, spec, replayer.compared, prices(options), **facts)
+    summary = summarise(logged, spec, replayer.compared, **facts)
     with naming_out(out):
         (out / REPLAY).write_text(summary.model_dump_json(indent=2) + "\n", encoding="utf-8")
     show(summary, console)
@@ -177,9 +167,7 @@ def replay(options: Replay, command: str, console: Console) -> int:
     return code
 
 
-def summarise(
-    logged: LoggedMission, spec: MissionSpec, compared: list[Compared], prices: Prices | None, **facts: str
-) -> ReplaySummary:
+def summarise(logged: LoggedMission, spec: MissionSpec, compared: list[Compared], **facts: str) -> ReplaySummary:
     """The summary of a replay with ``spec``."""
     return ReplaySummary(
         **facts,
@@ -191,8 +179,8 @@ def summarise(
         outcomes_fed_back=sum(c.fed_back for c in compared),
         agreement=agreement(compared),
         by_source=by_source(compared),
-        logged=side([c.logged for c in compared], prices),
-        replayed=side([c.replayed for c in compared], prices),
+        logged=side([c.logged for c in compared]),
+        replayed=side([c.replayed for c in compared]),
     )
 
 
@@ -273,21 +261,6 @@ def check(options: Replay) -> None:
     """Raises ``UsageError`` for the first option out of bounds."""
     check_wait(options.wait_s)
     check_deadline(options.deadline_ms)
-    for name in ("input", "cached", "output"):
-        price = getattr(options, f"price_{name}")
-        if price is not None and not 0 <= price < float("inf"):
-            raise UsageError(f"--price-{name} {price:g} is not at least 0")
-        if price is not None and options.price_input is None:
-            raise UsageError(f"--price-{name} needs --price-input")
-
-
-def prices(options: Replay) -> Prices | None:
-    """The prices of the options, if any."""
-    if options.price_input is None:
-        return None
-    cached = options.price_input if options.price_cached is None else options.price_cached
-    output = options.price_input if options.price_output is None else options.price_output
-    return Prices(options.price_input, cached, output)
 
 
 def apply_options(spec: MissionSpec, options: Replay) -> MissionSpec:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
@@ -18,8 +17,6 @@ from simulator.records.summary import BySource, RoundTrips, round_trips, sources
 
 # The largest difference of velocities that agree, m/s.
 CLOSE_MPS = 1
-# The tokens of an answer for which the LLM's server gives no count: two numbers and a space.
-_ANSWER_TOKENS = 5
 
 
 class Compared(Record):
@@ -56,8 +53,8 @@ class Side(Record):
     """One of the two missions: the sources of its decisions, and means over the edge's decisions.
 
     ``prompt_tokens`` is the edge's count. Fields with ``llm_`` are the LLM server's counts, and ``llm_new_tokens`` are
-    the tokens not read from its prefix cache. ``cost_usd`` is the estimate for all decisions together; None without
-    prices.
+    the tokens not read from its prefix cache. ``cost_usd`` is the edge's estimate for all decisions together,
+    by its prices (``AICVDS_PRICE_INPUT`` and others).
     """
 
     by_source: BySource
@@ -94,29 +91,6 @@ class ReplaySummary(Record):
     replayed: Side
 
 
-@dataclass(frozen=True)
-class Prices:
-    """US dollars a million tokens of the prompt, the cached prompt and the completion."""
-
-    prompt: float
-    cached: float
-    completion: float
-
-    def of(self, decision: Decision) -> float:
-        """The cost of a decision's LLM query, 0 without one.
-
-        The token counts are the server's where available, otherwise the edge's with nothing cached and a usual answer.
-        """
-        tokens = decision.tokens
-        if tokens is None or not queried_llm(decision):
-            return 0.0
-        prompt = tokens.server_prompt if tokens.server_prompt is not None else tokens.prompt
-        cached = tokens.cached or 0
-        completion = tokens.completion if tokens.completion is not None else _ANSWER_TOKENS
-        fresh = (prompt - cached) * self.prompt
-        return (fresh + cached * self.cached + completion * self.completion) / 1e6
-
-
 def agreement(compared: Sequence[Compared]) -> ReplayAgreement:
     """The agreement over all pairs."""
     sensor = [c.logged.sensor_id == c.replayed.sensor_id for c in compared]
@@ -133,10 +107,11 @@ def by_source(compared: Sequence[Compared]) -> dict[str, ReplayAgreement]:
     return {name: agreement([c for c in compared if c.replayed.source == name]) for name, _ in sources.most_common()}
 
 
-def side(decisions: Sequence[Decision], prices: Prices | None) -> Side:
-    """The statistics of one mission; without prices, the cost is the edge's estimate."""
+def side(decisions: Sequence[Decision]) -> Side:
+    """The statistics of one mission."""
     tokens = [d.tokens for d in decisions if d.tokens is not None]
     counted = [t for t in tokens if t.server_prompt is not None]
+    costs = [t.cost_usd for t in tokens if t.cost_usd is not None]
     return Side(
         by_source=BySource.model_validate(Counter(d.source for d in decisions)),
         by_reason=dict(sorted(Counter(d.reason for d in decisions if d.reason is not None).items())),
@@ -147,15 +122,8 @@ def side(decisions: Sequence[Decision], prices: Prices | None) -> Side:
         llm_completion_tokens=mean([t.completion for t in counted if t.completion is not None]),
         rtt_ms=round_trips(decisions),
         llm_asked=sum(map(queried_llm, decisions)),
-        cost_usd=_cost(decisions, prices),
+        cost_usd=sum(costs) if costs else None,
     )
-
-
-def _cost(decisions: Sequence[Decision], prices: Prices | None) -> float | None:
-    if prices is not None:
-        return sum(map(prices.of, decisions))
-    estimates = [d.tokens.cost_usd for d in decisions if d.tokens is not None and d.tokens.cost_usd is not None]
-    return sum(estimates) if estimates else None
 
 
 def _pct(agree: Sequence[bool]) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from simulator.records.decision import Decision
-from simulator.reporting.replay_agreement import Compared, Prices, agreement, side
+from simulator.reporting.replay_agreement import Compared, agreement
 
 
 def decision(sensor: int, velocity: int, **changes: Any) -> Decision:
@@ -21,7 +21,3 @@ def test_velocities_a_metre_a_second_apart_agree() -> None:
     assert (found.sensor_pct, found.velocity_pct, found.both_pct) == (75, 75, 50)
     assert [c.same for c in compared] == [True, False, False, False]
     assert agreement([]).both_pct is None
-
-
-def test_a_decision_without_an_llm_query_has_no_cost() -> None:
-    assert side([decision(1, 7, source="value", reason="mode_value")], Prices(1, 1, 1)).cost_usd == 0
