@@ -30,6 +30,7 @@ from rich.progress import track
 from lab.experiments.edges import Llm, edge_for
 from lab.experiments.intervals import interval, paired
 from lab.experiments.schemes import OFF
+from lab.formula_planner import FormulaPlanner
 from shared.client.edge_client import EdgeClient
 from shared.world.actions import Action
 from shared.world.channel import FloatArray
@@ -152,7 +153,7 @@ def flown(url: str, site: Site, seed: int) -> dict[str, int]:
         pilot.spec = pilot.spec.model_copy(update={"mode": "policy"})
         client.put_mission(f"trace-{seed}", pilot.spec)
         policy = fly(site, pilot, seed).tally
-    on_board = {name: policy_named(name) for name in ("mpc", "mpc_formula")} | dict(heuristics())
+    on_board = {"mpc": policy_named("mpc"), "mpc_formula": FormulaPlanner(), **dict(heuristics())}
     tallies = {name: rollout(site.world(), scheme, seed) for name, scheme in on_board.items()}
     return {name: sum(step.lost_packets for step in tally) for name, tally in {"policy": policy, **tallies}.items()}
 

@@ -54,7 +54,8 @@ class Explore:
 
     With `--edge` the UAVs fly that edge's decisions, and the teacher's action in each state is recorded beside them.
     So an LLM learns from the states that its own decisions bring about (DAgger, Ross et al. 2011). With `--policy` they
-    fly that policy's: `mpc_formula` believes in the formulas' links and so brings about failures that a teacher avoids.
+    fly that policy's: `lab.formula_planner:FormulaPlanner` believes in the formulas' links and so brings about failures
+    that a teacher avoids.
     """
 
     out: Annotated[Path, arg(metavar="FILE")]
@@ -72,7 +73,7 @@ class Explore:
     edge: Annotated[str | None, arg(metavar="URL")] = None
     """An edge whose decisions are flown, in the edge's own mode, such as http://127.0.0.1:8000."""
     policy: Annotated[str | None, arg(metavar="NAME")] = None
-    """A policy whose decisions are flown, such as mpc_formula."""
+    """A policy whose decisions are flown, such as mpc, or MODULE:CLASS."""
     workers: Annotated[int, arg(metavar="N")] = 1
     """Processes that fly the worlds, 1 to 64."""
     ray: Annotated[str | None, arg(metavar="local|HOST:PORT", help_behavior_hint="")] = None

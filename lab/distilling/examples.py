@@ -32,9 +32,9 @@ from shared.world.channel import FloatArray
 _REFERENCE_SHARE = 0.6
 # Packets of regret that make an action e times less likely.
 _TEMPERATURE = 1.0
-# The share that remains to a sensor whose newest experience is a failure that was not expected. In missions that
-# `mpc_formula` flew, such a sensor failed again in 78 and 66% of the cases after one failure (`faulty`, `shadowed`), in
-# 93 and 85% after two, and in 100 and 93% after more.
+# The share that remains to a sensor whose newest experience is a failure that was not expected. In missions that the
+# planner without learning flew, such a sensor failed again in 78 and 66% of the cases after one failure (`faulty`,
+# `shadowed`), in 93 and 85% after two, and in 100 and 93% after more.
 _AFTER_FAILURE = 0.15
 
 

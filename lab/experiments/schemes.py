@@ -92,7 +92,8 @@ _POLICY_LABELS = {
     "round_robin": "round robin",
     "random": "random",
 }
-_LEARNED = {name: f"lab.marl.learned:{name}" for name in ("madqn", "mappo")}
+_OF_THE_LAB = {name: f"lab.marl.learned:{name}" for name in ("madqn", "mappo")}
+_OF_THE_LAB[FORMULA_PLANNER] = "lab.formula_planner:FormulaPlanner"
 # Only the experiments that name them fly these.
 _NAMED_ONLY = (FORMULA_PLANNER,)
 BOUND = Scheme(name="bound", label="clairvoyant bound", decides=Clairvoyant())
@@ -101,7 +102,7 @@ INFORMED = Scheme(name="informed", label="MPC, told the true links", decides=Inf
 
 def local(name: str) -> Scheme:
     """The policy of that name."""
-    return Scheme(name=name, label=_POLICY_LABELS.get(name, name), decides=Local(policy=_LEARNED.get(name, name)))
+    return Scheme(name=name, label=_POLICY_LABELS.get(name, name), decides=Local(policy=_OF_THE_LAB.get(name, name)))
 
 
 def at_full_speed(name: str) -> Scheme:
@@ -114,7 +115,7 @@ def available_locals(*names: str) -> list[Scheme]:
     """The local policies of ``names`` that this version has, in display order; without names, all but variants."""
     from simulator.policies.registry import POLICY_NAMES
 
-    known = {*_LEARNED, *POLICY_NAMES}
+    known = {*_OF_THE_LAB, *POLICY_NAMES}
     every = (*_POLICY_LABELS, *(name for name in POLICY_NAMES if name not in _POLICY_LABELS))
     wanted = names or tuple(name for name in every if name not in _NAMED_ONLY)
     return [local(name) for name in wanted if name in known]

@@ -80,7 +80,7 @@ class Simulate:
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
     """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
     (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a planner, extra `planner`),
-    mpc_formula (the same without learning), or a class of your own as MODULE:CLASS."""
+    or a class of your own as MODULE:CLASS."""
     mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None
     """The edge's mode: llm (the paper's method), guided (the LLM among other advisers), value (the learned modules) or
     policy (the planner). Default: the edge's."""

@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared.belief.arrivals import Arrivals
-from shared.belief.drift import Drift
 from shared.belief.fleet_belief import FleetBelief
-from shared.belief.gain_measurements import NOTHING_MEASURED, Measured
 from shared.planning.receding import Draft, RecedingHorizon
 from shared.world.actions import Action
-from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
-from shared.world.trajectory import Trajectory
 from simulator.policies.reach import longest_unheard
 from simulator.world.observation import Observation
 
@@ -69,37 +64,3 @@ class RecedingHorizonPolicy:
         if draft is not None:
             self._planner.adopt(draft, draft.search())
         return self._planner.action(uav, taken)
-
-
-class _MeanArrivals(Arrivals):
-    def take(self, ids: IntArray, came: FloatArray, steps: IntArray, at: IntArray) -> None:
-        """Every sensor's rate stays the scenario's mean."""
-
-
-class _NoDrift(Drift):
-    def learn(self, path: Trajectory, start_m: float, still_m: float, end_m: float) -> None:
-        """A UAV is expected to fly its velocity times the step."""
-
-
-class _FormulaBelief(FleetBelief):
-    """The beacons' queues and the UAVs' positions; links, rates and ways are the formulas'."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        super().__init__(scenario)
-        self.arrivals = _MeanArrivals(scenario)
-        self.drift = _NoDrift()
-
-    def measure(self, uav: int, ids: IntArray, gain_db: FloatArray) -> Measured:
-        """A link has the mean path loss, whatever gain was measured."""
-        return NOTHING_MEASURED
-
-    def settle(self, uav: int, step: int, failed: bool) -> None:
-        """A transfer is what was planned, until a beacon says otherwise."""
-
-
-class FormulaPlanner(RecedingHorizonPolicy):
-    """The planner of ``mpc`` with the model that it starts with: its channel, drift and arrivals never learn."""
-
-    def new_belief(self, scenario: Scenario) -> FleetBelief:
-        """A belief that takes no measurement and no outcome."""
-        return _FormulaBelief(scenario)

@@ -14,7 +14,7 @@ from simulator.policies.hand_written import (
     RoundRobin,
     WeightedQueueChannel,
 )
-from simulator.policies.mpc import FormulaPlanner, RecedingHorizonPolicy
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.policies.policy import Policy
 
 _POLICIES: dict[str, Callable[[], Policy]] = {
@@ -25,7 +25,6 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "max_gain": MaximumGain,
     "nearest": NearestNeighbour,
     "mpc": RecedingHorizonPolicy,
-    "mpc_formula": FormulaPlanner,
 }
 POLICY_NAMES: tuple[str, ...] = tuple(_POLICIES)
 

@@ -53,7 +53,6 @@ def test_an_unknown_policy_lists_the_known_ones() -> None:
         "max_gain",
         "nearest",
         "mpc",
-        "mpc_formula",
     )
     with pytest.raises(
         ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs, max_gain"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lab.formula_planner import FormulaPlanner
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
-from simulator.policies.mpc import FormulaPlanner, RecedingHorizonPolicy
+from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 
 pytestmark = pytest.mark.usefixtures("brief")
