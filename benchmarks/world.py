@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.harness import Goal, Options, Report, run
+from lab.training_worlds import drawn
 from shared.world.scenario import Scenario, scenario_named
 from simulator.world.batch import Draw, VectorWorld
 from simulator.world.environment import PipelineWorld
@@ -44,7 +45,7 @@ def measure(args: World) -> Report:
     sensors = rng.integers(scenario.sensors, size=shape)
     velocities = rng.integers(scenario.max_velocity + 1, size=shape)
     began = time.process_time()
-    draw = Draw.of(scenario, range(args.worlds))
+    draw = drawn(scenario, range(args.worlds))
     draw_us = (time.process_time() - began) / args.worlds * 1e6
     batch_s = min(_batch(scenario, draw, sensors, velocities) for _ in range(args.rounds))
     single_s = min(_single(scenario, n, sensors[:, 0], velocities[:, 0]) for n in range(10 * args.rounds))
@@ -69,7 +70,7 @@ def _batch(scenario: Scenario, draw: Draw, sensors: NDArray[np.int64], velocitie
     """Seconds of one mission of every world."""
     world = VectorWorld(scenario)
     world.start(draw)
-    return _timed(lambda: [world.step(*pair) for pair in zip(sensors, velocities, strict=True)])
+    return _timed(lambda: [world.fly(*pair) for pair in zip(sensors, velocities, strict=True)])
 
 
 def _single(scenario: Scenario, seed: int, sensors: NDArray[np.int64], velocities: NDArray[np.int64]) -> float:

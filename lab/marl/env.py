@@ -12,8 +12,8 @@ from torchrl.data import Binary, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
 from lab.marl.network_inputs import fleet_input, width
+from lab.training_worlds import TrainingWorlds, state_of
 from shared.world.scenario import Scenario
-from simulator.world.batch import VectorWorld
 from simulator.world.observation import Cost, Observation
 
 
@@ -40,7 +40,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
     def __init__(self, scenario: Scenario, worlds: int, first_seed: int, cost: Cost) -> None:
         super().__init__(device="cpu", batch_size=[worlds])
         self.next_seed = first_seed
-        self._world = VectorWorld(scenario, cost=cost)
+        self._world = TrainingWorlds(scenario, cost=cost)
         self._order: NDArray[np.int64]
         uavs, choices = scenario.uavs, [scenario.sensors, scenario.max_velocity + 1]
         team = (worlds, uavs)
@@ -85,7 +85,7 @@ class PipelineEnv(EnvBase):  # type: ignore[misc]
         return TensorDict(
             {
                 "agents": TensorDict(agents, views.order.shape[:2]),
-                "state": torch.from_numpy(self._world.state()),
+                "state": torch.from_numpy(state_of(self._world)),
                 "lost_packets": torch.from_numpy(lost.astype(np.float32)[:, None]),
                 "done": over,
                 "terminated": over.clone(),

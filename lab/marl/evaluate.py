@@ -9,9 +9,9 @@ from torch import nn
 
 from lab.marl.network_inputs import actor_input, mask_without, uav_slice
 from lab.marl.networks import greedy
+from lab.training_worlds import TrainingWorlds
 from shared.world.channel import IntArray
 from shared.world.scenario import Scenario
-from simulator.world.batch import VectorWorld
 
 
 def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -> IntArray:
@@ -19,7 +19,7 @@ def lost_packets(scenario: Scenario, network: nn.Module, seeds: Sequence[int]) -
 
     UAV 0 decides first, and no UAV takes a sensor that an earlier one took.
     """
-    world = VectorWorld(scenario)
+    world = TrainingWorlds(scenario)
     observation = world.reset(seeds)
     rows = np.arange(len(seeds))
     lost = np.zeros(len(seeds), dtype=np.int64)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from shared.world.channel import FloatArray, IntArray, Links
 from shared.world.scenario import SCENARIOS, Scenario
@@ -64,11 +63,6 @@ class Draw:
     truth: Truth
 
     @classmethod
-    def of(cls, scenario: Scenario, seeds: Sequence[int]) -> Draw:
-        """The worlds of these seeds."""
-        return stacked([cls.one(scenario, np.random.SeedSequence(int(seed))) for seed in seeds])
-
-    @classmethod
     def one(
         cls,
         scenario: Scenario,
@@ -102,15 +96,14 @@ class VectorWorld:
 
     All worlds have the scenario's T steps and end together. The entries of an observation have leading dimensions
     ``(B, I)``; those of a UAV that left mean nothing. They are the world's own arrays, not copies, and are valid until
-    the next ``step``. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B worlds the true
+    the next step. Attributes besides ``scenario`` and ``cost``: ``steps_flown``, and of the B worlds the true
     ``sensors`` and the ``fleet``.
 
     Args:
         cost: the negative of the reward; see :class:`PipelineWorld`.
 
     Raises:
-        ValueError: ``step`` before ``reset`` or past step T, actions of another shape or out of bounds, or an unknown
-            cost.
+        ValueError: an unknown cost.
     """
 
     def __init__(self, scenario: Scenario = SCENARIOS["paper"], *, cost: Cost = "default") -> None:
@@ -122,10 +115,6 @@ class VectorWorld:
         self.sensors: Sensors
         self.fleet: Fleet
         self._truth: Truth | None = None
-
-    def reset(self, seeds: Sequence[int]) -> Observation:
-        """Draw one world a seed, and return the first observations."""
-        return self.start(Draw.of(self.scenario, seeds))
 
     def start(self, draw: Draw) -> Observation:
         """Begin B worlds that are drawn already, and return the first observations."""
@@ -142,23 +131,13 @@ class VectorWorld:
         self._surveyed = np.broadcast_to(draw.sensors.positions[:, None], (*shape, 2))
         return self._observe(*self._links(draw.truth))
 
-    def step(self, sensors: ArrayLike, velocities: ArrayLike) -> tuple[Observation, BatchStep]:
+    def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[Observation, BatchStep]:
         """Fly one step of every world.
 
         Args:
-            sensors: the sensor that each UAV collects from, integers ``(B, I)``.
-            velocities: of each UAV, m/s, integers ``(B, I)``.
+            chosen: the sensor that each UAV collects from, ``(B, I)``, in 0..J - 1.
+            velocity: of each UAV, m/s, ``(B, I)``, within the scenario's.
         """
-        if self._truth is None:
-            raise ValueError("step before reset")
-        if self.steps_flown == self.scenario.steps:
-            raise ValueError("step after the mission's end: reset first")
-        last_sensor, fastest = self.scenario.sensors - 1, self.scenario.max_velocity
-        chosen = self._checked("sensors", np.asarray(sensors), last_sensor)
-        return self.fly(chosen, self._checked("velocities", np.asarray(velocities), fastest))
-
-    def fly(self, chosen: IntArray, velocity: IntArray) -> tuple[Observation, BatchStep]:
-        """As :meth:`step`, of actions known to be right."""
         assert self._truth is not None
         truth, fleet, ground = self._truth, self.fleet, self.sensors
         scenario, step = self.scenario, self.steps_flown
@@ -180,33 +159,6 @@ class VectorWorld:
             cost = failed + blamed / scenario.queue_capacity
         outcome = BatchStep(failed, moved, blamed, -cost, overflows, lost_packets, collected)
         return self._observe(position, links), outcome
-
-    def state(self) -> NDArray[np.float32]:
-        """``PipelineWorld.state()`` of every world, ``(B, 1 + 2 I + 4 J)``.
-
-        Raises:
-            ValueError: before the first ``reset``.
-        """
-        if self._truth is None:
-            raise ValueError("state before reset")
-        sensors, side = self.sensors, self.scenario.area_m
-        worlds = len(sensors.queue)
-        parts = (
-            np.full((worlds, 1), self.steps_flown / self.scenario.steps),
-            (self.fleet.positions / side).reshape(worlds, -1),
-            (sensors.positions / side).reshape(worlds, -1),
-            sensors.queue / self.scenario.queue_capacity,
-            sensors.battery / self.scenario.battery_j,
-        )
-        return np.concatenate(parts, axis=1).astype(np.float32)
-
-    def _checked(self, name: str, values: IntArray, last: int) -> IntArray:
-        shape = self.fleet.start_m.shape
-        if values.shape != shape or values.dtype.kind not in "iu":
-            raise ValueError(f"{name} of shape {values.shape} and type {values.dtype}, not integers {shape}")
-        if values.min() < 0 or values.max() > last:
-            raise ValueError(f"{name} are not all in 0..{last}")
-        return values.astype(np.int64, copy=False)
 
     def _links(self, truth: Truth) -> tuple[FloatArray, Links]:
         """The UAVs' positions, and the links of every UAV to every sensor, ``(B, I, J)``."""

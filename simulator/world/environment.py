@@ -179,17 +179,6 @@ class PipelineWorld:
         """The index of each live agent's UAV, in their order."""
         return {agent: self._index[agent] for agent in self.agents}
 
-    def state(self) -> NDArray[np.float32]:
-        """The true state for centralised critics, flat float32 of length ``1 + 2 I + 4 J``.
-
-        In this order: step / T; UAV positions / area side (x, y of ``uav_0``, ...); sensor positions / area
-        side (x, y of sensor 0, ...); queues / W; batteries / initial battery.
-
-        Raises:
-            ValueError: before the first ``reset``.
-        """
-        return np.asarray(self._worlds.state()[0])
-
     def _own(self, observed: Observation) -> dict[str, Observation]:
         """A copy of every live UAV's observation."""
         columns: Any = {key: values[0] for key, values in cast(dict[str, NDArray[Any]], observed).items()}

@@ -15,6 +15,7 @@ from pettingzoo.utils import parallel_to_aec  # type: ignore[import-untyped]
 
 from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import SCENARIOS
+from tests.unit.simulator.world.test_environment import SMALL
 
 
 def with_steps(steps: int) -> PettingZooWorld:
@@ -51,3 +52,20 @@ def test_observations_and_state_stay_inside_their_spaces(name: str) -> None:
         assert world.state_space.contains(world.state())
         actions = {a: (rng.integers(world.scenario.sensors), rng.integers(15)) for a in world.agents}
         observations, *_ = world.step(actions)
+
+
+def test_state_is_laid_out_as_documented() -> None:
+    world = PettingZooWorld(SMALL)
+    with pytest.raises(ValueError, match="state before reset"):
+        world.state()
+    world.reset(seed=0)
+    world.sensors.arrivals[:] = 0
+    world.step({"uav_0": (0, 0), "uav_1": (2, 0)})
+    state = world.state()
+    assert state.shape == (1 + 2 * 2 + 4 * 3,)
+    assert state.dtype == np.float32
+    np.testing.assert_allclose(state[0], 0.25)
+    np.testing.assert_allclose(state[1:5], world.fleet.positions.ravel() / 1000, rtol=1e-6)
+    np.testing.assert_allclose(state[5:11], [0.5, 0.5, 0.5, 0.7, 0.5, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(state[11:14], [0.0, 1.0, 1.0])
+    np.testing.assert_allclose(state[14:], [0.98, 1.0, 1.0], rtol=1e-6)

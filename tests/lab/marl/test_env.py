@@ -8,6 +8,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from lab.marl.env import PipelineEnv
+from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import Scenario
 from simulator.world.environment import PipelineWorld
 
@@ -24,7 +25,7 @@ def test_each_reset_draws_the_next_worlds() -> None:
     env = PipelineEnv(SMALL, worlds=2, first_seed=7, cost="paper")
     first, second = env.reset()["state"], env.reset()["state"]
     for state, seed in zip((*first, *second), (7, 8, 9, 10), strict=True):
-        world = PipelineWorld(SMALL)
+        world = PettingZooWorld(SMALL)
         world.reset(seed=seed)
         np.testing.assert_array_equal(state.numpy(), world.state())
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lab.marl.network_inputs import ActorInput, actor_input, fleet_input, mask_without, taken_mask, width
+from lab.training_worlds import TrainingWorlds
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.world.batch import VectorWorld
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
 
@@ -31,7 +31,7 @@ def flown(scenario: Scenario, steps: int = 6, seed: int = 0) -> tuple[PipelineWo
 
 @pytest.mark.parametrize("scenario", [PAPER, SCENARIOS["stress"], ROUTES], ids=lambda scenario: scenario.name)
 def test_a_missions_features_equal_those_of_training_to_the_bit(scenario: Scenario) -> None:
-    batch = VectorWorld(scenario)
+    batch = TrainingWorlds(scenario)
     seen: Any = batch.reset(range(3))
     singles = [PipelineWorld(scenario) for _ in range(3)]
     alone: Any = [world.reset(seed=seed)[0] for seed, world in enumerate(singles)]
@@ -56,7 +56,7 @@ def test_a_missions_features_equal_those_of_training_to_the_bit(scenario: Scenar
 
 def test_features_are_independent_of_sensors_out_of_range() -> None:
     world, observations = flown(PAPER)
-    unheard = observations["uav_0"]["last_heard"] < world.state()[0] * 30
+    unheard = observations["uav_0"]["last_heard"] < len(world.tally)
     assert unheard.any()
     before = actor_input(PAPER, 0, observations["uav_0"])
     world.sensors.queue[unheard] = 0

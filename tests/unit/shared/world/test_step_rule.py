@@ -22,7 +22,7 @@ from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.step_rule import arrive, joules_a_packet, transfer
 from shared.world.trajectory import trajectories
 from simulator.bound.formulation import Formulation
-from simulator.world.batch import Draw, VectorWorld
+from simulator.world.batch import Draw, VectorWorld, stacked
 
 FASTEST = 2
 SEEDS = st.integers(0, 2**32 - 1)
@@ -101,12 +101,12 @@ def test_all_worlds_step_as_each_does_by_hand(seed: int, sensors: int, uavs: int
 def test_a_batch_of_worlds_steps_by_the_rule(seed: int, name: str, battery_j: float) -> None:
     scenario = SCENARIOS[name].model_copy(update={"battery_j": battery_j, "steps": 6, "sensors": 5})
     random, world = np.random.default_rng(seed), VectorWorld(scenario)
-    draw = Draw.of(scenario, [seed % 1000, 1])
+    draw = stacked([Draw.one(scenario, np.random.SeedSequence(one)) for one in (seed % 1000, 1)])
     world.start(draw)
     for step in range(scenario.steps):
         chosen, velocity = random.integers(scenario.sensors, size=(2, 3)), random.integers(15, size=(2, 3))
         ground, present = world.sensors.copy(), draw.truth.faults.present(step)
-        _, outcome = world.step(chosen, velocity)
+        _, outcome = world.fly(chosen, velocity)
         places = world.fleet.positions[:, :, None] - ground.positions[:, None]
         links = draw.truth.channel.links(
             np.hypot(places[..., 0], places[..., 1]), world.fleet.positions, world.fleet.progress_m, step + 1

@@ -225,19 +225,6 @@ def test_a_caller_cannot_change_the_world_through_an_observation() -> None:
     np.testing.assert_equal(got, expected)
 
 
-def test_state_is_laid_out_as_documented() -> None:
-    world = small_world()
-    step(world, (0, 0), (2, 0))
-    state = world.state()
-    assert state.shape == (1 + 2 * 2 + 4 * 3,)
-    assert state.dtype == np.float32
-    np.testing.assert_allclose(state[0], 0.25)
-    np.testing.assert_allclose(state[1:5], world.fleet.positions.ravel() / 1000, rtol=1e-6)
-    np.testing.assert_allclose(state[5:11], [0.5, 0.5, 0.5, 0.7, 0.5, 0.9], rtol=1e-6)
-    np.testing.assert_allclose(state[11:14], [0.0, 1.0, 1.0])
-    np.testing.assert_allclose(state[14:], [0.98, 1.0, 1.0], rtol=1e-6)
-
-
 # ---- random draws
 
 
@@ -283,10 +270,11 @@ def test_pipeline_sensors_are_strung_along_the_line() -> None:
 )
 def test_a_bad_action_names_its_agent_and_changes_nothing(actions: Any, fault: str) -> None:
     world = small_world(arrivals=(5, 5, 5))
-    before = world.state()
+    queue, places = world.sensors.queue.copy(), world.fleet.positions.copy()
     with pytest.raises(ValueError, match=fault):
         world.step(actions)
-    np.testing.assert_array_equal(world.state(), before)
+    np.testing.assert_array_equal(world.sensors.queue, queue)
+    np.testing.assert_array_equal(world.fleet.positions, places)
     assert world.tally == []
 
 
@@ -302,5 +290,3 @@ def test_stepping_a_world_that_does_not_run() -> None:
 def test_other_faults_have_clear_errors() -> None:
     with pytest.raises(ValueError, match="unknown cost 'eq5': choose one of default, paper"):
         PipelineWorld(cost="eq5")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="state before reset"):
-        PipelineWorld().state()

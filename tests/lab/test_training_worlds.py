@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lab.pettingzoo_world import PettingZooWorld
+from lab.training_worlds import TrainingWorlds, state_of
 from shared.world.scenario import SCENARIOS, Scenario
-from simulator.world.batch import VectorWorld
-from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Cost
 
 ROUTES = Scenario(
@@ -47,9 +47,9 @@ def same(batched: dict[str, Any], world: int, single: dict[str, Any]) -> None:
 @pytest.mark.parametrize("scenario", WORLDS, ids=lambda scenario: scenario.name)
 def test_every_number_is_that_of_the_single_world(scenario: Scenario, cost: Cost) -> None:
     seeds = range(5) if scenario.sensors < 50 else range(2)
-    batch = VectorWorld(scenario, cost=cost)
+    batch = TrainingWorlds(scenario, cost=cost)
     observation: Any = batch.reset(seeds)
-    singles = [PipelineWorld(scenario, cost=cost) for _ in seeds]
+    singles = [PettingZooWorld(scenario, cost=cost) for _ in seeds]
     for index, (seed, world) in enumerate(zip(seeds, singles, strict=True)):
         same(observation, index, world.reset(seed=seed)[0])
     sensors, velocities = actions_of(scenario, seeds)
@@ -66,12 +66,12 @@ def test_every_number_is_that_of_the_single_world(scenario: Scenario, cost: Cost
             assert outcome.moved[index].tolist() == [info["collected"] for info in of_all.values()]
             assert outcome.blamed[index].tolist() == [info["lost_packets"] for info in of_all.values()]
             np.testing.assert_equal(vars(outcome.tally(index, step)), vars(tally))
-            np.testing.assert_array_equal(batch.state()[index], world.state(), strict=True)
+            np.testing.assert_array_equal(state_of(batch)[index], world.state(), strict=True)
             assert set(over.values()) == {batch.steps_flown == scenario.steps}
 
 
 def test_the_worlds_compared_do_run_flat_collide_and_overflow() -> None:
-    batch = VectorWorld(FLAT)
+    batch = TrainingWorlds(FLAT)
     batch.reset(range(5))
     sensors, velocities = actions_of(FLAT, range(5))
     steps = [batch.step(*pair)[1] for pair in zip(sensors, velocities, strict=True)]
@@ -83,7 +83,7 @@ def test_the_worlds_compared_do_run_flat_collide_and_overflow() -> None:
 
 def test_a_world_does_not_depend_on_its_neighbours() -> None:
     sensors, velocities = actions_of(SCENARIOS["paper"], range(5))
-    five, two = VectorWorld(), VectorWorld()
+    five, two = TrainingWorlds(), TrainingWorlds()
     five.reset(range(5))
     two.reset([3, 1])
     for step in range(30):
@@ -94,13 +94,13 @@ def test_a_world_does_not_depend_on_its_neighbours() -> None:
 
 def test_bad_use_is_refused_and_changes_nothing() -> None:
     with pytest.raises(ValueError, match="unknown cost 'events': choose one of default, paper"):
-        VectorWorld(cost="events")  # type: ignore[arg-type]
-    batch = VectorWorld(Scenario(name="short", steps=1))
+        TrainingWorlds(cost="events")  # type: ignore[arg-type]
+    batch = TrainingWorlds(Scenario(name="short", steps=1))
     idle = np.zeros((2, 3), dtype=np.int64)
     with pytest.raises(ValueError, match="step before reset"):
         batch.step(idle, idle)
     with pytest.raises(ValueError, match="state before reset"):
-        batch.state()
+        state_of(batch)
     batch.reset([0, 1])
     for sensors, velocities, message in (
         (idle + 10, idle, r"sensors are not all in 0\.\.9"),
