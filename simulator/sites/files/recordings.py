@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,31 +38,42 @@ def read_trace(path: Path, sensors: Sequence[str]) -> IntArray:
     Raises:
         UsageError: the file cannot be read or is invalid; the text names the line.
     """
-    rows = csv.reader(io.StringIO(text_of(path, MAX_BYTES), newline=""), strict=True)
+    lines = _lines(path)
+    order = _columns(*next(lines), sensors)
     steps: list[list[int]] = []
-    try:
-        order = _columns(path, [name.strip() for name in next(rows, [])], sensors)
-        for row in rows:
-            if not row:
-                continue
-            at = f"{path}, line {rows.line_num}"
-            if len(row) != len(order) + 1:
-                raise UsageError(f"{at}: {len(row)} values, the header has {len(order) + 1}")
-            if row[0].strip() != str(len(steps)):
-                raise UsageError(f"{at}: step {quoted(row[0])}, expected {len(steps)}; one line a step, counted from 0")
-            if len(steps) == MAX_STEPS:
-                raise UsageError(f"{at}: a mission has at most {MAX_STEPS:,} steps; cut the trace")
-            steps.append([_packets(at, row[column], name) for name, column in zip(sensors, order, strict=True)])
-    except csv.Error as error:
-        raise UsageError(f"{path}, line {rows.line_num}: {error}") from None
+    for at, row in lines:
+        if row[0] != str(len(steps)):
+            raise UsageError(f"{at}: step {quoted(row[0])}, expected {len(steps)}; one line a step, counted from 0")
+        if len(steps) == MAX_STEPS:
+            raise UsageError(f"{at}: a mission has at most {MAX_STEPS:,} steps; cut the trace")
+        steps.append([_packets(at, row[column], name) for name, column in zip(sensors, order, strict=True)])
     if not steps:
         raise UsageError(f"{path} has a header and no step; add one line a step")
     return np.array(steps, dtype=np.int64)
 
 
-def _columns(path: Path, header: list[str], sensors: Sequence[str]) -> list[int]:
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The header and each line that is not blank: the file and the line's number for messages, and the cells."""
+    rows = csv.reader(io.StringIO(text_of(path, MAX_BYTES), newline=""), strict=True)
+    try:
+        header = [cell.strip() for cell in next(rows, [])]
+        yield f"{path}, line 1", header
+        for row in filter(None, rows):
+            at = f"{path}, line {rows.line_num}"
+            if len(row) != len(header):
+                raise UsageError(f"{at}: {len(row)} values, the header has {len(header)}")
+            yield at, [cell.strip() for cell in row]
+    except csv.Error as error:
+        raise UsageError(f"{path}, line {rows.line_num}: {error}") from None
+
+
+def _whole(cell: str, most: int) -> int | None:
+    """A whole number from 0 to ``most``; None for other text."""
+    return int(cell) if re.fullmatch(r"[0-9]{1,7}", cell) and int(cell) <= most else None
+
+
+def _columns(at: str, header: list[str], sensors: Sequence[str]) -> list[int]:
     """The index of each sensor's column."""
-    at = f"{path}, line 1"
     if not header or header[0] != "step":
         found = quoted(header[0]) if header else "nothing"
         raise UsageError(f"{at}: the first column is {found}; the header is step and the sensors' IDs, split by commas")
@@ -81,12 +92,10 @@ def _columns(path: Path, header: list[str], sensors: Sequence[str]) -> list[int]
 
 
 def _packets(at: str, cell: str, sensor: str) -> int:
-    count = cell.strip()
-    if not re.fullmatch(r"[0-9]{1,7}", count) or int(count) > MAX_PACKETS:
-        raise UsageError(
-            f"{at}, column {quoted(sensor)}: {quoted(count)} packets; write a whole number from 0 to {MAX_PACKETS}"
-        )
-    return int(count)
+    if (packets := _whole(cell, MAX_PACKETS)) is None:
+        wanted = f"write a whole number from 0 to {MAX_PACKETS}"
+        raise UsageError(f"{at}, column {quoted(sensor)}: {quoted(cell)} packets; {wanted}")
+    return packets
 
 
 def read_gains(path: Path, sensors: Sequence[str], lengths_m: Sequence[float]) -> GainTrace:
@@ -103,42 +112,29 @@ def read_gains(path: Path, sensors: Sequence[str], lengths_m: Sequence[float]) -
 
     points: dict[tuple[int, int], dict[float, float]] = {}
     column_of = {name: column for column, name in enumerate(sensors)}
-    rows = csv.reader(io.StringIO(text_of(path, MAX_BYTES), newline=""), strict=True)
-    try:
-        if [name.strip() for name in next(rows, [])] != HEADER:
-            raise UsageError(f"{path}, line 1: the header is {','.join(HEADER)}")
-        for count, row in enumerate(filter(None, rows)):
-            at = f"{path}, line {rows.line_num}"
-            if count == MAX_ROWS:
-                raise UsageError(f"{at}: at most {MAX_ROWS:,} points; thin them out")
-            if len(row) != len(HEADER):
-                raise UsageError(f"{at}: {len(row)} values, the header has {len(HEADER)}")
-            uav = _whole(at, row[0], len(lengths_m))
-            if row[1].strip() not in column_of:
-                raise UsageError(f"{at}: {quoted(row[1].strip())} is no sensor of world.geojson")
-            along = _number(at, "progress_m", row[2], 0.0, lengths_m[uav])
-            excess = _number(at, "excess_db", row[3], -MAX_EXCESS_DB, MAX_EXCESS_DB)
-            of_pair = points.setdefault((uav, column_of[row[1].strip()]), {})
-            if along in of_pair:
-                raise UsageError(f"{at}: this point of UAV {uav} and sensor {quoted(row[1].strip())} comes twice")
-            of_pair[along] = excess
-    except csv.Error as error:
-        raise UsageError(f"{path}, line {rows.line_num}: {error}") from None
+    lines = _lines(path)
+    at, header = next(lines)
+    if header != HEADER:
+        raise UsageError(f"{at}: the header is {','.join(HEADER)}")
+    for count, (at, (flown_by, sensor, progress, loss)) in enumerate(lines):
+        if count == MAX_ROWS:
+            raise UsageError(f"{at}: at most {MAX_ROWS:,} points; thin them out")
+        uav = _whole(flown_by, len(lengths_m) - 1)
+        if uav is None:
+            trajectories = f"write the number of a trajectory, 0 to {len(lengths_m) - 1}"
+            raise UsageError(f"{at}: UAV {quoted(flown_by)}; {trajectories}")
+        if sensor not in column_of:
+            raise UsageError(f"{at}: {quoted(sensor)} is no sensor of world.geojson")
+        along = _number(at, "progress_m", progress, 0.0, lengths_m[uav])
+        excess = _number(at, "excess_db", loss, -MAX_EXCESS_DB, MAX_EXCESS_DB)
+        of_pair = points.setdefault((uav, column_of[sensor]), {})
+        if along in of_pair:
+            raise UsageError(f"{at}: this point of UAV {uav} and sensor {quoted(sensor)} comes twice")
+        of_pair[along] = excess
     if not points:
         raise UsageError(f"{path} has a header and no point; add points, or take the file out")
-    return GainTrace({pair: _sorted(of_pair) for pair, of_pair in sorted(points.items())})
-
-
-def _sorted(of_pair: dict[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    along, excess = zip(*sorted(of_pair.items()), strict=True)
-    return np.array(along), np.array(excess)
-
-
-def _whole(at: str, cell: str, uavs: int) -> int:
-    text = cell.strip()
-    if not (text.isascii() and text.isdigit() and len(text) < 4 and int(text) < uavs):
-        raise UsageError(f"{at}: UAV {quoted(text)}; write the number of a trajectory, 0 to {uavs - 1}")
-    return int(text)
+    ordered = {pair: np.array(sorted(of_pair.items())).T for pair, of_pair in sorted(points.items())}
+    return GainTrace({pair: (along, excess) for pair, (along, excess) in ordered.items()})
 
 
 def _number(at: str, name: str, cell: str, least: float, most: float) -> float:
@@ -147,5 +143,5 @@ def _number(at: str, name: str, cell: str, least: float, most: float) -> float:
     except ValueError:
         value = math.nan
     if not least <= value <= most:
-        raise UsageError(f"{at}: {name} {quoted(cell.strip())} is no number from {least:g} to {most:.2f}")
+        raise UsageError(f"{at}: {name} {quoted(cell)} is no number from {least:g} to {most:.2f}")
     return value

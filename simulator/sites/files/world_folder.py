@@ -1,25 +1,6 @@
 """The folder of a user's own world: sensors, trajectories, scenario fields and recorded arrivals in files.
 
-``world.geojson`` (RFC 7946, WGS 84) is a FeatureCollection. The property ``role`` is the meaning of a feature:
-
-| role | geometry | becomes |
-|---|---|---|
-| ``sensor`` | Point; property ``id`` or ``name`` | a site; sensor j is the j-th in the file |
-| ``trajectory`` | LineString: there and back; closed LineString or Polygon: laps, in the order drawn | UAV i's route |
-| ``pipeline`` (at most one) | LineString | the line in pictures |
-| ``fence`` (at most one) | Polygon, or Point with ``radius_m`` | an area that no trajectory may leave |
-| ``no_fly`` | Polygon, or Point with ``radius_m`` | an area that no trajectory may enter |
-
-``scenario.toml`` (optional): any field of :class:`shared.world.scenario.Scenario` that does not follow from the
-features, such as ``steps``, ``radio_radius_m`` or ``queue_capacity``. Other fields are those of scenario ``paper``.
-
-``arrivals.csv`` (optional): a trace, ``step,<sensor ID>,<sensor ID>,...``, whole packets, one line a step from step 0,
-for at least the mission's steps. Without it arrivals are Poisson with the scenario's rates.
-
-``gains.csv`` (optional): a gain trace, ``uav,sensor,progress_m,excess_db``, one line a point: the loss in dB above the
-scenario's mean path loss, from that UAV (0: the first trajectory) at that arc length along its trajectory to the sensor
-of that ID. Between points it is interpolated; a pair without points has no excess.
-
+docs/guides/own-world.md specifies the files ``world.geojson``, ``scenario.toml``, ``arrivals.csv`` and ``gains.csv``.
 A seed draws each UAV's start along its trajectory, the initial queues and, without a trace, the arrivals.
 """
 
@@ -57,7 +38,7 @@ def site_from_folder(
     """The site that a world's folder describes.
 
     Args:
-        folder: as in this module's docstring; its name is the scenario's, unless ``scenario.toml`` sets ``name``.
+        folder: its name is the scenario's, unless ``scenario.toml`` sets ``name``.
         steps: of a mission, from 1 to 10,000; overrides the scenario's.
         on_warning: called with a warning about sensors that no UAV can reach.
 
