@@ -34,7 +34,6 @@ class FieldPilot:
         mode: the mission's, once this command or the edge has given it.
         on_request: called with each request before it is sent.
         last_error: the text of the last failure of asking the edge.
-        outcomes_sent: the number of outcomes that the edge has accepted.
     """
 
     def __init__(
@@ -50,7 +49,6 @@ class FieldPilot:
         self.mode = mode
         self.on_request: Callable[[DecideRequest], None] = lambda request: None
         self.last_error: str | None = None
-        self.outcomes_sent = 0
         self._client, self._mission_id, self._scenario = client, mission_id, scenario
         self._patience_s, self._deadline_ms = patience_s, deadline_ms
         self._fallback = policy_named(FALLBACK)
@@ -107,7 +105,6 @@ class FieldPilot:
             async with asyncio.timeout(self._patience_s):
                 for outcome in (*self._unstored_outcomes, *self._pending_outcomes.values()):
                     await self._client.feedback(FeedbackRequest(mission_id=self._mission_id, **outcome.model_dump()))
-                    self.outcomes_sent += outcome in self._pending_outcomes.values()
         except (EdgeError, TimeoutError) as error:
             self.last_error = str(error) or f"no answer within {self._patience_s:g} s"
 
@@ -125,10 +122,8 @@ class FieldPilot:
             self._joined = False
             return reason_on_board(error if isinstance(error, EdgeError) else EdgeUnreachable(self.last_error))
         answer = exchange.response
-        if outcome is not None and self._pending_outcomes.pop(uav, None) is not None:
-            self.outcomes_sent += 1
-            if not answer.stored:
-                self._unstored_outcomes.append(outcome)
+        if outcome is not None and self._pending_outcomes.pop(uav, None) is not None and not answer.stored:
+            self._unstored_outcomes.append(outcome)
         return PilotChoice(answer.sensor_id, answer.velocity, answer.source, answer.reason, exchange)
 
     async def _ask(self, request: DecideRequest) -> Exchange:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import platform
 import shutil
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from pydantic import ValidationError
@@ -26,7 +25,6 @@ from shared.wire.schemas import LLM_MODES
 if TYPE_CHECKING:
     from service.llm.examination import Examination
 
-_ASKED_S = 3.0
 # A large model on a small machine reads its first prompt slowly.
 _EXAMINED_S = 120.0
 _LATE = (
@@ -124,20 +122,13 @@ def versions() -> Finding:
 
 
 def port_of(host: str, port: int) -> Finding:
-    """Whether the port is free; where it is not, whether an edge has it."""
+    """Whether the port is free."""
     try:
         with socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET):
             return Finding("port", f"{host}:{port} is free")
     except OSError as error:
         fault = error.strerror or str(error)
-    answer = _asked(f"http://{f'[{host}]' if ':' in host else host}:{port}/readyz")
-    if isinstance(answer, dict) and "decides" in answer:
-        return Finding(
-            "port",
-            f"{host}:{port}: an edge runs there, its LLM is {answer.get('llm')}",
-            "use it, or aicvds serve --port 0",
-        )
-    return Finding("port", f"{host}:{port}: {fault}", "aicvds serve --port 0")
+    return Finding("port", f"{host}:{port}: {fault}", "aicvds serve --port 0, or use the edge that may run there")
 
 
 def store_of(settings: Settings) -> Finding:
@@ -234,28 +225,6 @@ def planner(settings: Settings) -> Finding:
         return Finding("planner", "off: one step of look-ahead")
     free_mb = shutil.disk_usage(Path.home()).free / 1e6
     return Finding("planner", f"numba {version('numba')}; {free_mb:,.0f} MB of disk free")
-
-
-def _asked(url: str) -> Any:
-    """The JSON of a GET, or the reason of a failure, as text."""
-    import httpx
-
-    try:
-        answer = httpx.get(url, timeout=_ASKED_S)
-        answer.raise_for_status()
-        found = answer.json()
-    except httpx.HTTPStatusError as error:
-        return f"it answers {error.response.status_code}"
-    except httpx.TimeoutException:
-        return f"no answer in {_ASKED_S:g} s"
-    except (httpx.HTTPError, httpx.InvalidURL) as error:
-        return str(error) or type(error).__name__
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
-        return "it answers no JSON"
-    except (ImportError, ValueError) as error:
-        # httpx reads the variables itself: one may name a scheme that is unknown, or SOCKS, which needs a package.
-        return f"HTTP_PROXY, HTTPS_PROXY or ALL_PROXY names a proxy that cannot be used: {error}"
-    return found if isinstance(found, dict) else "it answers no JSON object"
 
 
 def _writable(folder: Path) -> bool:
