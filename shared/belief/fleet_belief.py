@@ -332,17 +332,19 @@ class FleetBelief:
     def links(self, uav: int, metres: ArrayLike) -> ExpectedLinks:
         """The links to the UAV after it has flown ``metres`` ``(n,)`` on, ``(n, J)``."""
         ahead = self.uavs[uav].ahead(self._paths[uav], self.drift, metres)
-        return self.channel.links(ahead, self._distances_from(ahead))
+        return self.channel.links(ahead, _distances_between(ahead, self.places))
 
     def distances(self, uav: int, metres: ArrayLike) -> FloatArray:
         """Horizontal distances, metres, ``(n, J)``, after the UAV has flown ``metres`` ``(n,)`` on.
 
         A sensor of unknown position is far away.
         """
-        return self._distances_from(self.uavs[uav].ahead(self._paths[uav], self.drift, metres))
+        return _distances_between(self.uavs[uav].ahead(self._paths[uav], self.drift, metres), self.places)
 
-    def _distances_from(self, places: FloatArray) -> FloatArray:
-        offset = places[:, None, :] - self.places
-        metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
-        metres_off[np.isnan(metres_off)] = FAR_M
-        return metres_off
+
+def _distances_between(ahead: FloatArray, places: FloatArray) -> FloatArray:
+    """Distances ``(n, J)`` of a UAV's places ``(n, 2)`` to the sensors' ``(J, 2)``; far for an unknown position."""
+    offset = ahead[:, None, :] - places
+    metres_off: FloatArray = np.hypot(offset[..., 0], offset[..., 1])
+    metres_off[np.isnan(metres_off)] = FAR_M
+    return metres_off

@@ -13,7 +13,7 @@ from shared.belief.drift import Drift
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import LIKELY, ExpectedLinks, LearnedChannel
 from shared.wire.schemas import Features, UavState
-from shared.wire.sensor_arrays import arrays_of
+from shared.wire.sensor_arrays import SensorArrays, arrays_of
 from shared.world.channel import FloatArray, best_gain_db, channel_gain_db
 from shared.world.scenario import Point, Scenario
 from shared.world.trajectory import progress_of, trajectories
@@ -173,12 +173,8 @@ def augment(
 ) -> State:
     """Complete a UAV's report with visiting records, urgency, and the channel at its present position.
 
-    A stale channel gain is replaced by the expected one at the present distance: the place of a sensor does not change,
-    so the model knows better than an old beacon. Admissible is a sensor heard, with a battery, and not
-    reserved.
-
-    With a fleet's belief, queues and batteries are the values that the fleet expects now, and a sensor that no UAV has
-    heard counts as heard, with its expected queue.
+    Admissible is a sensor heard, with a battery, and not reserved. With a fleet's belief, queues and batteries are the
+    values that the fleet expects now, and a sensor that no UAV has heard counts as heard, with its expected queue.
 
     Args:
         visits: step of each sensor's last visit (TVR_j), by sensor ID; a sensor never visited counts from step 0.
@@ -188,7 +184,7 @@ def augment(
         belief: the fleet's; without it the state has this UAV's own last beacons.
     """
     reported = arrays_of(uav.sensors)
-    ids, places, queue, battery, gain = reported.ids, reported.places, reported.queue, reported.battery, reported.gain
+    ids, places, queue, battery = reported.ids, reported.places, reported.queue, reported.battery
     heard = reported.beacon >= 0
     position = (uav.position[0], uav.position[1])
     east, north = places[:, 0] - position[0], places[:, 1] - position[1]
@@ -200,19 +196,12 @@ def augment(
         heard = np.ones_like(heard)
         battery, queue = belief.battery[ids], belief.queue(step, ids)
         rate = belief.arrivals.coming(step, scenario.overflow_horizon_steps, ids)
-    stale = reported.beacon != step
-    if stale.any():
-        gain = gain.copy()
-        far, here = distance[stale], np.asarray(position)
-        known = None if belief is None else belief.channel
-        gain[stale] = channel_gain_db(far, scenario) if known is None else known.gain_db(here, far, ids[stale])
     able = heard & (battery > 0)
     # Few sensors are reserved: for them np.isin takes several times as long.
     admissible = able.copy()
     for sensor in reserved:
         admissible[ids == sensor] = False
     overflow = overflow_probability(queue, rate, scenario)
-    urgencies = urgency_of(queue, overflow, scenario)
     state = State(
         position=position,
         progress_m=uav.progress_m,
@@ -223,16 +212,36 @@ def augment(
         admissible=admissible,
         queue=queue,
         battery=battery,
-        gain=gain,
+        gain=_gains_now(reported, distance, position, step, scenario, None if belief is None else belief.channel),
         rate=rate,
         since_visit=np.maximum(step - np.maximum(visits[ids], 0), 0).astype(np.float64),
         overflow=overflow,
-        urgency=urgencies,
+        urgency=urgency_of(queue, overflow, scenario),
         distance=distance,
         channel=None if belief is None else belief.channel,
         drift=None if belief is None else belief.drift,
     )
     return replace(state, reach=state.reach_ahead(uav.uav_id, scenario)) if preset == "reach" else state
+
+
+def _gains_now(
+    reported: SensorArrays,
+    distance: FloatArray,
+    position: Point,
+    step: int,
+    scenario: Scenario,
+    channel: LearnedChannel | None,
+) -> FloatArray:
+    """The gains at the present distances, dB; expected where the beacon is old, since no sensor moves."""
+    stale = reported.beacon != step
+    if not stale.any():
+        return reported.gain
+    gain, far = reported.gain.copy(), distance[stale]
+    if channel is None:
+        gain[stale] = channel_gain_db(far, scenario)
+    else:
+        gain[stale] = channel.gain_db(np.asarray(position), far, reported.ids[stale])
+    return gain
 
 
 def places_ahead(
