@@ -42,7 +42,6 @@ def load_for_event_loop() -> None:
         state = augment(
             uav, step, _PAPER, visits=records.visits, rates=None, reserved=(), preset="reach", belief=belief
         )
-    belief.arrivals.burst(0)
     belief.channel.transfer(0.0)
     ExpectedLinks.by_formula(state.distance[None], _PAPER)
     UnprunedState(state, ",".join).tokens(len)

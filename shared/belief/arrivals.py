@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shared.belief.expected_queues import GOES_ON, bursts_to_come
 from shared.world.channel import FloatArray, IntArray
 from shared.world.scenario import Scenario
 
+# The probability that a burst lasts into the next step, and its powers until they are 0.
+GOES_ON = 0.7
+_POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
 # A rate in packets a step that yields less than one packet in the longest mission, and the weight of its prior in
 # steps.
 _ZERO_RATE, _CERTAIN_STEPS = 1e-6, 1000.0
 # The weight of the assumption that arrivals are Poisson, in intervals between beacons, and the least significant
 # dispersion.
 _POISSON_INTERVALS, _LEAST_DISPERSION = 20, 1.5
-_POWERS: FloatArray = np.asarray(GOES_ON ** np.arange(2100), dtype=np.float64)
 _ARRAYS = ("arrived", "watched", "recent", "recent_at")
 
 
@@ -70,17 +71,20 @@ class Arrivals:
         """Whether arrivals come in bursts."""
         return self.dispersion > 1.0
 
-    @property
-    def burst_arrays(self) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-        """``rate``, ``recent``, ``recent_at`` and the powers of ``GOES_ON``, for compiled functions."""
-        return self.rate, self.recent, self.recent_at, _POWERS
-
     def burst(self, step: int, ids: IntArray | None = None) -> FloatArray:
         """Expected further packets above the rate from the observed bursts, from this step on, ``(J,)`` or ``(n,)``."""
-        which = np.arange(len(self.rate)) if ids is None else np.array(ids)
-        packets = np.empty(len(which))
-        bursts_to_come(*self.burst_arrays, self.in_bursts, which, step, packets)
-        return packets
+        which = slice(None) if ids is None else ids
+        above = np.maximum(self.recent[which] - self.rate[which], 0.0)
+        return _still_to_come(above, step - self.recent_at[which]) if self.in_bursts else np.zeros_like(above)
+
+    def since(self, steps: IntArray, step: int, which: slice | IntArray) -> FloatArray:
+        """Expected arrivals of sensors ``(n,)`` from ``steps`` ``(n,)`` to a step, packets."""
+        rate = self.rate[which]
+        came = rate * np.maximum(step - steps, 0)
+        if self.in_bursts:
+            at, above = self.recent_at[which], np.maximum(self.recent[which] - rate, 0.0)
+            came += _still_to_come(above, np.minimum(steps, step) - at) - _still_to_come(above, step - at)
+        return came
 
     def coming(self, step: int, horizon: float, ids: IntArray) -> FloatArray:
         """Expected arrivals of sensors ``(n,)`` from this step to the horizon, packets a step."""
@@ -106,3 +110,8 @@ class Arrivals:
         self.rate = self.arrived / self.watched
         self._surprise, self._intervals = state["surprise"], state["intervals"]
         self._estimate_dispersion()
+
+
+def _still_to_come(above: FloatArray, passed: IntArray) -> FloatArray:
+    """A burst's further packets that many steps after an interval with ``above`` packets a step above the rate."""
+    return np.asarray(above * _POWERS[np.minimum(np.maximum(passed, 0) + 1, len(_POWERS) - 1)] / (1.0 - GOES_ON))

@@ -308,14 +308,9 @@ class FleetBelief:
 
     def queue(self, step: int, ids: IntArray | None = None) -> FloatArray:
         """Expected packets at the start of a step, shape ``(J,)``, or of the sensors ``ids``."""
-        from shared.belief.expected_queues import expected_queues
-
-        which = np.arange(len(self.base)) if ids is None else np.array(ids)
-        queue, capacity, bursts = np.empty(len(which)), float(self._scenario.queue_capacity), self.arrivals.in_bursts
-        # numpy raises an error for an unknown sensor ID; compiled code would not.
-        base, since = self.base[which], self.since[which]
-        expected_queues(*self.arrivals.burst_arrays, bursts, base, since, which, capacity, step, queue)
-        return queue
+        which = slice(None) if ids is None else ids
+        came = self.arrivals.since(self.since[which], step, which)
+        return np.minimum(self.base[which] + came, float(self._scenario.queue_capacity))
 
     def present(self, step: int) -> list[int]:
         """The UAVs located in this step or the one before."""

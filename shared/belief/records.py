@@ -49,17 +49,14 @@ class Records:
 
         Between two beacons of a sensor without a visit or an overflow, the queue grows by the arrivals.
         """
-        from shared.belief.record_updates import record_beacons
-
-        arrays = self.visits, self._seen, self._queue, self._arrivals, self._exposure
-        # Copies, because numba would recompile the function for other types and for read-only arrays.
-        which, steps = np.array(ids, dtype=np.int64), np.array(seen, dtype=np.int64)
-        queues = np.array(queue, dtype=np.float64)
-        # numpy raises an error for an unknown sensor ID; compiled code would not.
-        before = self._seen[which]
-        if not len(which) == len(steps) == len(queues):
-            raise ValueError(f"{len(which)} sensors with {len(steps)} steps and {len(queues)} queues")
-        record_beacons(*arrays, float(self._capacity), which, before, steps, queues)
+        before = self._seen[ids]
+        newer = np.flatnonzero(seen > before)
+        ids, seen, queue, before = ids[newer], seen[newer], queue[newer], before[newer]
+        last, undisturbed = self._queue[ids], (before >= 0) & (self.visits[ids] < before)
+        grown = undisturbed & (last <= queue) & (queue < self._capacity)
+        self._arrivals[ids[grown]] += (queue - last)[grown]
+        self._exposure[ids[grown]] += (seen - before)[grown]
+        self._seen[ids], self._queue[ids] = seen, queue
 
     def presume(self, sensor_id: int, decision_id: str, step: int) -> None:
         """Count a decision as a visit until its outcome is known."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from shared.belief.expected_queues import GOES_ON
+from shared.belief.arrivals import GOES_ON
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.learned_channel import ExpectedLinks
 from shared.belief.records import Records, take_report
@@ -188,6 +188,4 @@ def test_a_sensor_that_there_is_not_is_an_error_and_so_are_columns_of_other_leng
     three = np.arange(3)
     with pytest.raises(ValueError, match="3 sensors with 1 beacons, 1 queues, 1 batteries"):
         belief.hear(three, np.ones((3, 2)), np.array([3]), one, one)
-    with pytest.raises(ValueError, match="3 sensors with 1 steps and 1 queues"):
-        records.hear(three, np.array([3]), one)
     assert (belief.heard == -1).all()

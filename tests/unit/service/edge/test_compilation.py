@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.edge.compilation import load_for_event_loop
 from service.prompting import unpruned_state
 from service.prompting.unpruned_state import UnprunedState
-from shared.belief import beacon_updates, expected_queues, link_expectations, record_updates
+from shared.belief import beacon_updates, link_expectations
 from shared.belief.fleet_belief import FleetBelief
 from shared.belief.records import take_report
 from shared.features.augmented_state import augment
@@ -18,9 +18,6 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
         beacon_updates.take_beacons,
         beacon_updates.take_arrivals,
         beacon_updates.in_range,
-        expected_queues.bursts_to_come,
-        expected_queues.expected_queues,
-        record_updates.record_beacons,
         link_expectations.measured_excess,
         link_expectations.expected_transfers,
         link_expectations.transfer,
@@ -44,6 +41,4 @@ def test_no_form_of_an_array_is_compiled_anew_once_the_edge_is_ready() -> None:
             UnprunedState(state, ",".join).tokens(len)
         again.record_decision(step % 2, step, 0, 3)
         again.settle(step % 2, step, failed=False)
-    again.queue(70)
-    again.arrivals.burst(70)
     assert {len(function.signatures) for function in functions} == {1}  # type: ignore[attr-defined]
