@@ -10,10 +10,9 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
-from pydantic.alias_generators import to_camel
+from pydantic import AliasPath, AwareDatetime, BaseModel, Field
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,83 +40,62 @@ class DeviceMessage:
     simulated: bool = False
 
 
-class _ChirpStackModel(BaseModel):
-    model_config = ConfigDict(extra="ignore", alias_generator=to_camel, frozen=True)
+_Eui = Annotated[str, Field(pattern=r"^[0-9A-Fa-f]{16}$")]
+_Percent = Annotated[float, Field(ge=0, le=100)]
 
 
-class _DeviceInfo(_ChirpStackModel):
-    tenant_id: str = ""
-    application_id: str
-    dev_eui: str = Field(pattern=r"^[0-9A-Fa-f]{16}$")
-
-
-class _Reception(_ChirpStackModel):
+class _Reception(BaseModel):
     rssi: float | None = None
     snr: float | None = None
 
 
-class _ChirpStack(_ChirpStackModel):
+class _Battery(BaseModel):
+    value: _Percent = 0.0
+
+
+class _ChirpStack(BaseModel):
     """``UplinkEvent`` or ``StatusEvent``."""
 
-    deduplication_id: str = ""
+    deduplication_id: str = Field("", alias="deduplicationId")
     time: AwareDatetime
-    device_info: _DeviceInfo
-    f_cnt: int = 0
+    tenant_id: str = Field("", validation_alias=AliasPath("deviceInfo", "tenantId"))
+    application_id: str = Field(validation_alias=AliasPath("deviceInfo", "applicationId"))
+    dev_eui: _Eui = Field(validation_alias=AliasPath("deviceInfo", "devEui"))
+    f_cnt: int = Field(0, alias="fCnt")
     object: dict[str, Any] | None = None
-    rx_info: list[_Reception] = Field(default_factory=list, max_length=1000)
-    battery_level: float | None = Field(None, ge=0, le=100)
-    battery_level_unavailable: bool = False
-    external_power_source: bool = False
+    rx_info: list[_Reception] = Field([], alias="rxInfo", max_length=1000)
+    battery_level: _Percent | None = Field(None, alias="batteryLevel")
+    battery_level_unavailable: bool = Field(False, alias="batteryLevelUnavailable")
+    external_power_source: bool = Field(False, alias="externalPowerSource")
 
 
-class _TtsModel(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-
-class _ApplicationIds(_TtsModel):
-    application_id: str
-
-
-class _DeviceIds(_TtsModel):
-    application_ids: _ApplicationIds
-    dev_eui: str = Field(pattern=r"^[0-9A-Fa-f]{16}$")
-
-
-class _Battery(_TtsModel):
-    value: float = Field(0.0, ge=0, le=100)
-
-
-class _NetworkIds(_TtsModel):
-    tenant_id: str = ""
-
-
-class _TtsUplink(_TtsModel):
-    f_cnt: int = 0
-    received_at: AwareDatetime
-    decoded_payload: dict[str, Any] | None = None
-    rx_metadata: list[_Reception] = Field(default_factory=list, max_length=1000)
-    last_battery_percentage: _Battery | None = None
-    network_ids: _NetworkIds = _NetworkIds()
-
-
-class _TheThingsStack(_TtsModel):
+class _TheThingsStack(BaseModel):
     """``ApplicationUp`` with an ``uplink_message``."""
 
-    end_device_ids: _DeviceIds
-    uplink_message: _TtsUplink
+    application_id: str = Field(validation_alias=AliasPath("end_device_ids", "application_ids", "application_id"))
+    dev_eui: _Eui = Field(validation_alias=AliasPath("end_device_ids", "dev_eui"))
     simulated: bool = False
+    received_at: AwareDatetime = Field(validation_alias=AliasPath("uplink_message", "received_at"))
+    f_cnt: int = Field(0, validation_alias=AliasPath("uplink_message", "f_cnt"))
+    decoded_payload: dict[str, Any] | None = Field(
+        None, validation_alias=AliasPath("uplink_message", "decoded_payload")
+    )
+    rx_metadata: list[_Reception] = Field(
+        [], validation_alias=AliasPath("uplink_message", "rx_metadata"), max_length=1000
+    )
+    battery: _Battery | None = Field(None, validation_alias=AliasPath("uplink_message", "last_battery_percentage"))
+    tenant_id: str = Field("", validation_alias=AliasPath("uplink_message", "network_ids", "tenant_id"))
 
 
 def chirpstack(payload: bytes) -> DeviceMessage:
     """An event ``up`` or ``status`` of ChirpStack v4 in JSON; raises pydantic's ``ValidationError``."""
     event = _ChirpStack.model_validate_json(payload)
-    device = event.device_info
     mains = event.external_power_source or event.battery_level_unavailable
     return DeviceMessage(
-        dev_eui=device.dev_eui.lower(),
-        tenant=device.tenant_id or None,
-        application=device.application_id,
-        message_id=_message_id(device.dev_eui, event.deduplication_id or event.f_cnt, event.time),
+        dev_eui=event.dev_eui.lower(),
+        tenant=event.tenant_id or None,
+        application=event.application_id,
+        message_id=_message_id(event.dev_eui, event.deduplication_id or event.f_cnt, event.time),
         at=event.time,
         fields=None if event.object is None and event.battery_level is not None else event.object or {},
         battery_percent=None if mains else event.battery_level,
@@ -128,18 +106,16 @@ def chirpstack(payload: bytes) -> DeviceMessage:
 def the_things_stack(payload: bytes) -> DeviceMessage:
     """An uplink message of The Things Stack v3; raises pydantic's ``ValidationError``."""
     uplink = _TheThingsStack.model_validate_json(payload)
-    device, message = uplink.end_device_ids, uplink.uplink_message
-    battery = message.last_battery_percentage
     return DeviceMessage(
-        dev_eui=device.dev_eui.lower(),
-        tenant=message.network_ids.tenant_id or None,
-        application=device.application_ids.application_id,
-        message_id=_message_id(device.dev_eui, message.f_cnt, message.received_at),
-        at=message.received_at,
-        fields=message.decoded_payload or {},
-        battery_percent=None if battery is None else battery.value,
+        dev_eui=uplink.dev_eui.lower(),
+        tenant=uplink.tenant_id or None,
+        application=uplink.application_id,
+        message_id=_message_id(uplink.dev_eui, uplink.f_cnt, uplink.received_at),
+        at=uplink.received_at,
+        fields=uplink.decoded_payload or {},
+        battery_percent=None if uplink.battery is None else uplink.battery.value,
         simulated=uplink.simulated,
-        **_best_reception(message.rx_metadata),
+        **_best_reception(uplink.rx_metadata),
     )
 
 
