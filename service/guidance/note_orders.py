@@ -13,13 +13,17 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
+from importlib.resources import files
 
 from pydantic import ValidationError
 
 from service.guidance.note_numbers import CARDINALS, ORDINALS
-from service.guidance.order_examples import EXAMPLES
 from shared.planning.orders import Guidance, SensorWish
 
+# Worked examples: notes as operators write them, and their orders.
+EXAMPLES: list[tuple[str, str]] = list(
+    json.loads(files("service.guidance").joinpath("order_examples.json").read_text(encoding="utf-8")).items()
+)
 INSTRUCTION = "Rewrite the operator's note as orders for the UAVs."
 NOTHING = "nothing"
 SEPARATOR = ", "

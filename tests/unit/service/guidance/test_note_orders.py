@@ -6,8 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from service.guidance.note_orders import BadOrders, numbers_in, parse_orders, similar_examples
-from service.guidance.order_examples import EXAMPLES
+from service.guidance.note_orders import EXAMPLES, BadOrders, numbers_in, parse_orders, similar_examples
 from service.guidance.order_grammar import admissible, constrain_orders
 from shared.planning.orders import Guidance, SensorWish
 
