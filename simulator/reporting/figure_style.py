@@ -18,26 +18,9 @@ from matplotlib.figure import Figure
 # The widths of one column and of both columns of a two-column paper.
 SINGLE_IN, DOUBLE_IN = 3.5, 7.16
 
-RC: dict[Any, Any] = {
-    "svg.fonttype": "none",
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial", "sans-serif"],
-    "font.size": 8.5,
-    "axes.labelsize": 8.5,
-    "axes.titlesize": 9,
-    "axes.linewidth": 0.8,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "legend.fontsize": 8,
-    "legend.frameon": False,
-    "lines.linewidth": 1.4,
-    "text.parse_math": False,
-    "axes.formatter.use_mathtext": False,
-    "axes.unicode_minus": True,
-    "savefig.bbox": None,
-    # TrueType: text stays text, and the fonts are embedded.
-    "pdf.fonttype": 42,
-}
+RC: dict[Any, Any] = matplotlib.rc_params_from_file(
+    Path(__file__).with_name("paper.mplstyle"), use_default_template=False
+)
 # The formats for print, without the metadata that differ between runs.
 _UNDATED: dict[str, dict[str, Any]] = {
     "svg": {"Date": None, "Creator": None},
