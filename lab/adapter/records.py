@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from lab.distilling.examples import missions_of
+from lab.distilling.examples import failing_signs, missions_of
 from lab.exploration.rollouts import Header, Reference, RolloutStep, read_rollouts
 from lab.training.recorded_states import recorded_states
 from service.config.settings import Settings

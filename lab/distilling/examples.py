@@ -23,7 +23,7 @@ from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState
 from service.mission.mission import Mission
 from service.prompting.candidates import CandidateSet
-from service.prompting.compact_prompt import SIGNS, failing_signs, sign
+from service.prompting.compact_prompt import SIGNS, sign
 from shared.wire.schemas import Belief, MissionSpec
 from shared.world.actions import Action
 from shared.world.channel import FloatArray
@@ -82,6 +82,12 @@ class PromptExample:
     target: FloatArray
     sensors: tuple[int, ...]
     reference: int
+
+
+def failing_signs(lines: Iterable[str]) -> set[str]:
+    """The signs of the sensors whose newest experience is a failure although packets were expected."""
+    newest = {line[1]: line for line in lines}
+    return {own for own, line in newest.items() if line[0] != "0" and line.endswith("X")}
 
 
 def missions_of(steps: Iterable[RolloutStep]) -> Iterator[list[RolloutStep]]:

@@ -13,7 +13,7 @@ that it was trained on: :data:`service.llm.adapter_version.PROMPT_VERSION` chang
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -80,12 +80,6 @@ def _reached(view: Viewpoint, uav: int, metres: FloatArray, scenario: Scenario) 
 def sign(sensor_id: int) -> str:
     """A sensor's sign in the prompt."""
     return SIGNS[sensor_id % len(SIGNS)]
-
-
-def failing_signs(lines: Iterable[str]) -> set[str]:
-    """The signs of the sensors whose newest experience is a failure although packets were expected."""
-    newest = {line[1]: line for line in lines}
-    return {own for own, line in newest.items() if line[0] != "0" and line.endswith("X")}
 
 
 def digits(values: ArrayLike) -> NDArray[np.int64]:

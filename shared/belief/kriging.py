@@ -150,7 +150,7 @@ def invert(of: Measurements, links: LinkStatistics, ids: IntArray) -> None:
 
 @inlined
 def _covariance(kept: FloatArray, n: int, east: float, north: float, links: LinkStatistics) -> float:
-    """The covariance of a measurement with a place, as :meth:`shared.belief.shadowing.Shadowing.covariance`."""
+    """The covariance of a measurement with a place, without the fading."""
     apart = math.sqrt((kept[n, EAST] - east) ** 2 + (kept[n, NORTH] - north) ** 2)
     return links.sensor + links.place * math.exp(-apart / links.range_m)
 

@@ -5,10 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
-from shared.world.channel import FloatArray
-
 # The prior of the excess loss's standard deviation, dB, and its weight in measurements. A low weight: the first report
 # of a world that equals the formula shows that it does.
 PRIOR_DB, PRIOR_WEIGHT = 6.0, 0.03
@@ -32,10 +28,6 @@ class Shadowing:
     def fading(self) -> float:
         """The share of the variance that earlier measurements cannot explain."""
         return 1.0 - self.sensor - self.place
-
-    def covariance(self, apart_m: FloatArray) -> FloatArray:
-        """The covariance of two measurements of one sensor at places this far apart, without the fading."""
-        return self.sensor + self.place * np.exp(-apart_m / self.range_m)
 
 
 # The measurements' likelihood selects one of them; the first is the prior assumption.

@@ -61,22 +61,11 @@ class PipelineWorld:
     4. Packets in excess of W at a sensor are lost (g = 1 for that sensor), and its queue is W.
 
     ## What the model leaves out
-    An edge plans with the mean path loss, steady rates and ``velocity x step_s``. The fields of
-    :class:`shared.world.unmodelled.Unmodelled`, all off by default, make a world differ from that:
-
-    - **Links.** The path loss is ``mean + own_j + way_j(x, y) + fade_ijt + trace_ij``, within 0..400 dB. The normal
-      ``own_j`` is a sensor's own (``shadowing_db``). ``way_j`` is a Gaussian random field over the UAVs' places with
-      the correlation ``exp(-r / decorrelation_m)``, of each sensor another (``route_shadowing_db``). ``fade_ijt`` is
-      Rician of mean power 1, new for each UAV, sensor and step (``rician_k_db``). ``trace_ij`` is recorded (``gains``).
-      A transfer and the beacon after it meet the same loss, and ``channel_gain`` is minus all of it. Beacons are heard
-      within the radio radius at any loss.
-    - **Arrivals.** Each sensor alternates between bursts and calm (``burst_factor``, ``burst_steps``, ``calm_steps``).
-    - **Wind.** A UAV covers ``velocity x step_s x min(2, max(0, 1 + w / max_velocity))`` metres, w the wind along its
-      way (``wind_mps``, ``wind_from_deg``) and its gust of the step (``gust_mps``). ``progress`` is true.
-    - **Positions.** A reported ``position`` has a normal error on each axis (``position_noise_m``).
-    - **Faults.** All transmissions of a dead radio fail (``dead_radios``), while its beacons go on; its losses are
-      nobody's ``lost_i``. From a step on, every link has only the share ``1 - link_share_drop`` of its rate. A UAV that
-      left (``departures``) neither flies, hears nor collects.
+    The fields of :class:`shared.world.unmodelled.Unmodelled`, all off by default, make a world differ from what an edge
+    plans with; docs/reference/worlds.md says how. The path loss is ``mean + own_j + way_j(x, y) + fade_ijt +
+    trace_ij``, within 0..400 dB (:class:`~simulator.world.true_channel.TrueChannel`). A transfer and the beacon after
+    it meet the same loss, and ``channel_gain`` is minus all of it. ``progress`` is true. The losses of a dead radio are
+    nobody's ``lost_i``. A UAV that left neither flies, hears nor collects.
 
     ## Rewards
     ``reward = -cost``. With ``cost="default"``, ``c_i = f_i + lost_i / W``, where ``lost_i`` are the packets lost in

@@ -29,6 +29,7 @@ from lab.distilling.examples import (
     UNLEARNED,
     PromptExample,
     View,
+    failing_signs,
     missions_of,
     prompt_examples,
 )
@@ -46,7 +47,7 @@ from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
 from service.llm.model_file import embedded_model
 from service.llm.request_bodies import label_body
-from service.prompting.compact_prompt import STATIC, failing_signs
+from service.prompting.compact_prompt import STATIC
 from shared.world.scenario import SCENARIOS
 from tests.support.waiting import PATIENCE_S
 
@@ -398,3 +399,8 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(
     assert all(torch.allclose(a, b) for a, b in zip(one, other, strict=True))
     with pytest.raises(ValueError, match="give --out another folder"):
         next(train(student(), examples, replace(args, seed=1), tmp_path / "half.pt"))
+
+
+def test_a_sensor_fails_whose_newest_experience_is_a_failure_that_nobody_expected() -> None:
+    assert failing_signs(["7d9X", "9a0Y", "0k9X", "5b9X", "5b0Y", "4c0Y", "4c9X"]) == {"d", "c"}
+    assert failing_signs([]) == set()

@@ -80,7 +80,8 @@ def test_the_likelihoods_are_the_normal_distributions(laps: int) -> None:
         for sensor in range(4):
             used = slice(0, int(found.count[sensor]))
             places = found.places[sensor, used]
-            matrix = kind.covariance(np.linalg.norm(places[:, None] - places[None], axis=2))
+            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+            matrix = kind.sensor + kind.place * np.exp(-apart / kind.range_m)
             np.fill_diagonal(matrix, 1.0 + kind.fading * (found.noise[sensor, used] - 1.0))
             blocks.append((matrix, found.excess[sensor, used]))
             measured.append(np.linalg.solve(matrix, found.excess[sensor, used]))

@@ -14,7 +14,7 @@ from service.deciding.deliberation import candidates_of, template_of
 from service.errors import Refused
 from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint
-from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, digits, failing_signs, sign
+from service.prompting.compact_prompt import SIGNS, CompactTemplate, Outlook, digits, sign
 from service.prompting.experiences import Experience
 from shared.wire.schemas import MissionSpec
 from shared.world.actions import Action
@@ -77,11 +77,6 @@ def test_an_experience_has_what_was_expected_and_what_it_cost(
     seen: dict[str, str], cost: float, failed: bool, line: str
 ) -> None:
     assert CompactTemplate(PAPER, rows=5).experience(seen, Action(3, 14), cost, failed) == line
-
-
-def test_a_sensor_fails_whose_newest_experience_is_a_failure_that_nobody_expected() -> None:
-    assert failing_signs(["7d9X", "9a0Y", "0k9X", "5b9X", "5b0Y", "4c0Y", "4c9X"]) == {"d", "c"}
-    assert failing_signs([]) == set()
 
 
 def test_experiences_come_first_and_a_mission_has_none_unless_it_asks() -> None:
