@@ -36,7 +36,7 @@ from service.deciding.rollout_evaluator import evaluate
 from service.deciding.rollout_state import RolloutState
 from service.mission.mission import Mission
 from service.prompting.candidates import Viewpoint, velocity_options
-from service.prompting.compact_prompt import Outlook, failing_signs, fleet_digits, row_digits, sign
+from service.prompting.compact_prompt import Outlook, fleet_digits, row_digits, sign
 from shared.wire.schemas import MissionSpec
 from shared.world.actions import Action
 
