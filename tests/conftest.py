@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import os
 import secrets
@@ -45,6 +46,10 @@ _COMPLETE = "TESTS_COMPLETE"
 _PROGRAMS = ("chromium", "haproxy", "mosquitto", "prometheus")
 
 Edge = Callable[..., httpx.Client]
+
+# Imports make millions of objects and no garbage: to look through them again and again takes seconds of the collection,
+# and of the tests, which are started without them.
+gc.disable()
 
 
 @pytest.fixture(autouse=True)
@@ -142,6 +147,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
+
+
+def pytest_collection_finish() -> None:
+    """Leave all that was imported out of every later search for garbage."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

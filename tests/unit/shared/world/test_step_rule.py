@@ -182,7 +182,8 @@ def test_the_compiled_flights_follow_the_rule(seed: int, sensors: int, uavs: int
     actions = drawn_actions(problem, seed)
     course = fly(problem, actions)
     assert problem.links is not None
-    whole = np.stack([table[0].T for table in problem.links]).astype(np.float64)
+    # Contiguous, as an edge's are: another layout would be compiled anew, for seconds.
+    whole = np.ascontiguousarray([table[0].T for table in problem.links], dtype=np.float64)
     nothing = np.zeros((0, 0, 0))
     world = FlownWorld(
         packets=whole,
