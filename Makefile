@@ -46,7 +46,9 @@ demo: .venv/demo
 
 # In advance, because a test that waits for the compiler may run into a limit of time; a second once it is done.
 COMPILE = $(BIN)/python -c 'from service.edge.compilation import compile_all; compile_all()'
-PYTEST = $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+# The variable is that of `aicvds serve`, here before torch is loaded: llama.cpp's threads share the cores with other
+# tests, and would spin while one waits for the other.
+PYTEST = GOMP_SPINCOUNT=1000 $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: install
 	$(COMPILE)
