@@ -9,12 +9,15 @@ from typing import Any
 import httpx
 import pytest
 
+from service.api.app import create_app
+from service.config.settings import Settings
 from service.mission.events import GuidanceChanged
 from service.storage.rows import decode
 from tests.integration.service.api.test_routes import fields
 from tests.integration.service.guidance.test_operator_guidance import NOTE, ORDERS, OWN, Edge, Report, Scribe, guidance
 from tests.support.processes import serving_edge
 from tests.support.running import serving
+from tests.support.storing import StoreHere
 from tests.support.stub_llm import wait_for
 from tests.support.waiting import PATIENCE_S
 
@@ -154,5 +157,6 @@ def test_an_edge_that_was_killed_withdraws_the_orders_of_before(tmp_path: Path) 
         told = say(client, answer="withdraw", version=before["version"])
         assert (told["obeyed_in_words"], told["ended"]) == (None, OWN_IN_WORDS)
         process.kill()
-    with serving_edge(**env) as (url, _), httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
+    later = create_app(Settings(mode="value"), StoreHere(tmp_path / "missions.db"))
+    with serving(later) as url, httpx.Client(base_url=url, timeout=PATIENCE_S) as client:
         assert client.get(AT).json() == told

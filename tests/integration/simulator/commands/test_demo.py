@@ -63,6 +63,7 @@ def flown_beside(stub: EdgeStub, out: Path, mode: Mode) -> Summary:
     return summary_in(out)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_same_world_is_flown_without_the_llm_too(stub: EdgeStub, tmp_path: Path) -> None:
     summary = flown_beside(stub, tmp_path, "guided")
     assert {name: spec.mode for name, spec in stub.missions.items()} == {
@@ -74,6 +75,7 @@ def test_the_same_world_is_flown_without_the_llm_too(stub: EdgeStub, tmp_path: P
     assert summary.decisions == 9 and len(stub.decides) == 18
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_mission_without_an_llm_is_flown_once(stub: EdgeStub, tmp_path: Path) -> None:
     assert flown_beside(stub, tmp_path, "value").without_llm is None
     assert list(stub.missions) == ["paper-1-x"]

@@ -98,6 +98,7 @@ def test_the_bound_is_searched_unless_it_is_left_out(
     assert (summary_in(tmp_path).bound, summary_in(tmp_path).bound_missing) == (None, None)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_named_mission_has_its_note_and_its_address(
     stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -111,6 +112,7 @@ def test_a_named_mission_has_its_note_and_its_address(
     assert stub.missions["patrol"] is made and stub.notes == {"patrol": "Visit sensor 2 every fourth step."}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_flight_may_end_before_its_mission_does(
     stub: EdgeStub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -42,13 +42,22 @@ def decision(**changes: object) -> Decision:
     return Decision.model_validate({**base, **changes})
 
 
-def page(flight: Flight, model: str | None = "stub-1", decisions: list[Decision] | None = None) -> str:
+def page(
+    flight: Flight,
+    model: str | None = "stub-1",
+    decisions: list[Decision] | None = None,
+    figures: Drawn | None = None,
+) -> str:
     seen = flight.decisions if decisions is None else decisions
-    tallies = {"aic_vds": flight.tally, **baselines(Site(flight.scenario), 0, flight.steps_flown)}
     summary = summary_of(flight, model)
-    figures = drawings(summary, flight.scenario, seen, tallies, flight.sensor_xy)
+    figures = figures or drawings_of(flight, summary, seen)
     played = playback(flight.scenario, flight.sensor_xy, seen, flight.track.until(flight.steps_flown), 1)
     return render_report(summary, flight.scenario, seen, figures, played)
+
+
+def drawings_of(flight: Flight, summary: Summary, decisions: list[Decision]) -> Drawn:
+    tallies = {"aic_vds": flight.tally, **baselines(Site(flight.scenario), 0, flight.steps_flown)}
+    return drawings(summary, flight.scenario, decisions, tallies, flight.sensor_xy)
 
 
 def summary_of(flight: Flight, model: str | None) -> Summary:
@@ -71,16 +80,15 @@ def flight() -> Flight:
 
 
 @pytest.fixture(scope="module")
-def drawn(flight: Flight) -> str:
-    """The flight's page."""
-    return page(flight)
+def figures_of(flight: Flight) -> Drawn:
+    """The figures of that flight."""
+    return drawings_of(flight, summary_of(flight, "stub-1"), flight.decisions)
 
 
 @pytest.fixture(scope="module")
-def figures_of(flight: Flight) -> Drawn:
-    """The figures of that flight."""
-    tallies = {"aic_vds": flight.tally}
-    return drawings(summary_of(flight, "stub-1"), SHORT, flight.decisions, tallies, flight.sensor_xy)
+def drawn(flight: Flight, figures_of: Drawn) -> str:
+    """The flight's page."""
+    return page(flight, figures=figures_of)
 
 
 class Page(HTMLParser):
@@ -185,10 +193,10 @@ def test_the_costliest_decisions_come_first() -> None:
     assert [d.step for d in costliest(flown[:9])] == [6, 5, 4, 3, 2, 1, 8]
 
 
-def test_a_flight_without_costs_has_no_costly_decisions(flight: Flight) -> None:
-    free = [d.model_copy(update={"cost": 0.0}) for d in flight.decisions]
-    assert "No decision cost anything" in page(flight, decisions=free)
-    assert "No decision cost anything" not in page(flight)
+def test_a_flight_without_costs_has_no_costly_decisions(flight: Flight, figures_of: Drawn) -> None:
+    free, summary = [d.model_copy(update={"cost": 0.0}) for d in flight.decisions], summary_of(flight, "stub-1")
+    assert "No decision cost anything" in render_report(summary, SHORT, free, figures_of)
+    assert "No decision cost anything" not in render_report(summary, SHORT, flight.decisions, figures_of)
 
 
 def test_the_page_needs_nothing_but_itself(drawn: str) -> None:

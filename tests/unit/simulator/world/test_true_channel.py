@@ -39,10 +39,11 @@ def test_a_sensors_own_loss_has_its_deviation_and_is_the_same_everywhere() -> No
 @pytest.mark.parametrize("decorrelation_m", [20.0, 50.0, 200.0])
 def test_the_loss_along_the_way_has_the_exponential_correlation(decorrelation_m: float) -> None:
     scenario = CROWD.model_copy(update={"route_shadowing_db": 4.0, "decorrelation_m": decorrelation_m})
-    for apart in (0.2, 0.5, 1.0, 2.0):
-        two = on_a_line(apart * decorrelation_m, 2)
-        here, there = np.array([shadowing(scenario, two, seed) for seed in range(12)]).transpose(1, 0, 2)
-        assert here.std() == pytest.approx(4.0, rel=0.05)
+    gaps = (0.2, 0.5, 1.0, 2.0)
+    places = on_a_line(decorrelation_m, 2)[1] * np.array([0.0, *gaps])[:, None, None]
+    here, *others = np.array([shadowing(scenario, places, seed) for seed in range(12)]).transpose(1, 0, 2)
+    assert here.std() == pytest.approx(4.0, rel=0.05)
+    for apart, there in zip(gaps, others, strict=True):
         assert np.mean(here * there) / np.mean(here * here) == pytest.approx(np.exp(-apart), abs=0.06)
 
 

@@ -261,7 +261,7 @@ features = st.builds(
     geometries | anything,
     id=st.text(max_size=3) | anything,
 )
-quick = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @quick
