@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from tests.support.airframe import GROUND_M, HEIGHT_M, Airframe, Item
 
-TICK_S, HEARTBEAT_S = 0.02, 0.5
+TICK_S, HEARTBEAT_S = 0.02, 0.2
 SPEED, SET_MODE = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.MAV_CMD_DO_SET_MODE
 PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
 # PX4: main mode AUTO, and its sub-modes.

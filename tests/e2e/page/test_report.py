@@ -47,7 +47,9 @@ def opened(visit: Open, run: Path, **context: Any) -> Page:
 
 
 def rows(page: Page, table: str) -> list[list[str]]:
-    return [row.locator("th, td").all_inner_texts() for row in page.locator(f"#{table} tr").all()]
+    script = "rows => rows.map(row => [...row.querySelectorAll('th, td')].map(cell => cell.innerText))"
+    found: list[list[str]] = page.locator(f"#{table} tr").evaluate_all(script)
+    return found
 
 
 def test_every_step_shows_its_records(visit: Open, run: Path) -> None:
@@ -128,7 +130,7 @@ def lost_at(page: Page, index: int) -> str:
     return f"{lost} packet{'' if lost == 1 else 's'}"
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 390), ("light", 1280), ("dark", 1280)])
+@pytest.mark.parametrize(("scheme", "width"), [("light", 390), ("dark", 1280)])
 def test_it_is_accessible_and_fits(visit: Open, run: Path, scheme: str, width: int) -> None:
     page = opened(visit, run, viewport={"width": width, "height": 844}, color_scheme=scheme)
     page.locator("#playback-step").focus()
