@@ -1,4 +1,4 @@
-// What may need the operator: full and nearly full queues, sensors that are not heard, radios, links and batteries.
+// What may need the operator: an LLM that does not decide, full and nearly full queues, sensors that are not heard, radios, links and batteries.
 
 import { at, make, shown } from "./dom.js";
 
@@ -6,10 +6,12 @@ const SOON_STEPS = 2;
 const UNHEARD_STEPS = 10;
 const BATTERY = 0.15;
 const MOST_NAMED = 12;
+const LLM_FAULTS = ["degraded", "unavailable"];
 
-/** Show a mission's alarms, or nothing where there are none. */
-export function showAlarms(mission) {
+/** Show a mission's alarms, or nothing where there are none; `ready`: the edge's answer to `/readyz`. */
+export function showAlarms(mission, ready) {
   const found = alarms(mission.now, mission.scenario.queue_capacity);
+  if (mission.about.asks && LLM_FAULTS.includes(ready?.llm)) found.unshift([`LLM ${ready.llm}`, [ready.detail ?? "the edge's log has the reason"]]);
   const key = JSON.stringify(found);
   if (showAlarms.key === key) return;
   showAlarms.key = key;

@@ -25,6 +25,7 @@ let drawing = false;
 let paused = false;
 let remark = null;
 let mayCommand = false;
+let ready = null;
 
 const feed = new Feed((id) => mission?.decisions.has(id) && open(mission.decisions.get(id), mission.about.asks));
 const map = new MissionMap((kind, id) => {
@@ -58,6 +59,9 @@ async function list() {
         soon();
       }
       badge();
+      const before = JSON.stringify(ready);
+      ready = await ask("readyz").catch(() => null);
+      if (mission && JSON.stringify(ready) !== before) soon();
       const next = wanted ?? told.newest ?? told.missions.find((one) => one.mode)?.mission_id ?? null;
       if (next === null) nothing(told);
       else if (next !== following) follow(next);
@@ -213,7 +217,7 @@ function draw() {
   feed.update(mission);
   charts.update(mission);
   showNumbers(mission);
-  showAlarms(mission);
+  showAlarms(mission, ready);
   operator.update(mission, mayCommand);
   badge();
   document.title = `${mission.id} · AIC-VDS`;

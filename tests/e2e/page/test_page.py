@@ -11,6 +11,8 @@ from typing import Any
 
 import httpx
 import pytest
+from fastapi import FastAPI
+from fastapi.responses import JSONResponse
 from playwright.sync_api import expect
 
 from service.api.app import create_app
@@ -309,6 +311,18 @@ def test_alarms_name_the_sensors(visit: Open, edge: str, report: Report) -> None
     expect(alarms).to_contain_text("Battery below 15%: S1 (4%)")
     expect(page.locator("#badge")).to_have_text("Flying")
     assert violations(page) == []
+
+
+def test_an_llm_of_no_use_is_an_alarm_in_its_servers_words(visit: Open, report: Report) -> None:
+    app = FastAPI()
+    app.post("/v1/chat/completions")(lambda: JSONResponse({"error": {"message": f"no quota {HOSTILE}"}}, 500))
+    with serving(app) as llm, serving(create_app(Settings(mode="guided", llm_url=f"{llm}/v1"))) as edge:
+        httpx.post(f"{edge}/decide", json=report(mission_id="unheard"), timeout=PATIENCE_S)
+        page = visit(f"{edge}/?mission=unheard")
+        expect(page.locator("#alarm-list")).to_contain_text(f"HTTP 500: no quota {HOSTILE}"[:60])
+        assert page.evaluate("window.hacked") is None
+        assert violations(page) == []
+        page.close()
 
 
 def test_alarms_name_bad_links_and_dead_radios(visit: Open, edge: str, report: Report) -> None:
