@@ -1,7 +1,5 @@
 """The errors of a call to a vehicle."""
 
-from __future__ import annotations
-
 from simulator.errors import RunFailed
 
 

@@ -1,7 +1,5 @@
 """Refusals of requests, which ``api/`` turns into problem documents."""
 
-from __future__ import annotations
-
 from http import HTTPStatus
 
 from shared.wire.problem import INCOMPLETE

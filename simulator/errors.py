@@ -1,7 +1,5 @@
 """How a command ends that cannot do what it is asked to."""
 
-from __future__ import annotations
-
 # The exit code after Ctrl-C or SIGTERM.
 INTERRUPTED = 130
 

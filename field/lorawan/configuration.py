@@ -1,7 +1,5 @@
 """The file of ``aicvds mqtt``: the broker, the network's names, the payload's fields, and the sensor of each device."""
 
-from __future__ import annotations
-
 import tomllib
 from collections import Counter
 from pathlib import Path

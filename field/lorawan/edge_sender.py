@@ -1,7 +1,5 @@
 """Readings sent to the edge: in batches by mission, retried while it is unavailable, dropped where it refuses them."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The Prometheus metrics of ``aicvds mqtt``. No label names a device, sensor or mission."""
 
-from __future__ import annotations
-
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 
 _AGE_BUCKETS_S = (0.5, 1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600)

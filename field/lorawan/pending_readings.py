@@ -1,7 +1,5 @@
 """A broker's messages: the newest reading of each device is buffered for the edge, and every message is counted."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import deque

@@ -1,7 +1,5 @@
 """The subscription at an MQTT broker, which survives the broker's absence."""
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 

@@ -4,8 +4,6 @@ ChirpStack v4 (``integration.proto``, as JSON) and The Things Stack v3 (data for
 empty or zero may be missing.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass

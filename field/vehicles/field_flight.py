@@ -4,8 +4,6 @@ All UAVs of a flight are at the same waypoint: every ``step_s`` seconds of the m
 the speed that brings it to its next waypoint in time. There it collects from the decided sensor.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """The pilot of real UAVs: each asks the edge, all at once, and decides on board while the edge is silent."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Mapping
 

@@ -1,7 +1,5 @@
 """One command's flight of real UAVs: connect, check, wait for the missions, fly, write the log."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os

@@ -1,7 +1,5 @@
 """One UAV of a flight: its vehicle, its path, what it heard, and whether it can be commanded now."""
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """The beacons that one UAV has heard, as the observation that the edge and the policies on board decide from."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

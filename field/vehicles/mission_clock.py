@@ -1,7 +1,5 @@
 """The time of a flight of real UAVs, or of vehicles that a simulator moves faster."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from typing import Protocol

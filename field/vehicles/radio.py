@@ -1,7 +1,5 @@
 """The interface of the data link to the ground sensors, which MAVLink does not have."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Simulated sensors and their radios, for trials: the vehicles are real, the packets are not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

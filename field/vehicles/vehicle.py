@@ -1,7 +1,5 @@
 """The interface of a vehicle and its autopilot that the flight of real UAVs uses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, Protocol
 

@@ -1,7 +1,5 @@
 """The application: wiring, lifespan and middleware. Importing this module has no side effects."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

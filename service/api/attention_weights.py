@@ -1,7 +1,5 @@
 """A mission's current attention weights, with which its UAVs prune their reports on board."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 from http import HTTPStatus

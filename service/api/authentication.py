@@ -1,7 +1,5 @@
 """Authentication by API key, with scopes and a rate limit for each key."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """``GET /``, the page, and its data: the list of missions, one mission's events, and a decision's prompt."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import aclosing, suppress

@@ -1,7 +1,5 @@
 """Limits on requests: their concurrency, and the time and size of a body, before and after decompression."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import zlib

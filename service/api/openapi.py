@@ -1,7 +1,5 @@
 """The OpenAPI document: FastAPI's, with problem documents for errors and an example of every request and answer."""
 
-from __future__ import annotations
-
 import json
 from http import HTTPStatus
 from importlib.resources import files

@@ -1,7 +1,5 @@
 """Errors as RFC 9457 problem documents that name the field at fault."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The HTTP interface: thin routes over the engine."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 from collections.abc import Callable, Coroutine

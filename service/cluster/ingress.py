@@ -1,7 +1,5 @@
 """The ingress of a cluster: it forwards each request to the edge that owns its mission, and returns its answer."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable

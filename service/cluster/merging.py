@@ -1,7 +1,5 @@
 """Answers for a whole cluster, from what each of its edges answers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, zip_longest

@@ -1,7 +1,5 @@
 """The owners of missions as replicas of a Ray Serve deployment."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable

@@ -1,7 +1,5 @@
 """``aicvds serve --ray``: the replicas that own missions, and the ingress in this process."""
 
-from __future__ import annotations
-
 import socket
 
 from starlette.applications import Starlette

@@ -1,7 +1,5 @@
 """The banner of `aicvds serve` after loading: page, deciding mode, store, keys, and the next command."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from service.config.settings import Settings

@@ -1,7 +1,5 @@
 """``aicvds model fetch``: the embedded LLM's weights and the token vocabulary, once, checked, on disk."""
 
-from __future__ import annotations
-
 from rich.console import Console
 
 from service.config.settings import Settings

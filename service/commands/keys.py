@@ -1,7 +1,5 @@
 """``aicvds keys``: make, list and remove an edge's API keys."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path

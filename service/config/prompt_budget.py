@@ -1,7 +1,5 @@
 """An upper bound of a prompt's tokens, before the prompt exists."""
 
-from __future__ import annotations
-
 from shared.wire.schemas import Features, PromptFormat
 
 # Upper bounds in tokens of the embedded model, which has one for each digit: of the static block, and of a row or an

@@ -4,8 +4,6 @@ One of them is the LLM-free policy, :func:`look_ahead`: in every mode it is what
 wrong or down and there is no plan.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

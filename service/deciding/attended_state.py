@@ -1,7 +1,5 @@
 """A UAV's augmented state at a decision, and the sensors that attention keeps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The task of one UAV's decision, and its choice."""
 
-from __future__ import annotations
-
 import asyncio
 from dataclasses import dataclass
 

@@ -16,8 +16,6 @@ The weights and their guarantee are in :mod:`service.learning.trust`; the evalua
 :mod:`service.deciding.rollout_evaluator`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Queries to the LLM, within a deadline: about one UAV's decision, or about all UAVs of a step at once."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

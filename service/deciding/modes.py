@@ -1,7 +1,5 @@
 """The modes of decision: each one's prompt and choice. A mission's mode is one of these objects."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from concurrent.futures import Executor

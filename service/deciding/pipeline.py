@@ -1,7 +1,5 @@
 """The stages of a decision: augment, attend, prompt, choose, enforce, commit."""
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A prompt's view of one UAV's state, and the orders that it follows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Self
 

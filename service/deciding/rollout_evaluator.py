@@ -9,8 +9,6 @@ in a fortified rollout (Bertsekas 2020, Rollout, Policy Iteration, and Distribut
 model, which is the edge's belief, the best candidate is therefore expected to lose no more than the plan.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 A step follows :mod:`shared.world.step_rule` with batteries that last; a property test compares the two.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, Self
 

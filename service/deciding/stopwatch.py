@@ -1,7 +1,5 @@
 """A decision's deadline, and the duration of each of its stages."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A fleet's decisions at one step: one plan, one query to the LLM where it can serve all, and a share of time each."""
 
-from __future__ import annotations
-
 import asyncio
 from time import perf_counter
 

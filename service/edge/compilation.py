@@ -1,7 +1,5 @@
 """Compiling and loading numba's functions in advance, so that no decision waits for either."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """One edge: it resolves a request's mission, decides, makes the answer durable, and reports it."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Awaitable, Callable

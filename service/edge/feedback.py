@@ -1,7 +1,5 @@
 """Outcomes of decisions: applied once, used for training between decisions, and included in checkpoints."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -1,7 +1,5 @@
 """The missions of one service: those in memory, and those that are only in the store."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable
 from typing import TypeVar

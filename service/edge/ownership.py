@@ -1,7 +1,5 @@
 """Ownership of stored missions: all of an exclusive store, or those whose leases this edge has."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import threading

@@ -1,7 +1,5 @@
 """The missions of the store: claimed where other edges may have them, loaded into memory, and listed."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine

@@ -5,8 +5,6 @@ letters, such as ``visit A B every C; max D``. Code reads the letters' values an
 A change of a word here, or of the letters' text, is another version: :data:`service.llm.adapter_version.ORDERS`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -13,8 +13,6 @@ Compiling runs concurrently with decisions, and no decision waits for it. The em
 time and serves decisions first.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

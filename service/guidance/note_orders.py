@@ -5,8 +5,6 @@ an order must occur in the note, as digits or as a word, and two orders may not 
 detects an LLM that invents an order.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

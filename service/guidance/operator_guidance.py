@@ -1,7 +1,5 @@
 """One mission's operator's guidance: the note, the guidance proposed from it, and the confirmed guidance."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from typing import Any, Literal

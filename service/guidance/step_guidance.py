@@ -1,7 +1,5 @@
 """Confirmed guidance for one UAV's next step: the allowed velocities, and the worth of each sensor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """A mission's initial weights: those that ship with the package, or random ones."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.resources import files
 

@@ -4,8 +4,6 @@ A mission stores only numbers, its weights and Adam's moments: an edge serves th
 take more memory than their parameters.
 """
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

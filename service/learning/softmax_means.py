@@ -3,8 +3,6 @@
 ``mean_i = sum_j w_ij v_j / sum_j w_ij`` with ``w_ij = exp(q_i k_j)``, without an array of all pairs.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, Self
 

@@ -3,8 +3,6 @@
 The step has about thirty products of small arrays; each takes longer to call than to compute, so one function has all.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

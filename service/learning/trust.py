@@ -28,8 +28,6 @@ The best candidate is flown, not a draw, so q(b) is no propensity: an error of t
 never flown stays uncorrected. That is the price of not exploring; a draw would pay for it in lost packets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import exp
 from typing import Any, NamedTuple

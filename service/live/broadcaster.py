@@ -4,8 +4,6 @@ A listener takes the next update when the network has accepted the one before. A
 slot: the updates that it misses are dropped, and it continues from a snapshot. A mission without listeners has no task.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

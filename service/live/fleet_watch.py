@@ -1,7 +1,5 @@
 """A fleet's problems in its reports: overflows by step, and silent sensors."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """The newest decisions of all missions, for pages that are opened later; bounded in number and size."""
 
-from __future__ import annotations
-
 import time
 import uuid
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """The page's JSON of a mission: a snapshot, or the changes since the last update."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

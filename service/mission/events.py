@@ -1,7 +1,5 @@
 """The events that change a mission: the journal writes them, and recovery replays them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Idempotency keys: a request repeated under its key gets the same answer, even after a restart."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 from collections.abc import Awaitable, Callable

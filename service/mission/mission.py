@@ -1,7 +1,5 @@
 """One fleet's state: visiting records, arrival rates, reservations, experiences, pending decisions, learner."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """The answer of ``GET /missions/{id}``."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from service.mission.mission import Mission

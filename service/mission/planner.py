@@ -1,7 +1,5 @@
 """The planner: receding-horizon plans for a whole fleet, without an LLM, searched outside the event loop."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Collection

@@ -1,7 +1,5 @@
 """A mission's prompt template, and whether the LLM's context is large enough for its prompts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from service.config.prompt_budget import prompt_tokens

@@ -3,8 +3,6 @@
 A report may leave out what the UAV's reference report or an earlier report has (uplink ``delta``).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """A mission's complete spec: the service's settings and the mission's mode give the defaults."""
 
-from __future__ import annotations
-
 from typing import Literal, Self
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Sensors' own readings: each is checked, placed in a step of its mission by its age, and merged once."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The operator's orders to visit sensors, and their deadlines met and missed."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """Logs, as text for people or as JSON for machines; each line of a request has the fields bound to that request."""
 
-from __future__ import annotations
-
 import atexit
 import logging
 import logging.handlers

@@ -1,7 +1,5 @@
 """Every Prometheus metric of the edge. No label names a mission, UAV or sensor: there are too many of them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version

@@ -1,7 +1,5 @@
 """Limits that uvicorn lacks: the number of connections, the size and time of request heads, the time of answers."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -1,7 +1,5 @@
 """Settings of glibc's malloc, so that freed memory returns to the system early."""
 
-from __future__ import annotations
-
 import ctypes
 
 # Names and numbers of mallopt's options (malloc.h).

@@ -3,8 +3,6 @@
 This module imports nothing slow such as torch.
 """
 
-from __future__ import annotations
-
 import asyncio
 import gc
 from collections.abc import Awaitable, Callable, Mapping

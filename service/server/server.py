@@ -1,7 +1,5 @@
 """The HTTP server: uvicorn, with an orderly shutdown."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from collections.abc import Callable

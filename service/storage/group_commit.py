@@ -7,8 +7,6 @@ continue, and requests whose changes must be durable are refused. Only the chang
 taken over are dropped.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

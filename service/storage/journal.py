@@ -3,8 +3,6 @@
 The events of each mission are numbered. From time to time a checkpoint of the mission's whole state replaces them.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The lock of a SQLite file, which belongs to one edge at a time; in PostgreSQL each mission has a lease."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time

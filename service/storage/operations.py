@@ -3,8 +3,6 @@
 Each has the epoch of the lease under which it was made; 0 in a store that is exclusive to one edge.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from service.mission.events import Event

@@ -1,7 +1,5 @@
 """The writer of a SQLite store: a separate process, connected by a socket."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket

@@ -1,7 +1,5 @@
 """Recovery of a mission from the store: its last checkpoint, and the events since then, replayed."""
 
-from __future__ import annotations
-
 from service.config.settings import Settings
 from service.mission.events import Decided, Event, GuidanceChanged, ReadingsMerged, Reported, Settled
 from service.mission.idempotency import Answered

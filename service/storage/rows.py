@@ -3,8 +3,6 @@
 Events and states are MessagePack, with numpy arrays as an extension type. Unpacking runs no code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module

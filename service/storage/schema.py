@@ -1,7 +1,5 @@
 """The store's tables, as the newest migration leaves them."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 
 # The newest version in service/storage/migrations/versions.

@@ -8,8 +8,6 @@ The process ends when the socket is closed, after its last commit, even if the e
 so that it takes 17 MB and starts in a twentieth of a second.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -5,8 +5,6 @@ One edge uses a SQLite file at a time; several edges share a PostgreSQL database
 transaction that writes a checkpoint deletes the events that it covers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The interface of a store's writer: a process for SQLite, a thread for PostgreSQL."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Protocol
 

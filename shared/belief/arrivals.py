@@ -1,7 +1,5 @@
 """A fleet's estimate of the arrivals at the sensors: rates, their uncertainty, and bursts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

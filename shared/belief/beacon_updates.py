@@ -5,8 +5,6 @@ Arrays ``(J,)`` are by sensor, those of :class:`~shared.belief.fleet_belief.Flee
 tuple of them takes five times as long.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

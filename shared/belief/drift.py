@@ -1,7 +1,5 @@
 """The drift of a fleet: the true distances flown, learned from the UAVs' reported progress."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A fleet's belief: the reports of all its UAVs merged, and rolled forward to the present step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from copy import deepcopy

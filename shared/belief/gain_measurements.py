@@ -1,7 +1,5 @@
 """The measurements of one report's gains."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Without numba it is plain Python: a measurement takes 2 ms, the comparison of th
 Symmetric matrices are packed, as :class:`~shared.belief.radio_map_arrays.Measurements` has them.
 """
 
-from __future__ import annotations
-
 import math
 
 from shared.belief.radio_map_arrays import (

@@ -1,7 +1,5 @@
 """A fleet's learned channel: the formula, the radio map, failing radios, and the observed rate."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

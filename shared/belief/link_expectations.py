@@ -1,7 +1,5 @@
 """Expected links of a UAV by the formula and a radio map, compiled as :mod:`shared.belief.kriging` is."""
 
-from __future__ import annotations
-
 import math
 
 from shared.kit.compiled import compiled, inlined

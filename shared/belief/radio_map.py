@@ -1,7 +1,5 @@
 """The radio map: the excess of each sensor's path loss over the formula, learned from the gains of its beacons."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The arrays of a radio map."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from shared.world.channel import FloatArray, IntArray

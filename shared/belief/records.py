@@ -1,7 +1,5 @@
 """The visiting record and the arrival rate of each sensor, from visits and beacons of a fleet or of one UAV."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shadowing: the covariance of the excess losses of one sensor's links at several places."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """The likelihoods of the kinds of shadowing for a radio map, compiled as :mod:`shared.belief.kriging` is."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

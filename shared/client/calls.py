@@ -1,7 +1,5 @@
 """The calls to an edge, each described once: its request, its answer, and what is checked of it."""
 
-from __future__ import annotations
-
 import uuid
 from collections.abc import Callable, Collection
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The errors of a call to an edge."""
 
-from __future__ import annotations
-
 from shared.wire.problem import Problem
 
 

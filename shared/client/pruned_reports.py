@@ -1,7 +1,5 @@
 """Pruning on board: a UAV scores the sensors with its mission's attention, in numpy, and reports the k best."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Encoders of a UAV's reports: the full report, or its changes since the last answered one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar
 

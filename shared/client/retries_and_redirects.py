@@ -4,8 +4,6 @@ A request waits only in the two functions given to :class:`Requests`: the asynch
 loop, and the blocking client functions that never suspend.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Awaitable, Callable

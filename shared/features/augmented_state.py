@@ -1,7 +1,5 @@
 """State augmentation: a UAV's report completed by the edge's knowledge, with urgencies and reach, as features."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Self

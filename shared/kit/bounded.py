@@ -1,7 +1,5 @@
 """A dict of bounded weight that drops its oldest entries."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Generic, TypeVar
 

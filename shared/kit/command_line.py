@@ -1,7 +1,5 @@
 """The ``aicvds`` command: finds its subcommands by entry point and imports only the one that it runs."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal

@@ -1,7 +1,5 @@
 """Functions that numba compiles to machine code at their first call, and that are plain Python where it is missing."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar

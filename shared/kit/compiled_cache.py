@@ -1,7 +1,5 @@
 """The cache locator of compiled functions for :mod:`shared.kit.compiled`."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from functools import cache

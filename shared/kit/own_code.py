@@ -1,7 +1,5 @@
 """Code of the user's own, named as ``MODULE:NAME`` in an option."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from typing import Any

@@ -1,7 +1,5 @@
 """The connection of a command to Ray: to one started here for the command, or to a cluster."""
 
-from __future__ import annotations
-
 import logging
 import os
 import secrets

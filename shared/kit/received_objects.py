@@ -1,7 +1,5 @@
 """A limit on the names of a JSON object: an error for each of very many names would block the event loop."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import ValidationInfo

@@ -4,8 +4,6 @@ Processes that know the same names rank them alike for a key, in whatever order 
 only its own keys move, evenly to the others; if it is added again, they return.
 """
 
-from __future__ import annotations
-
 from hashlib import blake2b
 
 

@@ -1,7 +1,5 @@
 """A validation error in plain English: what is wrong with a field, and which name may have been meant."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches

@@ -4,8 +4,6 @@ Kirkpatrick, Gelatt and Vecchi, Science 220, 1983. The cost is the exact expecta
 :class:`shared.planning.queue_chains.QueueChains`.
 """
 
-from __future__ import annotations
-
 import math
 import time
 

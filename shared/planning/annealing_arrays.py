@@ -1,7 +1,5 @@
 """The arrays of :mod:`shared.planning.annealing`: of one problem, of the current plan and of a changed plan."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, Self
 
 import numpy as np

@@ -4,8 +4,6 @@ Sensors lose packets independently of each other. So the odds of each sensor's q
 losses expected after every step, and a changed visit costs one product of the two.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from shared.kit.compiled import compiled, inlined

@@ -1,7 +1,5 @@
 """The problem of planning for a fleet, and the course of the sensors' queues under a plan."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """A quick plan, as the start of a search and as a fallback: in every step each UAV looks one step ahead."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The sensors' queues as Markov chains: the losses that a plan expects where links and arrivals are uncertain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

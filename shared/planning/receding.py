@@ -1,7 +1,5 @@
 """Receding-horizon planning over a fleet's belief: plan some steps for all UAVs, fly the first, and plan again."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Collection

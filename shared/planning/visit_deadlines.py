@@ -1,7 +1,5 @@
 """Visit deadlines: whether a sensor that is to be visited at least once in any n consecutive steps was."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 

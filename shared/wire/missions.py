@@ -1,7 +1,5 @@
 """The edge's answers about its missions: one mission's status, its attention weights, the list of all."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import ConfigDict, Field

@@ -1,7 +1,5 @@
 """Errors on the wire: the body of every answer of the edge outside 2xx."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, Field
 
 # The type of a problem with an omitted part of a report that the edge does not have: the client is to send all of it.

@@ -1,7 +1,5 @@
 """The wire of sensors' own readings, which reach the edge by another network than the UAVs' radios, such as LoRaWAN."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator

@@ -1,7 +1,5 @@
 """Reasons why a decision is not the LLM's, and the classes of these reasons."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 Reason = Literal[

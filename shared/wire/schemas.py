@@ -4,8 +4,6 @@ Columns are parallel arrays, one entry for each sensor. A sensor that a UAV has 
 surveyed position (``x``, ``y``), and ``null`` in the four columns that only a beacon can fill.
 """
 
-from __future__ import annotations
-
 import operator
 from typing import Annotated, Literal, Self
 

@@ -1,7 +1,5 @@
 """A report's columns as numpy's arrays."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import chain
 

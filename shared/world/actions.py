@@ -1,7 +1,5 @@
 """A UAV's action in one step: the sensor that it collects from, and its velocity."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,7 +1,5 @@
 """The air-to-ground channel: path loss, gain and rate (Al-Hourani et al., 2014, angles in degrees)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Self

@@ -1,7 +1,5 @@
 """Scenarios: every number of the world in one validated model, and the presets by name."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal, Self
 

@@ -17,8 +17,6 @@ each for ``w_i`` joules. Sensor j has a queue ``q_j`` of at most W packets and `
 The loss of the step (Eq. 5) is the sum of all f and all g.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Trajectories, for the edge and the simulator: the position at an arc length, and the arc length of a position."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Differences of a world from the edge's planning model: fields of a scenario that only the simulator reads."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import BaseModel, Field

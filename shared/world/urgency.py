@@ -5,8 +5,6 @@ Look-ahead chooses the sensor j and the velocity v of greatest ``U_j min(q_j, pa
 (:mod:`shared.planning.greedy`) and, compiled, for the flights of the rollout evaluator.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

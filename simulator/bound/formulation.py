@@ -20,8 +20,6 @@ Batteries enter only as the packets that each can pay for over its best link, al
 higher cost of a weak link, and so keeps every plan that the world allows: the proven bound stays valid.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from functools import cached_property

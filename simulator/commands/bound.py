@@ -1,7 +1,5 @@
 """``aicvds bound``: the least that any fleet could have lost in one world, all arrivals known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

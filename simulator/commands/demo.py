@@ -1,7 +1,5 @@
 """``aicvds demo``: an edge, its LLM and a whole mission on this machine, in one command."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """``aicvds mission``: make a mission at an edge for a world, and print a request that works for it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -1,7 +1,5 @@
 """Checks of the options that several commands share."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

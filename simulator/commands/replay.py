@@ -1,7 +1,5 @@
 """``aicvds replay``: send a logged mission's requests again, to another model, prompt, k or mode."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import sys

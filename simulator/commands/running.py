@@ -1,7 +1,5 @@
 """Running a command: parsing its command line, and turning its errors into messages and exit codes."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Callable, Iterator

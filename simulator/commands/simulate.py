@@ -1,7 +1,5 @@
 """``aicvds simulate``: fly one mission against an edge and leave its summary, decisions and report."""
 
-from __future__ import annotations
-
 import shlex
 from contextlib import suppress
 from dataclasses import dataclass

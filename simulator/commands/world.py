@@ -1,7 +1,5 @@
 """``aicvds world``: a world's folder from flight plans, and flight plans from a world's folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The edge of a flight: its clients, the wait for it, and the mission made there."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """One flight: the UAVs fly a world step by step as their pilot decides."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 

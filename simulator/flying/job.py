@@ -1,7 +1,5 @@
 """The settings of one simulated mission."""
 
-from __future__ import annotations
-
 import secrets
 from dataclasses import dataclass
 from pathlib import Path

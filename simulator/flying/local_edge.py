@@ -1,7 +1,5 @@
 """An edge in a process on this machine."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

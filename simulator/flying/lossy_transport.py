@@ -1,7 +1,5 @@
 """An HTTP transport that delays and loses requests, as the radio link of a scenario with a lossy uplink."""
 
-from __future__ import annotations
-
 import random
 import time
 

@@ -1,7 +1,5 @@
 """The pilots of a fleet: a local policy, or an edge with a fallback on board."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

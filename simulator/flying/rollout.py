@@ -1,7 +1,5 @@
 """One mission flown by a local policy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from simulator.policies.policy import LearningPolicy, Policy

@@ -1,7 +1,5 @@
 """Receding-horizon planning: model predictive control as the conventional alternative to an LLM."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from shared.belief.fleet_belief import FleetBelief

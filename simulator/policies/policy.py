@@ -1,7 +1,5 @@
 """The interface of a scheduling policy."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 from shared.world.scenario import Scenario

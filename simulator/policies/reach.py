@@ -1,7 +1,5 @@
 """Rules that the hand-written policies share: the sensors in reach, and the choice without any."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Scheduling policies that need no edge, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from shared.kit.own_code import imported

@@ -1,7 +1,5 @@
 """One decision of a flight: one line of ``decisions.jsonl``."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from shared.wire.reasons import LLM_FAILURES

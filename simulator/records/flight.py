@@ -1,7 +1,5 @@
 """A mission's flight as it is recorded: its decisions, each step's losses, the sensors' and UAVs' states."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version

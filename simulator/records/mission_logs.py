@@ -5,8 +5,6 @@ further line is one ``POST /decide`` in the order sent. A request is the full re
 outcome that it carried. The outcomes of the last decisions are in ``decisions.jsonl``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType

@@ -1,7 +1,5 @@
 """The operator's part of a flight: the note, the orders, and the visit deadlines met and missed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 from shared.planning.visit_deadlines import count_deadlines

@@ -1,7 +1,5 @@
 """The part of a flight's summary that only real UAVs have: sums by UAV, and decisions not carried out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from simulator.records.decision import Decision

@@ -1,7 +1,5 @@
 """The base of every record that a run leaves on disk."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict
 
 

@@ -1,7 +1,5 @@
 """The folder of a run: the names of its files, and making it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Means, percentiles and Jain's index over decisions."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 

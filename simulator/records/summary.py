@@ -1,7 +1,5 @@
 """``summary.json``: the result of one mission."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime

@@ -1,7 +1,5 @@
 """The true state of a flight over its steps, for the report's playback."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

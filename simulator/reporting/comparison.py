@@ -1,7 +1,5 @@
 """Several missions side by side: a table of their numbers, and a page with their figures."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

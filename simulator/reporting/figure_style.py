@@ -1,7 +1,5 @@
 """The style of the report's figures: the widths of a two-column paper, inline SVG for the page and files for print."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ The colours are those of Okabe and Ito, distinguishable for colour-blind readers
 too.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 

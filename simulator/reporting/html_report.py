@@ -1,7 +1,5 @@
 """``report.html``: a page about one mission that needs no other file."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """``replay.json``: the agreement of a replayed mission with the logged one, and the costs of both."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The results of a flight in the folder of its log: the summary, the report, and the outcome on the terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The words of a mission's report: policy names, notices and the outcome in one sentence."""
 
-from __future__ import annotations
-
 from simulator.records.summary import Summary
 
 # The share of LLM decisions from which a mission of mode `llm` counts as a result of the LLM.

@@ -1,7 +1,5 @@
 """A geofence of a world: an area that no UAV may leave, or one that none may enter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """From longitudes and latitudes to metres in a scenario's square area, and back."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """The simulated world, in the terms of a PettingZoo environment; the class docstring is its specification."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, cast
 

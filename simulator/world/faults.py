@@ -1,7 +1,5 @@
 """The faults of a mission: dead radios, departing UAVs, and a lower share of the links' rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

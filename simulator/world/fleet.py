@@ -1,7 +1,5 @@
 """A fleet on its trajectories: the start and the progress of each UAV."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

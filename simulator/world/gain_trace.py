@@ -1,7 +1,5 @@
 """A recorded gain trace: the excess loss of a UAV's links along the way that it flies."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

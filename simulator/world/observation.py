@@ -1,7 +1,5 @@
 """A UAV's observation of the world, and the result of a step of the fleet."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, TypedDict
 

@@ -1,7 +1,5 @@
 """A UAV's observation as a request to the edge."""
 
-from __future__ import annotations
-
 from shared.wire.schemas import DecideRequest, Outcome, SensorColumns
 from shared.world.channel import FloatArray
 from simulator.world.observation import Observation

@@ -1,7 +1,5 @@
 """The ground sensors of one world: their positions, queues, arrivals and batteries."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple, Self

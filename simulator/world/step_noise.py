@@ -1,7 +1,5 @@
 """Random numbers of an instant of a world, which do not depend on the time and order of the calls."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

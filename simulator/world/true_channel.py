@@ -1,7 +1,5 @@
 """The true channel of a world: what its links lose beyond the mean path loss, and the share of their rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """The differences of one world, or a batch of worlds, from an edge's planning model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Self
 

@@ -1,7 +1,5 @@
 """The wind: how far a UAV flies at a velocity."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

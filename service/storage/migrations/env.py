@@ -1,7 +1,5 @@
 """The migrations; alembic runs this on the connection that :class:`service.storage.store.Store` passes."""
 
-from __future__ import annotations
-
 from alembic import context
 
 from service.storage.schema import metadata

@@ -1,7 +1,5 @@
 """``scenario.toml``: the fields of a world's scenario that differ from scenario ``paper``."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Reading one of a world's files, of a bounded size."""
 
-from __future__ import annotations
-
 import codecs
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``world.geojson``: the sensors' sites, the UAVs' trajectories, the pipeline and fences, as features on the globe."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

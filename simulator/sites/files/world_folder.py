@@ -4,8 +4,6 @@ docs/guides/own-world.md specifies the files ``world.geojson``, ``scenario.toml`
 A seed draws each UAV's start along its trajectory, the initial queues and, without a trace, the arrivals.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 A trajectory of a world is flown for as long as the mission lasts, so the items end in a jump to the first waypoint.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

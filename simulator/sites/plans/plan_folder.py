@@ -1,7 +1,5 @@
 """Flight plans into a world's folder, and a world's trajectories as flight plans."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence
