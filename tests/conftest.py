@@ -84,6 +84,8 @@ def certificates() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("httpx._transports.default.create_ssl_context", context)
+        # The edge's own client of LLM servers asks for one too.
+        patch.setattr("httpx.create_ssl_context", context)
         yield
 
 

@@ -75,12 +75,9 @@ def create_app(settings: Settings, store: Store | None = None) -> FastAPI:
         lifespan=lifespan,
         # The edge's own traces have a span for each decision; FastAPI would look for a provider at each request.
         telemetry={"tracing": False, "metrics": False, "logs": False},
-        # Clients made from the schema then have functions of these names.
-        generate_unique_id_function=lambda route: route.name,
     )
-    app.include_router(decisions)
-    app.include_router(router)
-    app.include_router(live_routes.router)
+    # include_router would build each route once more, on the first request.
+    app.router.routes += [*decisions.routes, *router.routes, *live_routes.router.routes]
     app.mount("/static", live_routes.ASSETS, name="static")
     app.add_middleware(RequestLimits, most=settings.max_requests, limit=settings.max_body_bytes)
     if settings.keys is not None:

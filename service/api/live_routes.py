@@ -4,6 +4,7 @@ import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import aclosing, suppress
 from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path
 
 from fastapi import APIRouter, Depends, Request
@@ -22,7 +23,7 @@ from shared.wire.missions import DecisionPrompt, MissionLine, MissionList
 from shared.wire.reasons import LLM_NOT_ASKED
 from shared.wire.schemas import DecisionId, MissionId
 
-router = APIRouter()
+router = APIRouter(generate_unique_id_function=attrgetter("name"))
 
 STATIC = Path(live.__file__).parent / "static"
 # Only the edge's own files are allowed: no inline scripts or styles, no frames, no requests to other hosts.

@@ -3,6 +3,7 @@
 import asyncio
 import re
 from collections.abc import Callable, Coroutine
+from operator import attrgetter
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Request, Response
@@ -61,8 +62,9 @@ class DecideRoute(APIRoute):
         return handler
 
 
-router = APIRouter()
-decisions = APIRouter(route_class=DecideRoute)
+# Clients made from the schema have functions of the routes' names.
+router = APIRouter(generate_unique_id_function=attrgetter("name"))
+decisions = APIRouter(route_class=DecideRoute, generate_unique_id_function=attrgetter("name"))
 
 
 async def _engine(request: Request) -> Engine:

@@ -14,6 +14,14 @@ def made_missions(made_on_decide: None) -> None:
     """Only test_unknown_missions.py is about edges by default."""
 
 
+@pytest.fixture(autouse=True, scope="session")
+def briefly_planned() -> Iterator[None]:
+    """The planner searches in one run: its plans' quality is the subject of the simulator's tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shared.planning.receding._RUNS", [(0, 0.05)])
+        yield
+
+
 @pytest.fixture(scope="module")
 def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     with warnings.catch_warnings():

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from tests.support.service_fixtures import address, left_alone, made_missions, postgres
+from tests.support.service_fixtures import address, briefly_planned, left_alone, made_missions, postgres
 
-__all__ = ["address", "left_alone", "made_missions", "postgres"]
+__all__ = ["address", "briefly_planned", "left_alone", "made_missions", "postgres"]
