@@ -140,7 +140,7 @@ def least_by_flying(site: Site, seed: int) -> int:
     flights = np.array(list(product(joint, repeat=world.steps)))
     batch = VectorWorld(world)
     batch.start(stacked([Draw.one(world, np.random.SeedSequence(seed))] * len(flights)))
-    lost = [batch.step(flights[:, step, :, 0], flights[:, step, :, 1])[1].lost_packets for step in range(world.steps)]
+    lost = [batch.fly(flights[:, step, :, 0], flights[:, step, :, 1])[1].lost_packets for step in range(world.steps)]
     return int(np.sum(lost, axis=0).min())
 
 
