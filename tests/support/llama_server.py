@@ -1,7 +1,7 @@
-"""A llama.cpp server in a process of its own: ``python -m tests.support.llama_server PORT NAME GGUF SLOTS``.
+"""A llama.cpp server in a process of its own: ``python -m tests.support.llama_server PORT NAME GGUF SLOTS [ADAPTER]``.
 
-It is what ``llama-server --port PORT --alias NAME --model GGUF --parallel SLOTS`` is, out of the package that the edge
-embeds, with one thread.
+It is what ``llama-server --port PORT --alias NAME --model GGUF --parallel SLOTS --lora ADAPTER`` is, out of the package
+that the edge embeds, with one thread.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from contextlib import contextmanager
 _CONTEXT = 4096
 
 
-def serve(port: int, name: str, gguf: str, slots: int) -> None:
+def serve(port: int, name: str, gguf: str, slots: int, adapter: str | None = None) -> None:
     """Serve until the process is killed."""
     import xllamacpp
 
@@ -26,6 +26,8 @@ def serve(port: int, name: str, gguf: str, slots: int) -> None:
     params.port = port
     params.n_parallel, params.n_ctx = slots, slots * _CONTEXT
     params.cpuparams.n_threads = params.cpuparams_batch.n_threads = 1
+    if adapter is not None:
+        params.lora_adapters = [xllamacpp.CommonAdapterLoraInfo(adapter, 1.0)]
     # What is in no slot is read again.
     params.cache_ram_mib = 0
     params.verbosity = 1
@@ -35,10 +37,12 @@ def serve(port: int, name: str, gguf: str, slots: int) -> None:
 
 
 @contextmanager
-def running(port: int, name: str, gguf: str, slots: int) -> Iterator[subprocess.Popen[bytes]]:
+def running(
+    port: int, name: str, gguf: str, slots: int, adapter: str | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
     """The server as a process, which may still load; killed at the end."""
     command = [sys.executable, "-m", "tests.support.llama_server", str(port), name, gguf, str(slots)]
-    process = subprocess.Popen(command)
+    process = subprocess.Popen(command if adapter is None else [*command, adapter])
     try:
         yield process
     finally:
@@ -47,4 +51,4 @@ def running(port: int, name: str, gguf: str, slots: int) -> Iterator[subprocess.
 
 
 if __name__ == "__main__":
-    serve(int(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4]))
+    serve(int(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4]), *sys.argv[5:])
