@@ -98,9 +98,10 @@ def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
     assert [step.reference is not None for step in steps].count(True) > 100
     for features in ("paper", "reach"):
         weights = []
-        for _ in range(2):
+        # Once as a user starts it, and once more in this process.
+        for run in (run_lab, run_lab_here):
             options = ("--out", str(checkpoint), "--epochs", "1", "--features", features)
-            trained = run_lab("pretrain", str(recorded), *options)
+            trained = run("pretrain", str(recorded), *options)
             assert trained.returncode == 0, trained.stderr
             assert "held-out loss" in trained.stdout
             assert "look_ahead's sensor in the top 5" in trained.stdout
@@ -112,10 +113,10 @@ def test_explore_and_pretrain_end_to_end(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_papers_target_learns_something_else(tmp_path: Path) -> None:
     recorded, weights = tmp_path / "r.jsonl.gz", []
-    assert run_lab("explore", "--out", str(recorded), "--missions", "0", "--untaught", "2").returncode == 0
+    assert run_lab_here("explore", "--out", str(recorded), "--missions", "0", "--untaught", "2").returncode == 0
     for target in ("return", "immediate"):
         out = tmp_path / f"{target}.pt"
-        trained = run_lab("pretrain", str(recorded), "--out", str(out), "--epochs", "1", "--target", target)
+        trained = run_lab_here("pretrain", str(recorded), "--out", str(out), "--epochs", "1", "--target", target)
         assert trained.returncode == 0, trained.stderr
         weights.append(torch.load(out, weights_only=True)["weights"]["attention.score.weight"])
     assert not torch.equal(*weights)

@@ -38,7 +38,7 @@ def weights_of(folder: Path) -> list[list[float]]:
 @pytest.mark.long
 def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    ended = run_lab("train", "mappo", *EPISODES, "--out", str(whole))
+    ended = run_lab_here("train", "mappo", *EPISODES, "--out", str(whole))
     assert ended.returncode == 0, ended.stderr
     command = [sys.executable, "-c", STANDS_STILL, "mappo", *EPISODES, "--out", str(killed), "--save-s", "0"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -56,7 +56,7 @@ def test_killed_and_resumed_it_ends_with_the_weights_of_a_training_left_alone(tm
         left = {path.suffix for path in folder.glob("mappo.*")}
         assert left == {".pt", ".csv", ".png", ".svg"}
         assert list((folder / "tensorboard").glob("events.*"))
-    again = run_lab("train", "mappo", *EPISODES, "--out", str(whole))
+    again = run_lab_here("train", "mappo", *EPISODES, "--out", str(whole))
     assert again.returncode == 2
     assert "has a training: give --resume" in again.stderr
 
