@@ -13,6 +13,8 @@ import subprocess
 import sys
 import sysconfig
 import zipfile
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -120,8 +122,13 @@ def build(image: str, folder: Path, version: str) -> Path:
     return wheel
 
 
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """By image: a folder with an ``aicvds`` that sees its wheel and the distributions of its extras alone."""
+    return cache(lambda image: install(image, tmp_path_factory.mktemp(image)))
+
+
 def install(image: str, tmp_path: Path) -> Path:
-    """A folder with an ``aicvds`` that sees the image's wheel and the distributions of its extras alone."""
     source, folder, commands = tmp_path / "source", tmp_path / "site", tmp_path / "bin"
     source.mkdir()
     zipfile.ZipFile(build(image, source, "1.2.3")).extractall(folder)
@@ -175,8 +182,10 @@ def test_the_wheel_of_an_image_holds_everything_and_the_version_that_it_was_give
 
 @pytest.mark.long
 @pytest.mark.parametrize("image", ["edge", "simulator"])
-def test_an_images_own_check_passes_with_its_files_and_its_extras_alone(image: str, tmp_path: Path) -> None:
-    commands = install(image, tmp_path)
+def test_an_images_own_check_passes_with_its_files_and_its_extras_alone(
+    image: str, installed: Callable[[str], Path], tmp_path: Path
+) -> None:
+    commands = installed(image)
     text = (ROOT / "docker" / f"{image}.Dockerfile").read_text()
     (check,) = re.findall(r"^RUN (python /opt/aicvds/check_edge\.py|aicvds simulate .*)$", text, re.MULTILINE)
     check = check.replace("/opt/aicvds", str(ROOT / "docker")).replace("/tmp/check", str(tmp_path / "check"))
@@ -186,8 +195,11 @@ def test_an_images_own_check_passes_with_its_files_and_its_extras_alone(image: s
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
-def test_a_module_of_an_extra_that_an_image_does_not_install_is_missing_in_it(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_a_module_of_an_extra_that_an_image_does_not_install_is_missing_in_it(
+    installed: Callable[[str], Path],
+) -> None:
     # So the checks above see a module that an image lacks. The simulator's image has no OR-Tools.
-    commands = install("simulator", tmp_path)
+    commands = installed("simulator")
     ran = subprocess.run([commands / "aicvds", "bound", "--seed", "0"], capture_output=True, text=True, check=False)
     assert ran.returncode != 0 and "the image has no module 'ortools" in ran.stderr, ran.stderr + ran.stdout
