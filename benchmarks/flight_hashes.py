@@ -4,9 +4,9 @@
     python -m benchmarks.flight_hashes --seeds 0 1 2 --out runs/after.json --against runs/before.json
 
 It starts `aicvds serve` with no LLM and a store of its own, and flies every scenario in modes `value`, `policy` and
-`guided`, `paper` with every uplink, and EOF, WQCS and MPC on board. A hash covers, in the order of the flight, each
-decision's step, UAV, sensor, velocity, source, reason and failure, its cost and its UAV's lost packets, as
-`decisions.jsonl` has them.
+`guided`, `paper` with every uplink, and on board the paper's EOF and WQCS, two heuristics and MPC. A hash covers, in
+the order of the flight, each decision's step, UAV, sensor, velocity, source, reason and failure, its cost and its UAV's
+lost packets, as `decisions.jsonl` has them.
 
 A flight repeats to the bit if no wall clock decides. The planner's search has one limit of wall clock,
 AICVDS_PLANNER_MS, which has its largest value here; the deadline is a minute. Requests come one
@@ -43,7 +43,7 @@ from simulator.sites.site import Site
 
 SCENARIOS = ("paper", "pipeline", "stress", "dense", "lossy_uplink")
 MODES = ("value", "policy", "guided")
-ON_BOARD = ("eof", "wqcs", "mpc")
+ON_BOARD = ("eof", "wqcs", "longest_queue", "queue_and_channel", "mpc")
 FIELDS = ("step", "uav_id", "sensor_id", "velocity", "source", "reason", "failed", "cost", "lost_packets")
 DEADLINE_MS = 60_000
 # An answer waits for the store, and so for learning from its request's outcome. Without a store the next request may

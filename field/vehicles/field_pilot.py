@@ -80,7 +80,7 @@ class FieldPilot:
         return there
 
     async def decide(self, observations: Mapping[int, Observation]) -> dict[int, PilotChoice]:
-        """The choices for UAVs from their observations: the edge's, or EOF's on board, in the order of the UAVs."""
+        """The choices for UAVs from their observations, in the order of the UAVs: the edge's, or the fallback's."""
         answers = await asyncio.gather(*(self._answer(uav, seen) for uav, seen in observations.items()))
         choices = {
             uav: found for uav, found in zip(observations, answers, strict=True) if isinstance(found, PilotChoice)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lab.exploration.teachers import TeacherName
 
 TeacherOption = Literal["both", "planner", "clairvoyant"]
-_BEHAVIOUR = "taught: mostly the reference's; untaught: half EOF or WQCS, half a random sensor; a random velocity"
+_BEHAVIOUR = "taught: mostly the reference's; untaught: half a heuristic's, half a random sensor; a random velocity"
 
 # Seconds in which an edge loads its LLM.
 _READY_S = 30.0
@@ -44,7 +44,7 @@ class Explore:
     The teacher alternates by world between the planner (partial observations, about 4 s a world) and a clairvoyant (all
     arrivals known, 1 to 3 s). A UAV mostly flies the teacher's actions. In up to half (planner) or a fifth
     (clairvoyant) of a world's steps the fleet deviates, so that the records cover other states: then half of the
-    sensors are EOF's or WQCS's, half random, and velocities are random; a third of the deviations use the teacher's
+    sensors are a heuristic's, half random, and velocities are random; a third of the deviations use the teacher's
     sensor, a third its velocity. The reference is the teacher's action in the state recorded. A clairvoyant has none
     while the fleet deviates, and plans again afterwards.
 

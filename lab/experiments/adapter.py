@@ -18,7 +18,7 @@ from lab.experiments.schemes import (
     value,
 )
 
-_HEURISTICS = ("eof", "wqcs", "max_gain", "nearest")
+_HEURISTICS = ("longest_queue", "queue_and_channel", "max_gain", "nearest")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
@@ -31,7 +31,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         guided("guided_alone_chance", "guided, no planner, LLM draws", planner="off", backing=CHANCE),
         value(),
         edge_planner(),
-        *available_locals(*_HEURISTICS),
+        *available_locals("eof", "wqcs", *_HEURISTICS),
         *map(at_full_speed, _HEURISTICS),
     ]
 
@@ -52,7 +52,7 @@ EXPERIMENT = Experiment(
     ),
     paired_measures=("lost_packets",),
     worlds=("paper", "shadowed", "field", "stress", "pipeline", "dense"),
-    heuristics=tuple(name + speed for name in _HEURISTICS for speed in ("", "_fast")),
+    heuristics=tuple(name + speed for name in _HEURISTICS for speed in ("", "_fast")) + ("eof", "wqcs"),
     notes=(
         "With the adapter, mode llm has the compact prompt, the fleet's belief and the features `reach`. Its rows are "
         "shuffled, and neither planner, verifier nor critic takes part. Without it, the prompt is the paper's.",

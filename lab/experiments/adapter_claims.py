@@ -43,7 +43,7 @@ EXPERIMENT = Experiment(
         "llm_decided_pct",
     ),
     figures=(
-        FigureSpec("adapter_claims", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), by step."),
+        FigureSpec("adapter_claims", "curves", LOSS_CURVES, "Lost packets and loss events, by step."),
         FigureSpec("adapter_claims_k", "sweep", ("lost_packets",), "Lost packets over k, with the adapter."),
     ),
     reference="llm",

@@ -17,7 +17,7 @@ from lab.experiments.schemes import (
     value,
 )
 
-_POLICIES = ("madqn", "mappo", "eof", "wqcs", "max_gain")
+_POLICIES = ("madqn", "mappo", "eof", "wqcs", "longest_queue", "queue_and_channel", "max_gain")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
@@ -32,7 +32,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         value(),
         edge_policy(),
         *available_locals(*_POLICIES),
-        at_full_speed("eof"),
+        at_full_speed("longest_queue"),
         BOUND,
     ]
 
@@ -44,8 +44,8 @@ EXPERIMENT = Experiment(
     schemes=_schemes,
     measures=(*LOSSES, "failures", "overflows", "velocity", "prompt_tokens", "llm_trust"),
     figures=(
-        FigureSpec("guided", "curves", LOSS_CURVES, "Lost packets and loss events (Eq. 5), per step and cumulative."),
-        FigureSpec("guided_totals", "bars", LOSSES, "Lost packets and loss events (Eq. 5) of a mission."),
+        FigureSpec("guided", "curves", LOSS_CURVES, "Lost packets and loss events, per step and cumulative."),
+        FigureSpec("guided_totals", "bars", LOSSES, "Lost packets and loss events of a mission."),
     ),
     reference="edge_planner",
     pairs=(

@@ -53,7 +53,7 @@ def ages(flight: FlightRecord) -> np.ndarray:
 
 
 def events_per_step(flight: FlightRecord) -> list[float]:
-    """Eq. 5's loss: failed transmissions plus overflowing sensors, a step."""
+    """The paper's loss P_l: failed transmissions plus overflowing sensors, a step."""
     return [float(f + g) for f, g in zip(flight.failures, flight.overflows, strict=True)]
 
 

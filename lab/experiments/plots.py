@@ -40,8 +40,8 @@ Style = tuple[str, Any, str]
 # Colour, dash and marker of each scheme.
 LOOKS: dict[str, Style] = {
     **POLICIES,
-    "eof_fast": (ORANGE, (0, (1, 1)), "p"),
-    "wqcs_fast": (GREEN, "-.", "<"),
+    "longest_queue_fast": (ORANGE, (0, (1, 1)), "p"),
+    "queue_and_channel_fast": (GREEN, "-.", "<"),
     "madqn": (RED, "-", "P"),
     "mappo": (PURPLE, "-", "*"),
     "bound": (INK, (0, (4, 2)), "|"),

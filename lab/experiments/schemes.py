@@ -87,6 +87,10 @@ _POLICY_LABELS = {
     FORMULA_PLANNER: "MPC without learning",
     "eof": "EOF",
     "wqcs": "WQCS",
+    "eof_coordinated": "EOF, coordinated",
+    "wqcs_coordinated": "WQCS, coordinated",
+    "longest_queue": "longest queue",
+    "queue_and_channel": "queue and channel",
     "max_gain": "maximum channel gain",
     "nearest": "nearest neighbour",
     "round_robin": "round robin",
@@ -182,4 +186,4 @@ def edge_policy() -> Scheme:
 def every_scheme() -> list[Scheme]:
     """All schemes that can fly, in display order."""
     ours = [llm(), guided(), value_as_written(), value(), edge_policy(), edge_planner()]
-    return [*ours, *available_locals(), at_full_speed("eof"), at_full_speed("wqcs")]
+    return [*ours, *available_locals(), *map(at_full_speed, ("longest_queue", "queue_and_channel"))]

@@ -18,7 +18,7 @@ from lab.experiments.schemes import (
     value,
 )
 
-_HEURISTICS = ("eof", "wqcs", "max_gain", "nearest")
+_HEURISTICS = ("longest_queue", "queue_and_channel", "max_gain", "nearest")
 
 
 def _schemes(setup: Setup) -> list[Scheme]:
@@ -28,7 +28,7 @@ def _schemes(setup: Setup) -> list[Scheme]:
         value(),
         *available_locals(PLANNER, FORMULA_PLANNER),
         INFORMED,
-        *available_locals("madqn", "mappo", *_HEURISTICS),
+        *available_locals("madqn", "mappo", "eof", "wqcs", *_HEURISTICS),
         *map(at_full_speed, _HEURISTICS),
         BOUND,
     ]
@@ -45,7 +45,7 @@ EXPERIMENT = Experiment(
     pairs=(("edge_planner", FORMULA_PLANNER), (PLANNER, FORMULA_PLANNER), ("value_reach", "eof")),
     paired_measures=("lost_packets",),
     worlds=("paper", "stress", "shadowed", "fading", "bursty", "windy", "faulty", "field"),
-    heuristics=tuple(name + speed for name in _HEURISTICS for speed in ("", "_fast")),
+    heuristics=tuple(name + speed for name in _HEURISTICS for speed in ("", "_fast")) + ("eof", "wqcs"),
     notes=(
         "The planner without learning reckons with the scenario's mean path loss, mean arrival rate and still air to "
         "the mission's end. The one that is told the true links knows shadowing, every fade to come, dead radios, the "

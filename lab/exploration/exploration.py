@@ -119,7 +119,7 @@ class _ExploringFleet:
         self._rng = np.random.default_rng([FIRST_TRAINING_SEED, mission])
         self._share = 1.0 if guide is None else self._rng.uniform(0.0, guide.deviations)
         self._levels = scenario.max_velocity + 1
-        self._policies = [policy_named("eof"), policy_named("wqcs")]
+        self._policies = [policy_named("longest_queue"), policy_named("queue_and_channel")]
         for policy in self._policies:
             policy.reset(scenario, mission)
         self.deviating = False
@@ -130,8 +130,8 @@ class _ExploringFleet:
     def action(self, advised: Action | None, uav: int, observation: Observation, taken: frozenset[int]) -> Action:
         """The teacher's action, or a deviation from it.
 
-        A deviation has a random velocity, and a sensor of EOF, of WQCS or at random; sometimes one of the two is the
-        teacher's.
+        A deviation has a random velocity, and a sensor of `longest_queue`, of `queue_and_channel` or at random;
+        sometimes one of the two is the teacher's.
         """
         if advised is not None and not self.deviating:
             return advised

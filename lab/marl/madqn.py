@@ -41,8 +41,8 @@ class Madqn:
     The value of a choice is the sum over its heads, ``Q(sensor) + Q(velocity)``: the library trains two heads this way,
     and neither head sees the choice of the other. An iteration is one gradient step on 100 transitions from the replay
     buffer. Every third iteration updates the target network by ``tau``. The target network averages many iterations, so
-    it is steadier than the online network, and ``network`` returns it. The reward is minus Eq. 5's cost, the same for
-    every UAV.
+    it is steadier than the online network, and ``network`` returns it. The reward is minus the paper's P_l, the same
+    for every UAV.
 
     Args:
         episodes: missions of the whole training, for the schedule of epsilon and the size of the replay buffer.

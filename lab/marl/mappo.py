@@ -94,8 +94,8 @@ class Mappo:
     """Proximal policy optimisation with one actor network for all UAVs and one centralised critic.
 
     A round flies ``worlds`` missions with actions drawn by the actors, then trains for 4 epochs over them in
-    minibatches. Only the critic sees the true state, and only in training. The reward is minus Eq. 5's cost, the same
-    for every UAV. The learning rate is the table's until the last 40 rounds, in which it falls linearly to zero.
+    minibatches. Only the critic sees the true state, and only in training. The reward is minus the paper's P_l, the
+    same for every UAV. The learning rate is the table's until the last 40 rounds, in which it falls linearly to zero.
 
     Args:
         episodes: missions of the whole training.

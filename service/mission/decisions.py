@@ -83,8 +83,8 @@ class PendingDecisions:
     """One mission's decisions that wait for their outcome, and its applied outcomes.
 
     Attributes:
-        max_step_cost: an upper bound of a step's cost. Eq. 5 counts at most one failure for each UAV and one overflow
-            for each sensor.
+        max_step_cost: an upper bound of a step's cost. The paper's P_l counts at most one failure for each UAV and one
+            overflow for each sensor.
     """
 
     def __init__(self, mission_id: str, scenario: Scenario) -> None:

@@ -14,7 +14,7 @@ each for ``w_i`` joules. Sensor j has a queue ``q_j`` of at most W packets and `
 2. **Arrivals and overflow.** ``r_j`` packets arrive, ``l_j = max(0, q_j + r_j - W)`` are lost (g_j = 1 if any), and
    ``q_j <- min(W, q_j + r_j)``.
 
-The loss of the step (Eq. 5) is the sum of all f and all g.
+The paper's packet loss P_l of the step, its Eq. (9), is the sum of all f and all g.
 """
 
 import math

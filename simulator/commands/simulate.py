@@ -50,9 +50,9 @@ class Simulate:
 
       aicvds simulate --policy eof --world examples/pipeline_world
 
-    If the edge is lost during the flight, the UAVs decide on board with EOF, and before the next step wait up to
-    --reconnect-s seconds for the edge to come back. Steps are not real time, so without this pause the mission would
-    end first.
+    If the edge is lost during the flight, the UAVs collect from the longest queue in reach, and before the next step
+    wait up to --reconnect-s seconds for the edge to come back. Steps are not real time, so without this pause the
+    mission would end first.
 
     Ctrl-C stops the flight and still writes the report of the steps flown. The environment variable AICVDS_API_KEY has
     the key for an edge that needs one. Exit code: 0 flown, 1 no edge, 2 bad use, 130 interrupted.
@@ -76,7 +76,8 @@ class Simulate:
     """Waypoints to fly, 1 to 10000, but no more than a mission that is at the edge has. Default: the world's (30 in
     every scenario)."""
     policy: Annotated[str, arg(metavar="NAME")] = "edge"
-    """The decider: edge, or without an edge eof (earliest overflow first), wqcs (weighted queue and channel), max_gain
+    """The decider: edge, or without an edge the paper's eof (earliest overflow first) or wqcs (queue times rate), each
+    also as NAME_coordinated (UAVs leave out the sensors taken in the step), longest_queue, queue_and_channel, max_gain
     (highest channel gain), nearest (nearest neighbour), round_robin, random, mpc (a planner, extra `planner`),
     or a class of your own as MODULE:CLASS."""
     mode: Annotated[Mode | None, arg(metavar="MODE", help_behavior_hint="")] = None

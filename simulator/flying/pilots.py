@@ -16,7 +16,7 @@ from simulator.records.decision import DecidedBy
 from simulator.world.observation import Observation
 from simulator.world.observation_report import decide_request
 
-FALLBACK = "eof"
+FALLBACK = "longest_queue"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class LocalPilot:
 
 
 class EdgePilot:
-    """The pilot that asks an edge; without a usable answer the UAV decides on board with EOF.
+    """The pilot that asks an edge; without a usable answer the UAV collects from the longest queue in reach.
 
     ``spec`` is the mission to create at the edge before the first decision. ``on_request`` is called with each request
     before it is sent. ``answered`` counts the edge's decisions, and ``last_error`` is the text of the last failure.
@@ -110,7 +110,7 @@ class EdgePilot:
         self.last_error: str | None = None
 
     def decide(self, uav: int, observation: Observation, taken: frozenset[int]) -> PilotChoice:
-        """The edge's choice, or EOF's with source ``onboard`` and the reason."""
+        """The edge's choice, or the fallback's with source ``onboard`` and the reason."""
         step = int(observation["step"][0])
         if step != self._step and self._lost and self._wait_left_s > 0:
             self._await_edge()

@@ -12,7 +12,7 @@ BASELINES = ("eof", "wqcs")
 
 
 def baselines(site: Site, seed: int, steps: int) -> dict[str, list[StepTally]]:
-    """EOF and WQCS on the same site and seed: the tallies of the first ``steps`` steps by policy."""
+    """The paper's EOF and WQCS on the same site and seed: the tallies of the first ``steps`` steps by policy."""
     flown = {name: rollout(site.world(), policy_named(name), seed) for name in BASELINES}
     return {name: tally[:steps] for name, tally in flown.items()}
 

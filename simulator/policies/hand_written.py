@@ -29,19 +29,15 @@ class _HighestScore(ABC):
         return best_in_reach(self.score(observation), observation, taken), cruise_velocity(self._scenario)
 
 
-class EarliestOverflowFirst(_HighestScore):
-    """The sensor in reach with the fewest expected steps to overflow, ``(W - q_j) / rate``.
-
-    The rate is the scenario's mean arrival rate for every sensor, since beacons do not report it.
-    """
+class LongestQueue(_HighestScore):
+    """The sensor in reach with the longest queue: the first to overflow, if packets arrive at one rate everywhere."""
 
     def score(self, observation: Observation) -> FloatArray:
-        """Minus the steps to overflow."""
-        rate = max(self._scenario.mean_arrival_rate, 1e-9)
-        return -((self._scenario.queue_capacity - observation["queue"]) / rate)
+        """The queue."""
+        return observation["queue"]
 
 
-class WeightedQueueChannel(_HighestScore):
+class QueueAndChannel(_HighestScore):
     """The sensor in reach with the highest ``0.5 q_j / W + 0.5 h_j``.
 
     ``h_j`` is the channel gain scaled to 0 at the path-loss threshold and 1 right below the UAV.

@@ -1,18 +1,20 @@
 """Scheduling policies that need no edge, by name."""
 
 from collections.abc import Callable
+from functools import partial
 
 from shared.kit.own_code import imported
 from simulator.errors import UsageError
 from simulator.policies.hand_written import (
-    EarliestOverflowFirst,
+    LongestQueue,
     MaximumGain,
     NearestNeighbour,
+    QueueAndChannel,
     RandomChoice,
     RoundRobin,
-    WeightedQueueChannel,
 )
 from simulator.policies.mpc import RecedingHorizonPolicy
+from simulator.policies.paper_schemes import EarliestOverflowFirst, WeightedQueueChannel
 from simulator.policies.policy import Policy
 
 _POLICIES: dict[str, Callable[[], Policy]] = {
@@ -20,6 +22,10 @@ _POLICIES: dict[str, Callable[[], Policy]] = {
     "round_robin": RoundRobin,
     "eof": EarliestOverflowFirst,
     "wqcs": WeightedQueueChannel,
+    "eof_coordinated": partial(EarliestOverflowFirst, coordinated=True),
+    "wqcs_coordinated": partial(WeightedQueueChannel, coordinated=True),
+    "longest_queue": LongestQueue,
+    "queue_and_channel": QueueAndChannel,
     "max_gain": MaximumGain,
     "nearest": NearestNeighbour,
     "mpc": RecedingHorizonPolicy,

@@ -15,7 +15,6 @@ from markupsafe import Markup
 
 from shared.world.scenario import Scenario
 from shared.world.trajectory import trajectories
-from simulator.policies.reach import cruise_velocity
 from simulator.records.decision import Decision
 from simulator.records.run_folder import FIGURES
 from simulator.records.summary import Summary, Tally
@@ -172,7 +171,6 @@ def render_report(
         notice=llm_notice(summary),
         sources=summary.by_source.present(),
         scenario=scenario,
-        cruise=cruise_velocity(scenario),
         figures={name: Markup(one.inline) for name, one in drawn.items()},
         costliest=costliest(decisions),
         maps=min(scenario.uavs, figures.MAPS),

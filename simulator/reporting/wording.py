@@ -8,6 +8,8 @@ NAMES = {
     "aic_vds": "AIC-VDS",
     "eof": "EOF",
     "wqcs": "WQCS",
+    "longest_queue": "longest queue",
+    "queue_and_channel": "queue and channel",
     "round_robin": "round robin",
     "random": "random",
     "max_gain": "maximum channel gain",

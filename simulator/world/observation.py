@@ -36,7 +36,7 @@ class Info(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class StepTally:
-    """One step of the whole fleet: the two losses of Eq. 5, the packets lost, and those collected.
+    """One step of the whole fleet: the two losses of the paper's P_l, the packets lost, and those collected.
 
     ``failures`` is the sum of f over UAVs, ``overflows`` the sum of g over sensors, ``collected`` has shape ``(J,)``.
     """
@@ -49,5 +49,5 @@ class StepTally:
 
     @property
     def events(self) -> int:
-        """Eq. 5's loss of the step: failed transmissions plus overflowing sensors."""
+        """The paper's loss P_l of the step: failed transmissions plus overflowing sensors."""
         return self.failures + self.overflows

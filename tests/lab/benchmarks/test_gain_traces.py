@@ -15,7 +15,7 @@ def test_every_scheme_flies_the_traces_and_the_map_is_better_than_the_formula(tm
     found = figures("lab.benchmarks.gain_traces", "--seeds", "1", "--scales", "0.7", out=tmp_path / "gain_traces.json")
     (world,) = found["worlds"]
     lost = world["lost_packets"]
-    assert {"policy", "mpc", "mpc_formula", "eof", "eof_fast", "nearest_fast"} <= set(lost)
+    assert {"policy", "mpc", "mpc_formula", "longest_queue", "longest_queue_fast", "nearest_fast"} <= set(lost)
     assert all(len(packets) == 1 and packets[0] >= 0 for packets in lost.values())
     # Slow flights lose many more packets than a plan.
     assert lost["policy"][0] < lost["max_gain"][0]

@@ -61,7 +61,7 @@ def test_decider_site_and_seed_are_part_of_the_key() -> None:
         flight_key(llm(), "embedded", traced, 0),
         *(flight_key(llm(), "embedded", site, 0) for site in measured),
         flight_key(local("eof"), None, Site(TINY), 0),
-        flight_key(at_full_speed("eof"), None, Site(TINY), 0),
+        flight_key(at_full_speed("longest_queue"), None, Site(TINY), 0),
     }
     assert len(keys) == 11
 
@@ -134,9 +134,17 @@ def test_a_scheme_that_cannot_fly_is_left_out_and_named(tmp_path: Path, monkeypa
 
 def test_full_speed_changes_the_velocity_alone(tmp_path: Path) -> None:
     run = run_in(tmp_path, seeds=1)
-    run.make([declared(local("eof"), at_full_speed("eof"), measures=("velocity", "lost_packets", "events"))])
+    run.make(
+        [
+            declared(
+                local("longest_queue"), at_full_speed("longest_queue"), measures=("velocity", "lost_packets", "events")
+            )
+        ]
+    )
     store = FlightStore(tmp_path / "flights")
-    own, full = (store.load(flight_key(s, None, Site(TINY), 0)) for s in (local("eof"), at_full_speed("eof")))
+    own, full = (
+        store.load(flight_key(s, None, Site(TINY), 0)) for s in (local("longest_queue"), at_full_speed("longest_queue"))
+    )
     assert own is not None and full is not None
     assert {d.velocity for d in own.decisions} == {7} and {d.velocity for d in full.decisions} == {14}
     assert [d.sensor for d in own.decisions[:3]] == [d.sensor for d in full.decisions[:3]]

@@ -13,7 +13,8 @@ from simulator.reporting.figure_style import DOUBLE_IN, SINGLE_IN
 from tests.support.made_results import CURVES, figure, interval, result, zero_from
 
 SCHEMES = [
-    "llm", "llm_all", "value", "edge_policy", "madqn", "mappo", "mpc", "eof", "eof_fast", "wqcs", "wqcs_fast",
+    "llm", "llm_all", "value", "edge_policy", "madqn", "mappo", "mpc", "eof", "wqcs",
+    "longest_queue_fast", "queue_and_channel_fast",
     "max_gain", "nearest", "round_robin", "random", "csv_score_6", "json_shuffled_30",
 ]  # fmt: skip
 LABELS = {"llm": "AIC-VDS, mode llm", "lost_packets": "lost packets", "mpc": "MPC (horizon 8)"}

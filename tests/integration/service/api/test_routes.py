@@ -364,7 +364,7 @@ def updates_of(client: httpx.Client, mission: str) -> int:
 
 
 def test_a_forged_cost_teaches_no_more_than_the_worst_that_can_be(edge: Edge, report: Report) -> None:
-    """Ten sensors that overflow and three transmissions that fail cost 13 by Eq. 5; 10,000 would drown all else."""
+    """Ten sensors that overflow and three transmissions that fail cost 13 in the paper; 10,000 would drown all else."""
     client = edge()
     losses = []
     for mission, cost in (("forged", 10_000), ("worst", 13)):

@@ -46,12 +46,14 @@ def test_every_uav_asks_at_every_step_and_every_outcome_arrives(stub: EdgeStub, 
     assert sent == {d.decision_id: (d.cost, d.failed) for d in flight.decisions}
 
 
-def test_without_an_edge_the_uavs_fly_eof() -> None:
+def test_without_an_edge_the_longest_queues_are_flown() -> None:
     with EdgeClient("http://127.0.0.1:1", timeout_s=1, attempts=2) as unreachable:
         pilot = EdgePilot(unreachable, "m", SHORT, seed=2)
         flight = fly(Site(SHORT), pilot, seed=2)
-    eof = fly(Site(SHORT), LocalPilot("eof", SHORT, 2), seed=2)
-    assert [(d.sensor_id, d.velocity) for d in flight.decisions] == [(d.sensor_id, d.velocity) for d in eof.decisions]
+    longest = fly(Site(SHORT), LocalPilot("longest_queue", SHORT, 2), seed=2)
+    assert [(d.sensor_id, d.velocity) for d in flight.decisions] == [
+        (d.sensor_id, d.velocity) for d in longest.decisions
+    ]
     assert {(d.source, d.reason) for d in flight.decisions} == {("onboard", "edge_unreachable")}
     assert pilot.answered == 0 and "127.0.0.1:1/decide" in str(pilot.last_error)
 

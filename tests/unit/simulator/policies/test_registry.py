@@ -50,12 +50,16 @@ def test_an_unknown_policy_lists_the_known_ones() -> None:
         "round_robin",
         "eof",
         "wqcs",
+        "eof_coordinated",
+        "wqcs_coordinated",
+        "longest_queue",
+        "queue_and_channel",
         "max_gain",
         "nearest",
         "mpc",
     )
     with pytest.raises(
-        ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs, max_gain"
+        ValueError, match="unknown policy 'best': choose one of random, round_robin, eof, wqcs, eof_coordinated"
     ):
         policy_named("best")
 
@@ -80,16 +84,18 @@ def test_a_policy_of_ones_own_is_found_in_the_current_folder(tmp_path: Path, mon
             policy_named(name)
 
 
-def test_eof_takes_the_sensor_in_range_that_overflows_first() -> None:
+def test_the_longest_queue_is_that_of_a_sensor_in_range() -> None:
     # Sensor 1 is fuller, but was last heard a step ago: it is out of range now.
-    assert ready("eof").decide(0, seen([30, 60, 50, 40], [5, 4, 5, 5]), NONE) == (2, 7)
+    assert ready("longest_queue").decide(0, seen([30, 60, 50, 40], [5, 4, 5, 5]), NONE) == (2, 7)
 
 
-def test_eof_leaves_taken_sensors() -> None:
-    assert ready("eof").decide(1, seen([30, 60, 50, 40], [5, 4, 5, 5]), frozenset({2})) == (3, 7)
+def test_the_longest_queue_is_free() -> None:
+    assert ready("longest_queue").decide(1, seen([30, 60, 50, 40], [5, 4, 5, 5]), frozenset({2})) == (3, 7)
 
 
-@pytest.mark.parametrize("name", ["eof", "wqcs", "max_gain"])
+@pytest.mark.parametrize(
+    "name", ["eof_coordinated", "wqcs_coordinated", "longest_queue", "queue_and_channel", "max_gain"]
+)
 def test_with_nothing_in_range_the_longest_silent_sensor(name: str) -> None:
     policy = ready(name)
     assert policy.decide(0, seen([60, 1, 60, 60], [4, 2, 3, 4]), NONE)[0] == 1
@@ -98,8 +104,8 @@ def test_with_nothing_in_range_the_longest_silent_sensor(name: str) -> None:
     assert policy.decide(0, seen([0, 0, 0, 0], [-1, -1, -1, -1], [900, 700, 400, 800]), NONE)[0] == 2
 
 
-def test_wqcs_weighs_queue_against_channel() -> None:
-    policy = ready("wqcs")
+def test_queue_and_channel_weighs_queue_against_channel() -> None:
+    policy = ready("queue_and_channel")
     near_and_half = seen([30, 60, 0, 0], [5, 5, 5, 5], [0, 350, 350, 350])
     assert policy.decide(0, near_and_half, NONE)[0] == 0
     near_and_empty = seen([0, 60, 0, 0], [5, 5, 5, 5], [100, 200, 350, 350])
@@ -107,8 +113,9 @@ def test_wqcs_weighs_queue_against_channel() -> None:
     assert policy.decide(0, near_and_empty, frozenset({1}))[0] == 0
 
 
-def test_wqcs_ignores_a_better_sensor_out_of_range() -> None:
-    assert ready("wqcs").decide(0, seen([60, 10, 10, 10], [4, 5, 5, 5], [0, 300, 200, 350]), NONE)[0] == 2
+@pytest.mark.parametrize("name", ["wqcs", "queue_and_channel"])
+def test_a_better_sensor_out_of_range_is_left(name: str) -> None:
+    assert ready(name).decide(0, seen([60, 10, 10, 10], [4, 5, 5, 5], [0, 300, 200, 350]), NONE)[0] == 2
 
 
 def test_max_gain_takes_the_best_channel_in_range_however_empty_its_queue() -> None:
@@ -214,6 +221,6 @@ def test_on_paper_the_informed_policies_lose_least() -> None:
     world = PipelineWorld()
     lost = {
         name: sum(t.lost_packets for seed in range(5) for t in rollout(world, policy_named(name), seed))
-        for name in ("eof", "wqcs", "round_robin", "random")
+        for name in ("wqcs", "longest_queue", "queue_and_channel", "round_robin", "random")
     }
-    assert lost["eof"] < lost["wqcs"] < lost["round_robin"] < lost["random"]
+    assert list(lost) == sorted(lost, key=lambda name: lost[name])
