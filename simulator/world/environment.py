@@ -67,8 +67,8 @@ class PipelineWorld:
 
     ## Rewards
     ``reward = -cost``. With ``cost="default"``, ``c_i = f_i + lost_i / W``, where ``lost_i`` are the packets lost in
-    this step at the sensors with a usable link to UAV i at its new position. With ``cost="paper"``, the paper's P_l: the
-    sum of all f and all g of this step, the same for every UAV.
+    this step at the sensors with a usable link to UAV i at its new position. With ``cost="paper"``, the paper's P_l:
+    the sum of all f and all g of this step, the same for every UAV.
 
     ## Infos
     ``action_mask``: flat int8, J entries for the sensors (1 for those heard at least once; all 1 if none was)
