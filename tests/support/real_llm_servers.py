@@ -109,12 +109,12 @@ def forward_proxy(packages: Packages, log: Path) -> Iterator[str]:
         yield f"http://127.0.0.1:{port}"
 
 
-def answers(url: str, log: Path | None = None, **options: bool) -> None:
+def answers(url: str, log: Path | None = None, verify: bool = True) -> None:
     """Wait until a server answers, by whatever status."""
 
     def there() -> bool:
         try:
-            return httpx.get(url, timeout=10.0, trust_env=False, **options).status_code != 503
+            return httpx.get(url, timeout=10.0, trust_env=False, verify=verify).status_code != 503
         except httpx.TransportError:
             return False
 
