@@ -75,7 +75,15 @@ def litellm(packages: Packages, upstream: str, folder: Path) -> Iterator[str]:
     """LiteLLM's proxy with a master key before an OpenAI-compatible server; its base URL, which may not answer yet."""
     port, config = free_port(), folder / "litellm.yaml"
     config.write_text(_LITELLM.format(upstream=upstream, key=MASTER_KEY))
-    command = [packages.programs / "litellm", "--config", config, "--host", "127.0.0.1", "--port", str(port)]
+    command: list[str | Path] = [
+        packages.programs / "litellm",
+        "--config",
+        config,
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(port),
+    ]
     with _process(command, folder / "litellm.log"):
         yield f"http://127.0.0.1:{port}/v1"
 
@@ -84,7 +92,15 @@ def litellm(packages: Packages, upstream: str, folder: Path) -> Iterator[str]:
 def transformers_serve(packages: Packages, model: Path, folder: Path) -> Iterator[str]:
     """``transformers serve`` with a model's folder; its base URL, which may not answer yet."""
     port = free_port()
-    command = [Path(sys.executable).with_name("transformers"), "serve", model, "--device", "cpu", "--port", str(port)]
+    command: list[str | Path] = [
+        Path(sys.executable).with_name("transformers"),
+        "serve",
+        model,
+        "--device",
+        "cpu",
+        "--port",
+        str(port),
+    ]
     environment = {"PYTHONPATH": f"{packages.serving}", "HF_HUB_OFFLINE": "1", "HF_HOME": f"{folder}"}
     # More threads than free cores wait for each other.
     with _process(command, folder / "transformers.log", {**environment, "OMP_NUM_THREADS": "1"}):
@@ -104,7 +120,15 @@ def tls_front(target: int, certificate: Path, folder: Path) -> Iterator[str]:
 def forward_proxy(packages: Packages, log: Path) -> Iterator[str]:
     """proxy.py; its URL. The log has a line for each request and each tunnel."""
     port = free_port()
-    command = [packages.programs / "proxy", "--hostname", "127.0.0.1", "--port", str(port), "--num-workers", "1"]
+    command: list[str | Path] = [
+        packages.programs / "proxy",
+        "--hostname",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--num-workers",
+        "1",
+    ]
     with _process([*command, "--log-file", log], log.with_suffix(".out")):
         yield f"http://127.0.0.1:{port}"
 
