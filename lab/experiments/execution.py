@@ -112,9 +112,12 @@ def fly_with_edge(edge: EdgeAt, planned: Planned) -> FlightRecord:
 
 def _bound(planned: Planned, seconds: float) -> FlightRecord:
     try:
+        from lab.wind import bound_in_wind
         from simulator.bound.clairvoyant_bound import clairvoyant
 
-        found = clairvoyant(planned.site, planned.seed, seconds)
+        world = planned.site.scenario
+        find = bound_in_wind if world.wind_mps or world.gust_mps else clairvoyant
+        found = find(planned.site, planned.seed, seconds)
     except ImportError as error:
         raise CannotFly(f"{error}; install the extra: pip install -e '.[lab]'") from error
     bound = BoundFound.model_validate(found, from_attributes=True)

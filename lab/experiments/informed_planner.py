@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lab.wind import course
 from shared.planning.receding import Draft
-from simulator.bound.true_problem import course, true_links
+from simulator.bound.true_problem import true_links
 from simulator.flying.pilots import LocalPilot, PilotChoice
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.sites.site import Site

@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.bound.true_problem import targets, true_problem, velocities_towards
+from simulator.bound.true_problem import true_problem
 from simulator.policies.mpc import RecedingHorizonPolicy
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation
@@ -103,7 +103,12 @@ class ClairvoyantTeacher:
 
         world = self._world
         blows = world.truth.wind.blows
-        problem = true_problem(world, _WINDY_STEPS if blows else None)
+        if blows:
+            from lab.wind import problem_in_wind, targets, velocities_towards
+
+            problem = problem_in_wind(world, _WINDY_STEPS)
+        else:
+            problem = true_problem(world)
         # The search of simulator.bound.clairvoyant_bound ends by the clock; rollouts must repeat to the bit.
         budget = Budget(work=_WINDY_WORK if blows else _CLAIRVOYANT_WORK)
         actions = plan(problem, budget, "cautious").actions

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.bound.true_problem import relaxed_problem, targets, true_problem, velocities_towards
+from simulator.bound.true_problem import true_problem
+from simulator.errors import UsageError
 from simulator.records.summary import LossBound
 from simulator.sites.site import Site
 
@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from shared.planning.fleet_problem import FleetProblem
     from simulator.bound.solver import Plan
     from simulator.world.environment import PipelineWorld
-
-# For each flight tried in wind: the steps of its plans (None: all remaining ones), and the deterministic seconds of
-# each search. Neither is always better.
-_CHASES = ((10, 0.3), (None, 3.0))
 
 
 def clairvoyant(site: Site, seed: int, time_limit_s: float = 60.0, workers: int = 8) -> Plan:
@@ -38,6 +34,7 @@ def clairvoyant(site: Site, seed: int, time_limit_s: float = 60.0, workers: int 
 
     Raises:
         RuntimeError: the world lost another number of packets than the plan, so one of the two is wrong.
+        UsageError: the world has wind.
         ModuleNotFoundError: OR-Tools is not installed (extra ``bound``).
         Interrupted: by Ctrl-C, with the best plan so far.
     """
@@ -50,27 +47,26 @@ def confirmed(site: Site, seed: int, plan: Plan) -> Plan:
     """The bound that a plan of the whole mission proves, and the losses of the plan's flight in the world.
 
     Where the world differs from the model, the flight may lose more than the plan, which omits what a weak link costs a
-    battery. In wind the plan cannot be flown, and another one is made from step to step.
+    battery.
 
     Raises:
         RuntimeError: the world lost another number of packets than the plan, or fewer than the bound.
     """
-    world = _reset(site, seed)
-    tried = [plan.actions]
-    if world.truth.wind.blows:
-        tried = [_chased(_reset(site, seed), steps, work) for steps, work in _CHASES]
-    flown, actions = min(((replay(site, seed, actions), actions) for actions in tried), key=itemgetter(0))
+    flown, world = replay(site, seed, plan.actions), _reset(site, seed)
     if flown < plan.lower_bound or (flown != plan.lost_packets and not world.truth.differs):
         raise RuntimeError(
             f"the plan of seed {seed} loses {plan.lost_packets} packets, at least {plan.lower_bound}; "
             f"flown in the world {flown}"
         )
-    return replace(plan, actions=actions, lost_packets=flown)
+    return replace(plan, lost_packets=flown)
 
 
 def problem_of(site: Site, seed: int) -> FleetProblem:
-    """The whole mission as a planning problem, with the world's hidden state."""
-    return relaxed_problem(_reset(site, seed))
+    """The whole mission as a planning problem, with the world's hidden state; raises ``UsageError`` in wind."""
+    world = _reset(site, seed)
+    if world.truth.wind.blows:
+        raise UsageError(f"scenario {site.scenario.name} has wind, in which no plan is flown as made: it has no bound")
+    return true_problem(world)
 
 
 def replay(site: Site, seed: int, actions: NDArray[np.int64]) -> int:
@@ -85,20 +81,6 @@ def _reset(site: Site, seed: int) -> PipelineWorld:
     world = site.world()
     world.reset(seed=seed)
     return world
-
-
-def _chased(world: PipelineWorld, steps: int | None, work: float) -> NDArray[np.int64]:
-    """Fly a fully known world in wind, each step by a plan of the next ones, and return the actions."""
-    from simulator.bound.solver import Budget, plan
-
-    actions = []
-    while world.agents:
-        problem = true_problem(world, steps)
-        chosen = plan(problem, Budget(work=work), "cautious").actions[0].copy()
-        chosen[:, 1] = velocities_towards(world, targets(world, chosen[:, 1]))
-        actions.append(chosen)
-        world.step({agent: chosen[uav] for agent, uav in world.live.items()})
-    return np.array(actions)
 
 
 # UAVs x sensors x steps. With 30,000, as in scenario `dense`, building the model already takes half a minute.
@@ -119,6 +101,8 @@ def mission_bound(site: Site, seed: int, steps_flown: int, time_limit_s: float) 
         return "the mission ended before its last step"
     if scenario.uavs * scenario.sensors * scenario.steps > MOST_CHOICES:
         return "this world is too large for a short search; try `aicvds bound`"
+    if scenario.wind_mps or scenario.gust_mps:
+        return "in wind no plan is flown as made"
     from simulator.bound.solver import Interrupted
 
     try:

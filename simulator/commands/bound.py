@@ -24,8 +24,7 @@ class BoundOptions:
 
     Printed: the proven bound, the losses of the best plan found, the gap between them, and EOF's losses in the same
     world. The plan is flown in the simulated world, which must lose exactly the packets of the plan. In a scenario that
-    differs from the edge's model the bound knows the true links, wind and faults; in wind the flight is planned from
-    step to step, and the gap stays.
+    differs from the edge's model the bound knows the true links and faults. A world with wind has no bound.
 
       aicvds bound --seed 0
 
