@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.harness import Goal, Options, Report, run
-from lab.training_worlds import drawn
+from lab.marl.training_worlds import drawn
 from shared.world.scenario import Scenario, scenario_named
 from simulator.world.batch import Draw, VectorWorld
 from simulator.world.environment import PipelineWorld

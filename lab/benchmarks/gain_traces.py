@@ -28,9 +28,9 @@ from rich.console import Console
 from rich.progress import track
 
 from lab.experiments.edges import Llm, edge_for
+from lab.experiments.formula_planner import FormulaPlanner
 from lab.experiments.intervals import interval, paired
 from lab.experiments.schemes import OFF
-from lab.formula_planner import FormulaPlanner
 from shared.client.edge_client import EdgeClient
 from shared.world.actions import Action
 from shared.world.channel import FloatArray

@@ -54,8 +54,8 @@ class Explore:
 
     With `--edge` the UAVs fly that edge's decisions, and the teacher's action in each state is recorded beside them.
     So an LLM learns from the states that its own decisions bring about (DAgger, Ross et al. 2011). With `--policy` they
-    fly that policy's: `lab.formula_planner:FormulaPlanner` believes in the formulas' links and so brings about failures
-    that a teacher avoids.
+    fly that policy's: `lab.experiments.formula_planner:FormulaPlanner` believes in the formulas' links and so brings
+    about failures that a teacher avoids.
     """
 
     out: Annotated[Path, arg(metavar="FILE")]

@@ -112,7 +112,7 @@ def fly_with_edge(edge: EdgeAt, planned: Planned) -> FlightRecord:
 
 def _bound(planned: Planned, seconds: float) -> FlightRecord:
     try:
-        from lab.wind import bound_in_wind
+        from lab.exploration.wind import bound_in_wind
         from simulator.bound.clairvoyant_bound import clairvoyant
 
         world = planned.site.scenario

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lab.wind import course
+from lab.exploration.wind import course
 from shared.planning.receding import Draft
 from simulator.bound.true_problem import true_links
 from simulator.flying.pilots import LocalPilot, PilotChoice

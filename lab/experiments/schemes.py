@@ -97,7 +97,7 @@ _POLICY_LABELS = {
     "random": "random",
 }
 _OF_THE_LAB = {name: f"lab.marl.learned:{name}" for name in ("madqn", "mappo")}
-_OF_THE_LAB[FORMULA_PLANNER] = "lab.formula_planner:FormulaPlanner"
+_OF_THE_LAB[FORMULA_PLANNER] = "lab.experiments.formula_planner:FormulaPlanner"
 # Only the experiments that name them fly these.
 _NAMED_ONLY = (FORMULA_PLANNER,)
 BOUND = Scheme(name="bound", label="clairvoyant bound", decides=Clairvoyant())

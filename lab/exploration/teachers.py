@@ -104,7 +104,7 @@ class ClairvoyantTeacher:
         world = self._world
         blows = world.truth.wind.blows
         if blows:
-            from lab.wind import problem_in_wind, targets, velocities_towards
+            from lab.exploration.wind import problem_in_wind, targets, velocities_towards
 
             problem = problem_in_wind(world, _WINDY_STEPS)
         else:

@@ -12,7 +12,7 @@ from torchrl.data import Binary, Composite, MultiCategorical, Unbounded
 from torchrl.envs import EnvBase
 
 from lab.marl.network_inputs import fleet_input, width
-from lab.training_worlds import TrainingWorlds, state_of
+from lab.marl.training_worlds import TrainingWorlds, state_of
 from shared.world.scenario import Scenario
 from simulator.world.observation import Cost, Observation
 

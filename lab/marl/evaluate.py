@@ -9,7 +9,7 @@ from torch import nn
 
 from lab.marl.network_inputs import actor_input, mask_without, uav_slice
 from lab.marl.networks import greedy
-from lab.training_worlds import TrainingWorlds
+from lab.marl.training_worlds import TrainingWorlds
 from shared.world.channel import IntArray
 from shared.world.scenario import Scenario
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.marl.network_inputs import ActorInput, actor_input, fleet_input, mask_without, taken_mask, width
-from lab.training_worlds import TrainingWorlds
+from lab.marl.training_worlds import TrainingWorlds
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.environment import PipelineWorld
 from simulator.world.observation import Observation

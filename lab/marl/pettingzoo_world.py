@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv  # type: ignore[import-untyped]
 
-from lab.training_worlds import state_of
+from lab.marl.training_worlds import state_of
 from shared.world.channel import path_loss_db
 from shared.world.scenario import SCENARIOS, Scenario
 from shared.world.trajectory import Trajectory, trajectories
@@ -34,7 +34,7 @@ class PettingZooWorld(PipelineWorld, ParallelEnv[str, Observation, NDArray[np.in
         self._actions = spaces.MultiDiscrete([scenario.sensors, scenario.max_velocity + 1])
 
     def state(self) -> NDArray[np.float32]:
-        """The true state for centralised critics, as :func:`~lab.training_worlds.state_of` lays it out."""
+        """The true state for centralised critics, as :func:`~lab.marl.training_worlds.state_of` lays it out."""
         return np.asarray(state_of(self._worlds)[0])
 
     def observation_space(self, agent: str) -> spaces.Dict:

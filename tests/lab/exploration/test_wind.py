@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lab.wind import bound_in_wind
+from lab.exploration.wind import bound_in_wind
 from simulator.bound.clairvoyant_bound import replay
 from tests.unit.simulator.bound.test_clairvoyant_bound import least_by_flying, small
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lab.formula_planner import FormulaPlanner
+from lab.experiments.formula_planner import FormulaPlanner
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.flying.rollout import rollout
 from simulator.policies.mpc import RecedingHorizonPolicy
