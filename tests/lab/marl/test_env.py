@@ -8,7 +8,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from lab.marl.env import PipelineEnv
-from lab.marl.pettingzoo_world import PettingZooWorld
+from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import Scenario
 from simulator.world.environment import PipelineWorld
 

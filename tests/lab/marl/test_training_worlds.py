@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lab.marl.pettingzoo_world import PettingZooWorld
 from lab.marl.training_worlds import TrainingWorlds, state_of
+from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import SCENARIOS, Scenario
 from simulator.world.observation import Cost
 

@@ -13,7 +13,7 @@ from pettingzoo.test import (  # type: ignore[import-untyped]
 )
 from pettingzoo.utils import parallel_to_aec  # type: ignore[import-untyped]
 
-from lab.marl.pettingzoo_world import PettingZooWorld
+from lab.pettingzoo_world import PettingZooWorld
 from shared.world.scenario import SCENARIOS
 from tests.unit.simulator.world.test_environment import SMALL
 
