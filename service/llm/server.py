@@ -308,9 +308,13 @@ class LlmServer:
 
     async def _find_abilities(self, client: LLMClient) -> None:
         """Ask the server for its model, unless the settings or the model file name one, and for its abilities."""
-        if self._embedded is None and self._settings.llm_model is None:
-            self.model = self.bare_model = self.notes_model = await listed_model(client)
+        named = self._embedded is not None or self._settings.llm_model is not None
+        if not named:
+            self.model = await listed_model(client)
         self.abilities = await probe(client, self.model)
+        if not named:
+            # A server that has loaded its model meanwhile lists it now.
+            self.model = self.bare_model = self.notes_model = self.model or await listed_model(client)
 
     async def _probe_again(self) -> None:
         """Probe a ready server whose answers cannot be used: it may have another model now."""

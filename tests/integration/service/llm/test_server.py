@@ -229,6 +229,21 @@ def test_a_server_that_is_still_loading_is_probed_again(
     assert (ready["llm"], ready["constraint"]) == ("ready", "grammar")
 
 
+def test_a_server_that_lists_its_model_only_once_it_has_loaded_it_is_named(edge: Edge, report: Report) -> None:
+    """As llama.cpp answers 503 while it loads, and may be ready before the next request."""
+    model, early = Model("grammar"), [503]
+
+    async def loading() -> Response:
+        return JSONResponse({}, status_code=early.pop()) if early else JSONResponse(await model.models())
+
+    app = FastAPI()
+    app.get("/v1/models")(loading)
+    app.post("/v1/chat/completions")(model.complete)
+    with serving(app) as url:
+        client = edge(mode="llm", llm_url=f"{url}/v1")
+        assert wait_for(client, "ready")["model"] == client.post("/decide", json=report()).json()["model"] == "stub-1"
+
+
 def test_a_server_that_goes_away_is_told_and_found_again(
     edge: Edge, report: Report, monkeypatch: pytest.MonkeyPatch
 ) -> None:
