@@ -31,7 +31,7 @@ class BoundOptions:
       aicvds bound --seed 0 --scenario stress --time-limit-s 120 --out bound.json
 
     `paper` is solved in about a second. `stress` and `dense` are not solved in 60 s: seed 0 of `stress` was proven to
-    lose at least 599 packets, with a flight that loses 827 (EOF 1009); of `dense`, at least 0, with 438 (EOF 1171).
+    lose at least 599 packets, with a flight that loses 827 (EOF 1252); of `dense`, at least 0, with 438 (EOF 3290).
     Of worlds as large as `dense`, writing the problem down takes up to half a minute more than --time-limit-s. Ctrl-C
     ends the search, and the best so far is printed. Exit code: 0 done, also by Ctrl-C; 2 bad use.
     """
