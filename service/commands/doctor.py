@@ -183,7 +183,7 @@ def _llm_server(settings: Settings) -> Iterator[Finding]:
     except NoDecision as error:
         yield Finding("LLM", str(error), _REMEDIES.get(error.reason, _REMEDIES["llm_error"]))
         return
-    yield Finding("LLM", f"{settings.llm_url}: {found.model or 'the default model of the server'}")
+    yield Finding("LLM", f"{settings.llm_url}: {found.abilities.model or 'the default model of the server'}")
     yield Finding("LLM", f"{found.abilities}{f'; with {found.terms}' if found.terms else ''}")
     late = found.seconds * 1e3 > settings.deadline_ms
     yield Finding("LLM", _timed(found, settings.deadline_ms), _LATE if late else None)

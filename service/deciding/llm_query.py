@@ -131,7 +131,7 @@ class LlmQueries:
     async def ask(self, mission: Mission, candidates: CandidateSet, prompt: Prompt, deadline: Deadline) -> LlmAdvice:
         """Mode ``guided``: the LLM's preference among one UAV's candidates."""
         if not mission.prompt_fits:
-            model = self._llm.serving(mission.mission_id).model
+            model = self._llm.serving(mission.mission_id).connection.model
             return LlmAdvice(prompt, None, "llm_unavailable", None, calibrated=False, model=model)
         template = template_of(mission)
         answer = await self._query(mission, prompt.static, prompt.user, [list(candidates.labels)], deadline)
@@ -146,7 +146,7 @@ class LlmQueries:
     def may_ask_for_fleet(self, mission: Mission, uavs: int) -> bool:
         """Whether one query can serve this many UAVs: mode ``guided``, a capable server, a sufficient context."""
         server = self._llm.serving(mission.mission_id)
-        able = server.status.llm == "ready" and uavs <= server.abilities.max_uavs_per_call
+        able = server.status.llm == "ready" and uavs <= server.max_uavs_per_call
         return able and mission.mode == "guided" and uavs > 1 and mission.prompt_fit.fits(uavs)
 
     async def ask_for_fleet(
@@ -189,7 +189,7 @@ class LlmQueries:
         self._late = self._late + 1 if reason == "llm_timeout" else 0
         if reason is not None and (self._late == 0 or self._late >= _LATE):
             log.warning("the LLM does not decide for %d UAVs at once (%s): asked one by one", uavs, reason)
-            self._llm.serving(mission.mission_id).abilities.max_uavs_per_call = uavs - 1
+            self._llm.serving(mission.mission_id).connection.abilities.max_uavs_per_call = uavs - 1
             self._late = 0
 
     async def _query(
@@ -207,7 +207,7 @@ class LlmQueries:
             reason = error.reason
         self._metrics.llm_requests.labels(reason or "ok").inc()
         if completion is None:
-            model = self._llm.serving(mission.mission_id).model
+            model = self._llm.serving(mission.mission_id).connection.model
             return _Answer(None, None, reason, calibrated=False, to_calibrate=False, model=model)
         known = bool(completion.positions) and self._labels.bias(completion.model, static, len(labels)) is not None
         unknown = by_label is not None and bool(completion.positions) and not known

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from service.config.settings import Settings
 from service.llm.client import client_of
-from service.llm.probing import Abilities, first_decision, listed_model, probe
+from service.llm.probing import Abilities, first_decision, probe
 from service.llm.request_bodies import WarmUp
 
 
@@ -20,7 +20,6 @@ class Examination:
         prompt_tokens, cached_tokens, completion_tokens: of the decision; None if the server does not count them.
     """
 
-    model: str | None
     abilities: Abilities
     terms: str
     seconds: float
@@ -37,10 +36,9 @@ async def examine(settings: Settings, warm_up: WarmUp) -> Examination:
     """
     client = client_of(settings)
     try:
-        model = settings.llm_model or await listed_model(client)
-        abilities = await probe(client, model)
-        answer, seconds = await first_decision(client, model, warm_up, abilities)
+        able = await probe(client, settings.llm_model)
+        answer, seconds = await first_decision(client, able.model, warm_up, able)
         counts = answer.prompt_tokens, answer.cached_tokens, answer.completion_tokens
-        return Examination(model, abilities, str(client.terms), seconds, *counts)
+        return Examination(able, str(client.terms), seconds, *counts)
     finally:
         await client.close()

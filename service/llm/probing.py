@@ -44,14 +44,16 @@ _PASSES = 2
 
 @dataclass(slots=True)
 class Abilities:
-    """A server's abilities; ``str()`` has them in words.
+    """A server's model and abilities; ``str()`` has these in words.
 
     Attributes:
+        model: as given, or the first that the server lists; None without a list.
         constraint: the kind of constraint that it obeys.
         logprobs: the probabilities of tokens that it gives.
         max_uavs_per_call: number of UAVs that one call may decide for.
     """
 
+    model: str | None = None
     constraint: Constraint = "none"
     logprobs: TokenProbabilities = "none"
     max_uavs_per_call: int = 1
@@ -65,15 +67,18 @@ class Abilities:
 
 
 async def probe(client: LLMClient, model: str | None) -> Abilities:
-    """Determine a server's abilities by a few short requests.
+    """Determine a server's model, unless it is given, and its abilities by a few short requests.
 
     Raises:
         NoDecision: the server does not answer a plain one, or is gone.
     """
+    model = model or await _listed_model(client)
     constraint = await _constraint(client, model)
     logprobs = await _probabilities(client, model, constraint)
     together = await _answers_lists(client, model, constraint, logprobs)
-    return Abilities(constraint, logprobs, _ANY_NUMBER if together else 1)
+    # A server that had to load its model first lists it now.
+    model = model or await _listed_model(client)
+    return Abilities(model, constraint, logprobs, _ANY_NUMBER if together else 1)
 
 
 async def _constraint(client: LLMClient, model: str | None) -> Constraint:
@@ -138,7 +143,7 @@ async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
         return None
 
 
-async def listed_model(client: LLMClient) -> str | None:
+async def _listed_model(client: LLMClient) -> str | None:
     """The first model that the server lists; None, and the server's own default, if it gives no list.
 
     Raises:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import importlib
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextvars import Context
 from dataclasses import dataclass, replace
 from functools import partial
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from service.config.settings import Settings
 from service.llm.adapter_version import AdapterUnusable
 from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.circuit_breaker import CircuitBreaker, SilenceCounter
+from service.llm.connection import PROBE_TIMEOUT_S, Connection
 from service.llm.decision_priority import DecisionPriority
-from service.llm.embedded import Embed, EmbeddedServer, LoadFailed, embedded
+from service.llm.embedded import Embed, LoadFailed, embedded
 from service.llm.model_file import ModelMissing
-from service.llm.probing import Abilities, first_decision, listed_model, probe, probe_body
 from service.llm.request_bodies import (
     SEVERAL_LABELS_TEMPERATURE,
     Rewriting,
@@ -34,14 +32,13 @@ from shared.wire.reasons import Reason
 from shared.wire.schemas import Readiness
 
 if TYPE_CHECKING:
-    from service.llm.client import LLMClient
+    pass
 
 log = logging.getLogger(__name__)
 
 _RETRY_S = 5.0
 # Message to a call that is cancelled because an earlier call was answered, which is no failure of this server.
 EARLIER_CALL_ANSWERED = "another answered"
-_PROBE_TIMEOUT_S = 60.0
 
 
 @dataclass(slots=True)
@@ -69,30 +66,19 @@ class LlmServer:
         status: replaced as a whole when the state changes.
         usability: whether its answers can be used.
         url: the server's address; empty for the embedded LLM.
-        model, bare_model: name of the model, once it is known, with its adapter and without.
-        notes_model: name of the model that reads notes.
-        reads_letters: whether that model has the orders' adapter, which reads notes whose numbers are letters.
-        abilities: what its probes found.
-        decision_s: duration of the last probe's decision; None before it.
+        connection: to the LLM, with its model's names and its abilities.
     """
 
     def __init__(
         self, settings: Settings, warm_up: WarmUp, on_open: Callable[[], None] = lambda: None, embed: Embed = embedded
     ) -> None:
         self._settings = settings
-        self._embed = embed
-        self._warm_up = warm_up
         self._on_open = on_open
         self.status = ServerStatus("off" if settings.mode in ("value", "policy") else "loading")
         self.url = settings.llm_url or ""
-        self._client: LLMClient | None = None
-        self._embedded: EmbeddedServer | None = None
+        self.connection = Connection(settings, warm_up, embed)
         # Brings the server up, or waits for its recovery.
         self._task: asyncio.Task[None] | None = None
-        self.model = self.bare_model = self.notes_model = settings.llm_model
-        self.reads_letters = False
-        self.abilities = Abilities()
-        self.decision_s: float | None = None
         self._busy: Busy | None = None
         self.usability = Usability(self._probe_again)
         self._breaker = CircuitBreaker()
@@ -105,27 +91,28 @@ class LlmServer:
         return self._task is not None and not self._task.done()
 
     @property
+    def max_uavs_per_call(self) -> int:
+        """Number of UAVs that one call may decide for."""
+        return self.connection.abilities.max_uavs_per_call
+
+    @property
     def paused(self) -> bool:
         """Whether the server asks for no requests at present."""
         return self._busy is not None and self._busy.pause_s > 0.0
 
     def readiness(self) -> Readiness:
         """The answer of ``/readyz``."""
-        ready = self.status.llm == "ready"
+        ready, connection = self.status.llm == "ready", self.connection
         return Readiness(
             ready=True,
             decides=self._settings.mode if ready else "policy",
             llm="degraded" if ready and self.usability.degraded else self.status.llm,
-            model=self.model,
-            constraint=self.abilities.constraint if ready else None,
-            abilities=self._in_words() if ready else None,
-            decision_ms=self.decision_s and round(self.decision_s * 1e3, 1),
+            model=connection.model,
+            constraint=connection.abilities.constraint if ready else None,
+            abilities=str(connection) if ready else None,
+            decision_ms=round(connection.decision_s * 1e3, 1) if ready else None,
             detail=self.usability.degraded if ready else self.status.detail,
         )
-
-    def _in_words(self) -> str:
-        terms = "" if self._client is None else str(self._client.terms)
-        return f"{self.abilities}; with {terms}" if terms else str(self.abilities)
 
     def start(self) -> None:
         """Begin to load or reach the LLM, unless it is off."""
@@ -138,10 +125,7 @@ class LlmServer:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
         await self.usability.close()
-        if self._client is not None:
-            await self._client.close()
-        if self._embedded is not None:
-            await asyncio.to_thread(self._embedded.close)
+        await self.connection.close()
 
     async def ask(self, mission_id: str, system: str, user: str, sensor_ids: list[int], velocities: int) -> Completion:
         """Call for one decision's sensor and velocity; the caller sets the time limit.
@@ -149,7 +133,9 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = chat_body(self.model, system, user, self.abilities.constraint, sensor_ids, velocities)
+        body = chat_body(
+            self.connection.model, system, user, self.connection.abilities.constraint, sensor_ids, velocities
+        )
         return await self._decide(mission_id, body, self._silence)
 
     async def ask_labels(self, mission_id: str, system: str, user: str, lists: Sequence[Sequence[str]]) -> Completion:
@@ -158,10 +144,17 @@ class LlmServer:
         Raises:
             NoDecision: no answer, with the reason.
         """
-        body = label_body(self.model, system, user, self.abilities.constraint, lists, self.abilities.logprobs)
+        body = label_body(
+            self.connection.model,
+            system,
+            user,
+            self.connection.abilities.constraint,
+            lists,
+            self.connection.abilities.logprobs,
+        )
         # The silence of a call for several UAVs says nothing about calls for one.
         answer = await self._decide(mission_id, body, self._silence if len(lists) == 1 else None)
-        if self.abilities.logprobs != "sampled" or len(lists) == 1:
+        if self.connection.abilities.logprobs != "sampled" or len(lists) == 1:
             return answer
         positions = tuple(position.untempered(SEVERAL_LABELS_TEMPERATURE) for position in answer.positions)
         return replace(answer, positions=positions)
@@ -175,16 +168,18 @@ class LlmServer:
             ValueError: ``wanted.constrain`` finds nothing to rewrite.
             NoDecision: no answer, with the reason.
         """
-        body = rewriting_body(self.model, wanted, wanted.constrain(self.abilities.constraint), temperature, seed)
-        ask = partial(self._ask_about_note, body)
-        return await ask() if self._embedded is None else await self._priority.answer(ask)
+        body = rewriting_body(
+            self.connection.model, wanted, wanted.constrain(self.connection.abilities.constraint), temperature, seed
+        )
+        ask = partial(self._complete, partial(self.connection.complete_note, body))
+        return await self._priority.answer(ask) if self.connection.embedded else await ask()
 
     async def _decide(self, mission_id: str, body: dict[str, Any], silence: SilenceCounter | None) -> Completion:
         """Call for a decision, and count its result; ``silence`` counts the wait of a cancelled call."""
         started = time.monotonic()
         try:
             with self._priority.decision():
-                answer = await self._ask(body, mission_id)
+                answer = await self._complete(partial(self.connection.complete, body, mission_id))
         except (NotUnderstood, Busy):
             # The fault is the request's, or will be over by itself.
             raise
@@ -202,27 +197,13 @@ class LlmServer:
         self._silence.answered_at = time.monotonic()
         return answer
 
-    async def _ask(self, body: dict[str, Any], mission_id: str | None = None) -> Completion:
-        embedded, system = self._embedded, body["messages"][0]["content"]
-        if embedded is None:
-            return replace(await self._complete(body, mission_id), model=self.model)
-        with embedded.request(system, self._warm_up.static) as fields:
-            answer = await self._complete(body | fields)
-        return replace(answer, model=self.bare_model if "lora" in fields else self.model)
-
-    async def _ask_about_note(self, body: dict[str, Any]) -> Completion:
-        if self._embedded is None:
-            return replace(await self._complete(body), model=self.model)
-        with self._embedded.note_request() as fields:
-            return replace(await self._complete(body | fields), model=self.notes_model)
-
-    async def _complete(self, body: dict[str, Any], mission_id: str | None = None) -> Completion:
-        if self._client is None or self.status.llm != "ready":
+    async def _complete(self, request: Callable[[], Awaitable[Completion]]) -> Completion:
+        if self.status.llm != "ready":
             raise NoDecision("llm_loading" if self.status.llm == "loading" else "llm_unavailable", self.status.llm)
         if self._busy is not None and self.paused:
             raise Busy(str(self._busy), self._busy.until)
         try:
-            return await self._client.complete(body, mission_id)
+            return await request()
         except Busy as busy:
             self._busy = busy
             raise
@@ -244,87 +225,39 @@ class LlmServer:
 
     async def _recover(self) -> None:
         """After the breaker has opened: pause and probe, until a probe is answered."""
-        while self._client is not None:
+        while True:
             await asyncio.sleep(self._breaker.pause_s)
             try:
-                async with asyncio.timeout(_PROBE_TIMEOUT_S):
-                    await self._client.complete(probe_body(self.model, self.abilities.constraint))
+                await self.connection.ping()
             except (NoDecision, TimeoutError) as error:
                 self._breaker.failed()
                 log.warning("LLM still fails, next try in %g s: %s", self._breaker.pause_s, error)
             else:
                 self.status = ServerStatus("ready")
-                log.info("LLM answers again: %s", self.model)
+                log.info("LLM answers again: %s", self.connection.model)
                 return
 
     async def _bring_up(self) -> None:
         while True:
             try:
-                client = await self._connect()
+                await self.connection.open()
                 self.status = ServerStatus("ready")
-                log.info("LLM ready: %s at %s, %s", self.model, client.base_url, self._in_words())
-                if self.decision_s is not None and self.decision_s * 1e3 > self._settings.deadline_ms:
-                    text = "LLM too slow: a decision took %.2f s, the deadline is %d ms"
-                    log.warning(text, self.decision_s, self._settings.deadline_ms)
+                log.info("LLM ready: %s, %s", self.connection.model, self.connection)
                 return
             except (ModelMissing, AdapterUnusable, LoadFailed) as error:
                 self.status = ServerStatus("unavailable", str(error))
                 log.error("no embedded LLM: %s", error)
                 return
             except (NoDecision, TimeoutError) as error:
-                self.status = ServerStatus("unavailable", str(error) or f"no answer in {_PROBE_TIMEOUT_S:g} s")
+                self.status = ServerStatus("unavailable", str(error) or f"no answer in {PROBE_TIMEOUT_S:g} s")
                 log.warning("LLM not ready, next try in %g s: %s", _RETRY_S, self.status.detail)
             except Exception as error:
                 self.status = ServerStatus("unavailable", f"{type(error).__name__}: see the log")
                 log.exception("LLM not ready, next try in %g s", _RETRY_S)
             await asyncio.sleep(_RETRY_S)
 
-    async def _connect(self) -> LLMClient:
-        """Reach or load the LLM, probe its abilities, and send the warm-up."""
-        settings, client_module = self._settings, await asyncio.to_thread(_client_module)
-        if self._client is None and settings.llm_url is not None:
-            self._client = client_module.client_of(settings)
-        elif self._client is None:
-            self._embedded = await self._embed(settings)
-            key = self._embedded.api_key
-            self._client = client_module.LLMClient(self._embedded.base_url, api_key=key, trust_env=False)
-            self.model = self.model or self._embedded.model
-            self.bare_model = self.bare_model or self._embedded.bare_model
-            self.notes_model = self.notes_model or self._embedded.notes_model
-            self.reads_letters = bool(self._embedded.with_orders)
-        async with asyncio.timeout(settings.llm_load_s):
-            await self._find_abilities(self._client)
-        try:
-            await self._judge(self._client)
-        except (NoDecision, TimeoutError) as error:
-            log.warning("the LLM's answer to the first question cannot be used: %s", error or "none in time")
-        return self._client
-
-    async def _judge(self, client: LLMClient) -> None:
-        """Send the warm-up, and check its answer as a decision's; raises :class:`NoDecision` or ``TimeoutError``."""
-        async with asyncio.timeout(_PROBE_TIMEOUT_S):
-            enough_s = self._settings.deadline_ms / 1e3
-            _, self.decision_s = await first_decision(client, self.model, self._warm_up, self.abilities, enough_s)
-
-    async def _find_abilities(self, client: LLMClient) -> None:
-        """Ask the server for its model, unless the settings or the model file name one, and for its abilities."""
-        named = self._embedded is not None or self._settings.llm_model is not None
-        if not named:
-            self.model = await listed_model(client)
-        self.abilities = await probe(client, self.model)
-        if not named:
-            # A server that has loaded its model meanwhile lists it now.
-            self.model = self.bare_model = self.notes_model = self.model or await listed_model(client)
-
     async def _probe_again(self) -> None:
         """Probe a ready server whose answers cannot be used: it may have another model now."""
-        if self._client is None or self.status.llm != "ready":
+        if self.status.llm != "ready":
             raise NoDecision("llm_unavailable", self.status.llm)
-        async with asyncio.timeout(_PROBE_TIMEOUT_S):
-            await self._find_abilities(self._client)
-        await self._judge(self._client)
-
-
-def _client_module() -> ModuleType:
-    """The client's module, imported in a thread: importing aiohttp takes a fifth of a second."""
-    return importlib.import_module("service.llm.client")
+        await self.connection.probe_again()

@@ -64,12 +64,12 @@ class ServerPool:
     @property
     def notes_model(self) -> str | None:
         """The model with which the active server reads notes."""
-        return self.active.notes_model
+        return self.active.connection.notes_model
 
     @property
     def reads_letters(self) -> bool:
         """As of the active :class:`LlmServer`."""
-        return self.active.reads_letters
+        return self.active.connection.reads_letters
 
     @property
     def recovering(self) -> bool:
@@ -125,7 +125,7 @@ class ServerPool:
 
     def _first(self, mission_id: str, call: Call, uavs: int = 1) -> Answer:
         """The first answer of the ready servers."""
-        ready = [each for each in self._each if each.status.llm == "ready" and each.abilities.max_uavs_per_call >= uavs]
+        ready = [server for server in self._each if server.status.llm == "ready" and server.max_uavs_per_call >= uavs]
         if len(ready) > 1:
             # A stable sort: where every server is full, the order is as without a limit.
             ready = sorted(self._ordered(mission_id, ready), key=self._reluctance)

@@ -22,9 +22,10 @@ from service.guidance.note_orders import INSTRUCTION
 from service.guidance.order_grammar import constrain_orders
 from service.guidance.step_guidance import StepGuidance
 from service.llm.answers import Completion
+from service.llm.client import LLMClient
 from service.llm.embedded import EmbeddedServer
 from service.llm.request_bodies import Rewriting, WarmUp
-from service.llm.server import LlmServer
+from service.llm.server import LlmServer, ServerStatus
 from service.mission.mission import Mission
 from service.prompting.guided_prompt import GuidedTemplate
 from service.prompting.paper_prompt import Template
@@ -352,8 +353,9 @@ async def test_what_is_asked_beside_gives_way_to_decisions_and_is_asked_again(mo
         finished.append(name)
         return Completion(ORDERS, None, None, None)
 
-    upstream._complete = ask  # type: ignore[method-assign]
-    upstream._embedded = cast(EmbeddedServer, EMBEDDED)
+    upstream.status = ServerStatus("ready")
+    upstream.connection.client = cast(LLMClient, SimpleNamespace(complete=ask))
+    upstream.connection._embedded = cast(EmbeddedServer, EMBEDDED)
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     await soon(lambda: running)
     await upstream.ask("mission", "static", "user", [0], 15)
@@ -384,8 +386,9 @@ async def test_what_is_asked_beside_goes_through_at_last(monkeypatch: pytest.Mon
     def asked_times(times: int) -> bool:
         return asked == times
 
-    upstream._complete = ask  # type: ignore[method-assign]
-    upstream._embedded = cast(EmbeddedServer, EMBEDDED)
+    upstream.status = ServerStatus("ready")
+    upstream.connection.client = cast(LLMClient, SimpleNamespace(complete=ask))
+    upstream.connection._embedded = cast(EmbeddedServer, EMBEDDED)
     note = asyncio.create_task(upstream.rewrite(REWRITING, temperature=0.0, seed=0))
     for turn in range(1, 5):
         await soon(partial(asked_times, turn))

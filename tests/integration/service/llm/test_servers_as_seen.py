@@ -12,6 +12,7 @@ import pytest
 from fastapi import FastAPI, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
+from tests.integration.service.llm.test_server_pool import standing_by
 from tests.support.running import listening, serving
 from tests.support.stub_llm import FIRST, StubLlm, said, wait_for
 from tests.support.waiting import until
@@ -330,7 +331,7 @@ def test_a_server_is_left_alone_for_the_pause_that_it_asks_for(edge: Edge, repor
         answers = [alone.post("/decide", json=report(step=step)).json() for step in range(5)]
         ready = wait_for(alone, "degraded")
         pair = edge(mode="llm", llm_url=f"{url}/v1,{spare}/v1")
-        wait_for(pair, "ready")
+        standing_by(pair, 1)
         sources = [pair.post("/decide", json=report(step=step)).json()["source"] for step in range(3)]
     assert [answer["reason"] for answer in answers] == ["llm_status"] * 5
     assert "exceeded your current quota (no requests for 480 s)" in ready["detail"]

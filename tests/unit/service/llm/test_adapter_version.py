@@ -136,7 +136,8 @@ async def test_a_rewriting_that_begins_again_counts_as_another_bare_request(
             return Completion("visit 0", None, None, None)
 
     server = LlmServer(settings, warm)
-    server._embedded, server._client = embedded_server(), cast(LLMClient, Client())
+    connection = server.connection
+    connection._embedded, connection.client = embedded_server(), cast(LLMClient, Client())
     server.status = ServerStatus("ready")
     rewriting = Rewriting("Rewrite the note.", [], "note", lambda _: {})
     note = asyncio.create_task(server.rewrite(rewriting, temperature=0.0, seed=0))
