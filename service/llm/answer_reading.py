@@ -3,11 +3,14 @@
 Servers that were seen: a model's thoughts before the answer, within ``<think>`` tags (QwQ behind vLLM without a
 reasoning parser) or in a field of their own with no content yet (Ollama, vLLM 39103); content as a list of parts
 (Mistral, LiteLLM); a JSON answer within a Markdown fence (vllm 38696); the byte-level tokens of GPT-2's vocabulary,
-whose blank is written as another letter (lmdeploy 2802), and null among the token probabilities.
+whose blank is written as another letter (lmdeploy 2802), and null among the token probabilities; gpt-oss's channels
+(mlx-lm 1867), special tokens after the answer (llama.cpp 6924), an answer where its thoughts belong (rig 1656) or in a
+tool call (litellm 6741), and event streams that nobody asked for (unsloth 6570).
 """
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from typing import Any
@@ -16,9 +19,14 @@ from service.llm.answers import Completion, NoDecision, TokenPosition
 from service.llm.server_words import excerpt_of
 
 _MAX_TOKENS, _MAX_POSITIONS, _MAX_LIKELIEST = 10**9, 4096, 80
-_THOUGHTS = re.compile(r"\A\s*(?:<think(?:ing)?>.*?</think(?:ing)?>\s*)+", re.DOTALL)
-_UNCLOSED = re.compile(r"\A\s*<think(?:ing)?>", re.DOTALL)
-_CLOSING = re.compile(r"</think(?:ing)?>")
+_TAG = r"(?:think(?:ing)?|thought|reasoning)[>\]]"
+_THOUGHTS = re.compile(rf"\A\s*(?:[<\[]{_TAG}.*?[<\[]/{_TAG}\s*)+", re.DOTALL | re.IGNORECASE)
+_UNCLOSED = re.compile(rf"\A\s*[<\[]{_TAG}", re.IGNORECASE)
+_CLOSING = re.compile(rf"[<\[]/{_TAG}", re.IGNORECASE)
+_FINAL = re.compile(r".*<\|channel\|>final[^<]*<\|message\|>", re.DOTALL)
+_SPECIALS = re.compile(r"(?:\s*(?:<[|\uff5c][^<>]{1,40}[|\uff5c]>|</s>|<end_of_turn>))+\s*\Z")
+_WRAPPED = re.compile(r"""\A\s*(?:\*\*(.*)\*\*|"(.*)"|\\boxed\{(.*)\})\s*\Z""", re.DOTALL)
+_ODD_BLANKS = str.maketrans({"\ufeff": None, "\u200b": None, "\u00a0": " "})
 _FENCE = re.compile(r"\A\s*```[a-zA-Z]*\s*\n?(.*?)\n?\s*```\s*\Z", re.DOTALL)
 # A blank and the end of a line in the vocabularies of GPT-2 and SentencePiece.
 _BLANKS = str.maketrans({"Ġ": " ", "▁": " ", "Ċ": "\n"})
@@ -35,21 +43,25 @@ def completion_of(answer: Any, base_url: str, secrets: tuple[str, ...] = ()) -> 
     """
     try:
         choice = answer["choices"][0]
-        message = choice["message"]
+        message = choice.get("message") or choice.get("delta") or {"content": choice["text"]}
         content, reasoning = message.get("content"), message.get("reasoning_content") or message.get("reasoning")
+        failed = choice.get("error") or message.get("refusal")
     except (AttributeError, KeyError, IndexError, TypeError):
         said = excerpt_of(answer, secrets)
         detail = f"a 200 that is no chat completion{f': {said!r}' if said else ''}"
         raise NoDecision("llm_error", f"{base_url}: {detail}") from None
     cut = choice.get("finish_reason") == "length"
     text = _text(content)
+    if not text and not failed and not cut:
+        text = _arguments(message.get("tool_calls")) or _text(reasoning) or text
     if text is None and (reasoning or cut):
         text = ""
-    if text is None:
-        raise NoDecision("llm_error", f"{base_url}: a completion without text")
+    if text is None or (failed and not text):
+        said = excerpt_of(failed, secrets)
+        raise NoDecision("llm_error", f"{base_url}: a completion without text{f': {said!r}' if said else ''}")
     plain = _without_thoughts(text)
     positions = _positions(choice)
-    if plain != text:
+    if plain != text and not (plain and text.startswith(plain)):
         positions = _after_thoughts(positions)
     prompt, cached, completion = _counts(answer.get("usage"))
     unfinished = cut and not plain.strip() and (not text or bool(reasoning) or plain != text)
@@ -60,17 +72,58 @@ def _text(content: Any) -> str | None:
     if isinstance(content, list):
         parts = [part.get("text") for part in content if isinstance(part, dict) and part.get("type") == "text"]
         return "".join(part for part in parts if isinstance(part, str))
+    if isinstance(content, dict):
+        return json.dumps(content)
     return content if isinstance(content, str) else None
 
 
+def _arguments(calls: Any) -> str | None:
+    """The arguments of the only tool call; None if there is none."""
+    try:
+        (call,) = calls
+        return _text(call["function"]["arguments"])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def streamed(content: bytes | bytearray) -> Any:
+    """The completion whose parts, or whose whole, a server sent as events; raises ``ValueError``."""
+    lines = content.decode(errors="replace").splitlines()
+    data = [line.removeprefix("data:") for line in lines if line.startswith(("data:", "{"))]
+    parts = [json.loads(line) for line in data if line.strip() != "[DONE]"]
+    try:
+        found = [part["choices"][0] for part in parts if part.get("choices")]
+        messages = [one.get("delta") or one.get("message") or {} for one in found]
+        joined = {
+            key: "".join(message.get(key) or "" for message in messages)
+            for key in ("content", "reasoning_content", "reasoning")
+        }
+        positions = [position for one in found for position in (one.get("logprobs") or {}).get("content") or []]
+        ends = [one["finish_reason"] for one in found if one.get("finish_reason")]
+        usage = [part["usage"] for part in parts if part.get("usage")]
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(str(error)) from None
+    if not found:
+        # A failure is an event, too.
+        return parts[-1] if parts else json.loads(b"")
+    choice = {"message": joined, "finish_reason": ends[-1] if ends else None, "logprobs": {"content": positions}}
+    return {"choices": [choice], "usage": usage[-1] if usage else None}
+
+
 def _without_thoughts(text: str) -> str:
-    """A text without the thoughts and the fence around its answer; empty if the thoughts have no end."""
-    if "<think" in text or "</think" in text:
+    """A text without thoughts, special tokens and marks around its answer; empty if the thoughts have no end."""
+    text = _SPECIALS.sub("", text.translate(_ODD_BLANKS))
+    if "<|message|>" in text:
+        final = _FINAL.match(text)
+        text = text[final.end() :] if final else ""
+    if _UNCLOSED.match(text) or _CLOSING.search(text):
         text = _THOUGHTS.sub("", text)
         # Some chat templates open the thoughts in the prompt, so that the answer has the closing tag alone.
         text = "" if _UNCLOSED.match(text) else _CLOSING.split(text)[-1].lstrip()
     fenced = _FENCE.match(text) if "```" in text else None
-    return fenced[1] if fenced else text
+    text = fenced[1] if fenced else text
+    wrapped = _WRAPPED.match(text)
+    return wrapped[wrapped.lastindex or 0] if wrapped else text
 
 
 def _counts(usage: Any) -> tuple[int | None, int | None, int | None]:

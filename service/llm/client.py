@@ -10,6 +10,7 @@ import json
 import logging
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,7 @@ from pydantic_core import to_json
 from yarl import URL
 
 from service.config.settings import Settings
-from service.llm.answer_reading import completion_of
+from service.llm.answer_reading import completion_of, streamed
 from service.llm.answers import Busy, Completion, NoDecision, NotUnderstood, Unreachable
 from service.llm.request_terms import RequestExtras, RequestTerms
 from service.llm.server_words import connection_fault, excerpt, excerpt_of, pause_of
@@ -196,7 +197,7 @@ class LLMClient:
                 raise self._failure(again) from again
         except (aiohttp.ClientError, OSError, ValueError) as error:
             raise self._failure(error) from error
-        if status != 200:
+        if not 200 <= status < 300:
             kind = NotUnderstood if status in _NOT_UNDERSTOOD else NoDecision
             target = head.get("Location", "").split("?")[0] if status in _REDIRECTS else ""
             said = excerpt(target.encode() or content, self._secrets)
@@ -206,11 +207,11 @@ class LLMClient:
             if pause_s is None or kind is NotUnderstood:
                 raise kind("llm_status", text)
             raise Busy(f"{text} (no requests for {pause_s:.3g} s)", time.monotonic() + pause_s)
-        try:
-            return json.loads(content)
-        except (ValueError, RecursionError):
-            said = excerpt(content, self._secrets)
-            raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON: {said!r}") from None
+        for read in (json.loads, streamed):
+            with suppress(ValueError, RecursionError):
+                return read(content)
+        said = excerpt(content, self._secrets)
+        raise NoDecision("llm_error", f"{self.base_url}: a 200 that is not JSON: {said!r}")
 
     async def _exchange(
         self, method: str, url: URL, sent: bytes | None, headers: dict[str, str], exchange: _Exchange

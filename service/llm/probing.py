@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,8 @@ _PROBE_TEXT = "Say hello."
 _PROBE_SENSOR, _PROBE_VELOCITIES = 7301, 1
 _PROBES: tuple[Constraint, ...] = ("grammar", "structured_outputs", "json_schema")
 _PROBABILITIES: tuple[TokenProbabilities, ...] = ("sampled", "top_20", "top_5")
+# Names of models without chat, which LM Studio and Ollama list among the others (odysseus 4487).
+_NO_CHAT = re.compile(r"embed|rerank|whisper|moderation|\b(tts|bert|clip|dall-e|bge)\b", re.IGNORECASE)
 # A server that answers 503 may only be busy: once it answers a plain request, it is probed once more.
 _PASSES = 2
 
@@ -144,13 +147,14 @@ async def _answer(client: LLMClient, body: dict[str, Any]) -> Completion | None:
 
 
 async def _listed_model(client: LLMClient) -> str | None:
-    """The first model that the server lists; None, and the server's own default, if it gives no list.
+    """The first listed model that may chat, else the first; None, and the server's own default, without a list.
 
     Raises:
         Unreachable: the server is gone.
     """
     try:
-        return next(iter(await client.models()), None)
+        names = await client.models()
+        return next((name for name in names if not _NO_CHAT.search(name)), names[0] if names else None)
     except Unreachable:
         raise
     except NoDecision as error:

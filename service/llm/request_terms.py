@@ -18,6 +18,10 @@ _SYSTEM_ROLE = re.compile(
     r"system (role|message|prompt|instruction)|developer instruction|'system'|messages\[0\]\.role|roles must alternate",
     re.IGNORECASE,
 )
+# Azure's o-series and GPT-5 want 16 tokens or more (dotnet/extensions 6945), or as many as the answer takes.
+_TOO_FEW = re.compile(r"tokens.*(below minimum|>= ?\d|at least \d)|higher max_tokens", re.IGNORECASE | re.DOTALL)
+# Alibaba's thinking models answer in streams alone (supersonic 2355).
+_STREAMS_ONLY = re.compile(r"non-stream|stream ?= ?false|only supports? stream|stream mode", re.IGNORECASE)
 # Tokens of thought in addition to an answer, tried one after the other.
 _BUDGETS = (256, 1024, 4096, 16_384)
 
@@ -50,6 +54,7 @@ class RequestTerms:
         system_role: whether messages may have the system role; else the first user message begins with its text.
         top_logprobs: most token probabilities of a position; 0: the server gives none.
         more_tokens: tokens of thought in addition to the answer's.
+        stream: whether the answer must come as events.
     """
 
     max_tokens: Literal["max_tokens", "max_completion_tokens"] = "max_tokens"
@@ -58,12 +63,13 @@ class RequestTerms:
     system_role: bool = True
     top_logprobs: int = 20
     more_tokens: int = 0
+    stream: bool = False
 
     def applied(self, body: dict[str, Any]) -> dict[str, Any]:
         """A request body with these changes; the given one is left alone."""
         if self == _USUAL:
             return body
-        changed = dict(body)
+        changed = body | {"stream": self.stream}
         changed[self.max_tokens] = changed.pop("max_tokens") + self.more_tokens
         if not self.temperature:
             changed.pop("temperature", None)
@@ -86,6 +92,10 @@ class RequestTerms:
         """
         if _ABOUT_LENGTH.search(message):
             return None
+        if _TOO_FEW.search(message) and not self.more_tokens:
+            return replace(self, more_tokens=_BUDGETS[0])
+        if _STREAMS_ONLY.search(message) and not self.stream:
+            return replace(self, stream=True)
         if "logprobs" in message and "top_logprobs" in body and self.top_logprobs:
             return replace(self, top_logprobs=5 if self.top_logprobs > 5 else 0)
         if "max_tokens" in message and self.max_tokens == "max_tokens":
@@ -107,6 +117,7 @@ class RequestTerms:
             (not self.system_role, "no system role"),
             (self.top_logprobs < _USUAL.top_logprobs, f"{self.top_logprobs} token probabilities"),
             (self.more_tokens > 0, f"{self.more_tokens} tokens of thought"),
+            (self.stream, "streams"),
         ]
         return ", ".join(text for changed, text in changes if changed)
 

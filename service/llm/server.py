@@ -184,7 +184,7 @@ class LlmServer:
             # The fault is the request's, or will be over by itself.
             raise
         except NoDecision as error:
-            self._failed(error.reason)
+            self._failed(error.reason, f" ({error})")
             raise
         except asyncio.CancelledError as cancelled:
             if silence is None or EARLIER_CALL_ANSWERED in cancelled.args:
@@ -213,11 +213,11 @@ class LlmServer:
                 self.start()
             raise
 
-    def _failed(self, reason: Reason) -> None:
+    def _failed(self, reason: Reason, said: str = "") -> None:
         if self.status.llm != "ready" or not self._breaker.failed():
             return
         pause_s = self._breaker.pause_s
-        detail = f"failed too often, the last time by {reason}: no calls for {pause_s:g} s"
+        detail = f"failed too often, the last time by {reason}{said}: no calls for {pause_s:g} s"
         self.status = ServerStatus("unavailable", detail, breaker_open=True)
         log.warning("LLM %s", self.status.detail)
         self._on_open()

@@ -55,7 +55,7 @@ def _message(answer: Any) -> str:
         return answer
     if not isinstance(answer, dict):
         return ""
-    for key in ("error", "message", "detail", "msg", "title"):
+    for key in ("error", "message", "detail", "msg", "title", "choices", "content_filter_results"):
         if found := _message(answer.get(key)):
             named = answer.get("param") or answer.get("loc")
             return f"{named}: {found}" if named and str(named) not in found else found
