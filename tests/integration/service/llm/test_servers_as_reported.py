@@ -327,7 +327,7 @@ UNREADABLE: list[Behaviour] = [
     names_several,
     writes_numbers_as_texts,
 ]
-# These have words of their own, which the state must quote.
+# All others give a reason, which the state must quote.
 SILENT = (
     filters_silently,
     has_no_choices,
