@@ -40,7 +40,7 @@ pytestmark = [pytest.mark.long, pytest.mark.timeout(600)]
 # The model's adapter is served, so that its short prompts and single letters need little time of two cores.
 SERVED = {"llm_adapter": "served"}
 # In this world every UAV hears a free sensor at every step, so that there is always something to ask.
-FLIGHT = ("--steps", "4", "--seed", "1", "--no-bound")
+FLIGHT = ("--steps", "4", "--seed", "1", "--no-bound", "--deadline-ms", "60000")
 DECISIONS = 12
 
 

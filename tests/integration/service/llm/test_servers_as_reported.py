@@ -56,7 +56,9 @@ def cannot_finish_in_so_few_tokens(body: Body) -> Response | str:
 def streams_although_it_was_told_not_to(body: Body) -> Response:
     """unslothai/unsloth#6570"""
     deltas = [{"role": "assistant", "content": ""}, {"content": "0"}, {"content": " 7"}, {}]
-    chunks = [{"object": "chat.completion.chunk", "choices": [{"delta": delta, "index": 0}]} for delta in deltas]
+    chunks: list[Body] = [
+        {"object": "chat.completion.chunk", "choices": [{"delta": delta, "index": 0}]} for delta in deltas
+    ]
     chunks.append({"choices": [], "usage": {"prompt_tokens": 9, "completion_tokens": 3}})
     text = ": keep-alive\n\n" + "".join(f"data: {json.dumps(chunk)}\n\n" for chunk in chunks) + "data: [DONE]\n\n"
     return Response(text, media_type="text/event-stream")
